@@ -1,7 +1,8 @@
 """From source to screen: delay of a frame on its way into the browser, by stage, and whether the page keeps up.
 
   python bench/page.py                      one camera 960x540 at 30 Hz, then eight 640x360 at 15 Hz, eight drives each;
-                                            pictures skipped with 1, 2, 4 and 8 cameras; what overlays add
+                                            pictures skipped with 1, 2, 4 and 8 cameras; what overlays add, and
+                                            what the bird's-eye view adds to the cameras beside it
   python bench/page.py --seconds 60 --show  with a window instead of headless
 
 The clock starts with the frame's capture time and stops when the page has drawn it, on one machine and one clock; the
@@ -18,7 +19,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
@@ -44,7 +45,8 @@ ONE, EIGHT = (
     ("eight 640x360 at 15 Hz", 8, (640, 360, 15), 6000),
 )
 COUNTS = (1, 2, 4, 8)  # of cameras, for skipped pictures
-PAIRS = 10  # of blocks with and without overlays
+PAIRS = 10  # of blocks with and without overlays or the bird's-eye view
+TOP_VIEWS = 4  # cameras of a bird's-eye view; their own pictures are not shown beside it
 BLOCK_SETTLE_S = 0.3
 STEERING_S, STEERING_RAD = 0.05, 0.3  # between two reports, and amplitude: the path changes in each picture
 # The page's own frame of a region, which it normally shows only until the picture has the new region.
@@ -68,6 +70,7 @@ def rows(seconds: float = 30, *, headless: bool = True) -> list[Row]:
             *measure(browser, *EIGHT, seconds),
             *(skipped(browser, count, seconds / 2) for count in COUNTS),
             *(row for video in (ONE, EIGHT) for row in overlays(browser, *video, seconds)),
+            *birdseye(browser, *EIGHT, seconds),
         ]
         browser.close()
     return found
@@ -104,9 +107,70 @@ def skipped(browser: Browser, count: int, seconds: float) -> Row:
 def overlays(
     browser: Browser, what: str, count: int, video: tuple[int, int, int], kbps: int, seconds: float
 ) -> Iterator[Row]:
-    """What lines on the ground, figures and frames of regions add to source to screen, alternating in one drive."""
+    """What lines on the ground, figures and frames of regions add to source to screen."""
+
+    def show(page: Page, with_them: bool) -> None:
+        shows = bool(page.evaluate("document.querySelector('canvas.guides:not([hidden])') !== null"))
+        if shows != with_them:
+            page.keyboard.press("g")
+        page.evaluate("bare => document.body.classList.toggle('bare', bare)", not with_them)
+
+    def are_shown(page: Page) -> bool:
+        return bool(page.evaluate("tod.guides('camera_0')"))
+
+    names = [f"camera_{number}" for number in range(count)]
+    with _vehicle(count, video, kbps) as words:
+        blocks = _alternating(browser, words, names, show, are_shown, seconds)
+    yield _added(f"{what}: overlays add", blocks, most=1)
+
+
+def birdseye(
+    browser: Browser, what: str, count: int, video: tuple[int, int, int], kbps: int, seconds: float
+) -> Iterator[Row]:
+    """What the bird's-eye view adds to source to screen of the cameras beside it, and what is skipped of them."""
+
+    def show(page: Page, with_it: bool) -> None:
+        until(lambda: is_shown(page) == with_it or page.keyboard.press("e"), every_s=0.2)  # in the row, large, off
+
+    def is_shown(page: Page) -> bool:
+        return bool(page.locator("#birdseye").is_visible())
+
+    beside = [f"camera_{number}" for number in range(count - TOP_VIEWS)]
+    with _vehicle(count, video, kbps, TOP_VIEWS) as words:
+        blocks = _alternating(browser, words, beside, show, is_shown, seconds)
+    yield _added(f"{what}: bird's-eye view of {TOP_VIEWS} adds to the others", blocks)
+    for with_it in (True, False):
+        skipped = [block.skipped for block in blocks if block.with_them == with_it]
+        how = "with" if with_it else "without"
+        yield Row(f"{what}: skipped of the others, {how} bird's-eye view", 100 * sum(skipped) / len(skipped), "%")
+
+
+class Block(NamedTuple):
+    """Some seconds of a drive: source to screen of each picture drawn, ms; skipped as a share of all pictures."""
+
+    with_them: bool
+    ages: list[float]
+    skipped: float
+
+
+def _added(what: str, blocks: Sequence[Block], most: float | None = None) -> Row:
+    """The difference of the medians of each pair of blocks."""
+    medians = {which: [median(block.ages) for block in blocks if block.with_them == which] for which in (True, False)}
+    added = [a - b for a, b in zip(medians[True], medians[False], strict=True)]
+    note = f"{min(added):.2f} to {max(added):.2f} in {len(added)} pairs, to {median(medians[False]):.1f}"
+    return Row(what, median(added), "ms", most=most, note=note)
+
+
+def _alternating(
+    browser: Browser,
+    words: Sequence[str],
+    names: Sequence[str],
+    show: Callable[[Page, bool], None],
+    are_shown: Callable[[Page], bool],
+    seconds: float,
+) -> list[Block]:
+    """Measure cameras in the Drive view with something and without it, alternating in one drive."""
     with (
-        _vehicle(count, video, kbps) as words,
         _station(words) as (url, _, broker),
         browser.new_context(viewport={"width": 1280, "height": 800}) as context,
     ):
@@ -115,32 +179,33 @@ def overlays(
         until(lambda: page.evaluate("window.tod?.control") == "you")
         page.keyboard.press("v")
         page.add_style_tag(content=OVERLAYS)
+        blocks = []
         with _steering(broker):
             time.sleep(SETTLE_S)
             turns = (True, False, False, True) * (PAIRS // 2)  # a trend of the machine affects both
-            blocks = [(with_them, _block(page, with_them, seconds / len(turns))) for with_them in turns]
-    medians = {with_them: [median(ages) for each, ages in blocks if each == with_them] for with_them in (True, False)}
-    added = [a - b for a, b in zip(medians[True], medians[False], strict=True)]
-    note = f"{min(added):.2f} to {max(added):.2f} in {len(added)} pairs, to {median(medians[False]):.1f}"
-    yield Row(f"{what}: overlays add", median(added), "ms", most=1, note=note)
+            for with_them in turns:
+                show(page, with_them)
+                blocks.append(_block(page, names, with_them, seconds / len(turns)))
+                if are_shown(page) != with_them:
+                    raise SystemExit(f"what is measured is {'not ' if with_them else ''}shown")
+    return blocks
 
 
-def _block(page: Page, with_them: bool, seconds: float) -> list[float]:
-    """Source to screen of each picture drawn in some seconds with overlays or without, ms."""
-    shows = bool(page.evaluate("document.querySelector('canvas.guides:not([hidden])') !== null"))
-    if shows != with_them:
-        page.keyboard.press("g")
-    page.evaluate("bare => document.body.classList.toggle('bare', bare)", not with_them)
+def _block(page: Page, names: Sequence[str], with_them: bool, seconds: float) -> Block:
     time.sleep(BLOCK_SETTLE_S)
-    began = 1000 * time.time()
+    began, before = 1000 * time.time(), page.evaluate("tod.measure()")["cameras"]
     time.sleep(seconds)
-    if bool(page.evaluate("tod.guides('camera_0')")) != with_them:
-        raise SystemExit(f"lines on the ground are {'not ' if with_them else ''}drawn")
-    cameras = page.evaluate("tod.stages()").values()
-    ages = [frame[-1] - frame[0] for frames in cameras for frame in _since(frames, began)]
+    after, stages = page.evaluate("tod.measure()")["cameras"], page.evaluate("tod.stages()")
+    ages = [frame[-1] - frame[0] for name in names for frame in _since(stages[name], began)]
     if not ages:
         raise SystemExit("no picture was drawn; is the machine idle?")
-    return ages
+    return Block(with_them, ages, _skipped([before[name] for name in names], [after[name] for name in names]))
+
+
+def _skipped(before: Sequence[Mapping[str, int]], after: Sequence[Mapping[str, int]]) -> float:
+    """Of the pictures that reached the page between two measurements of cameras, the share that was not drawn."""
+    due, drawn = (sum(b[key] - a[key] for a, b in zip(before, after, strict=True)) for key in ("due", "drawn"))
+    return 1 - drawn / due
 
 
 @contextmanager
@@ -189,10 +254,11 @@ def _round(browser: Browser, words: Sequence[str], seconds: float) -> Round:
         cores = (processor_s(operator) - used_s) / took
         stages = page.evaluate("tod.stages()").values()
     frames = [_since(camera, began * 1000) for camera in stages]
-    due, drawn = ([after[name][key] - before[name][key] for name in after] for key in ("due", "drawn"))
+    drawn = [after[name]["drawn"] - before[name]["drawn"] for name in after]
+    skipped = _skipped(list(before.values()), list(after.values()))
     opened = max(float(camera["first_drawn_ms"] or "inf") for camera in after.values())
     errors = sum(camera["errors"] for camera in after.values())
-    return Round(frames, [each / took for each in drawn], 1 - sum(drawn) / sum(due), errors, opened, cores)
+    return Round(frames, [each / took for each in drawn], skipped, errors, opened, cores)
 
 
 def _since(frames: list[list[float]], began_ms: float) -> list[list[float]]:
@@ -201,27 +267,33 @@ def _since(frames: list[list[float]], began_ms: float) -> list[list[float]]:
 
 
 @contextmanager
-def _vehicle(count: int, video: tuple[int, int, int], kbps: int) -> Iterator[list[str]]:
-    """A vehicle of equal cameras, whose pictures are rendered. Yields the words that choose it."""
+def _vehicle(count: int, video: tuple[int, int, int], kbps: int, top_views: int = 0) -> Iterator[list[str]]:
+    """A vehicle of equal cameras, whose pictures are rendered; the last ones look down. Yields its words."""
     with tempfile.TemporaryDirectory() as directory:
-        words = _configuration(Path(directory), count, *video, kbps)
+        words = _configuration(Path(directory), count, top_views, *video, kbps)
         render_missing(configuration(words, Path(directory)).vehicle(), lambda *_: None)
         yield [*words, f"conf={directory}"]
 
 
-def _configuration(directory: Path, count: int, width: int, height: int, fps: int, kbps: int) -> list[str]:
+def _configuration(
+    directory: Path, count: int, top_views: int, width: int, height: int, fps: int, kbps: int
+) -> list[str]:
     """A vehicle of equal cameras in its own conf directory; returns the overrides that choose it."""
     (directory / "cameras").mkdir()
     (directory / "vehicle").mkdir()
     model = f"{{scaling: [1.0], b_min_kbps: [0], b_full_kbps: {kbps}}}"
     camera = f"width_px: {width}\nheight_px: {height}\nfps: {fps}\nrate_quality: {model}\n"
-    (directory / "cameras" / "equal.yaml").write_text(camera)
+    for kind, optics in (("plain", ""), ("top_view", "lens: fisheye\nfov_deg: 180\n")):
+        (directory / "cameras" / f"{kind}.yaml").write_text(camera + optics)
     names = [f"camera_{number}" for number in range(count)]
-    mounts = "".join(f"  - /cameras@cameras.{name}: equal\n" for name in names)
+    plain = count - top_views
+    kinds = ["plain"] * plain + ["top_view"] * top_views
+    mounts = "".join(f"  - /cameras@cameras.{name}: {kind}\n" for name, kind in zip(names, kinds, strict=True))
     mounted = []
     for n, name in enumerate(names):
         place = f"{{row: {n // 3}, column: {n % 3}}}"
-        pose = f"{{x_m: 2, y_m: 0, z_m: 1.5, yaw_deg: {n * 360 // count}}}"
+        yaw, pitch = (n * 360 // plain, 0) if n < plain else ((n - plain) * 360 // top_views, 35)
+        pose = f"{{x_m: 2, y_m: 0, z_m: 1.5, yaw_deg: {yaw}, pitch_deg: {pitch}}}"
         mounted.append(f"  {name}: {{place: {place}, pose: {pose}, calibrated: true}}\n")
     top = f"# @package _global_\ndefaults:\n{mounts}  - _self_\nname: bench\n"
     car = "{wheelbase_m: 2.9, track_m: 1.65, width_m: 1.92, front_m: 3.65, rear_m: 0.95}"

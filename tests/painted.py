@@ -1,11 +1,13 @@
 """Marks painted into the ground of the synthetic drive, and found in pictures by image processing.
 
 A mark is a corner where two white and two black fields meet. For lines on the ground there is one at each end of those
-that the page draws across it, 5, 10 and 15 m from both ends of the vehicle; for the bird's-eye view they are around it.
+that the page draws across it, 5, 10 and 15 m from both ends of the vehicle, and some on the wheels' paths at a steering
+angle; for the bird's-eye view they are around it.
 """
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -33,12 +35,13 @@ End = tuple[int, int, int]  # 1 ahead or -1 behind, distance in m, side: 0 left 
 
 @dataclass(frozen=True)
 class Mark:
-    """Where a mark is, in the vehicle's axes, and how far its fields reach from there each way, m."""
+    """Where a mark is, in the vehicle's axes, how far its fields reach each way, m, and how far it is turned, rad."""
 
     x: float
     y: float
     along: float = 2.0
     aside: float = 0.5
+    turned: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -75,7 +78,7 @@ CAMERAS = {
     "cropped": Mounted(
         Pose(1.9, 0.5, 1.5, 40, 6, 2), ((1, 5, 0), (1, 10, 0), (1, 15, 0)), 100, native=(1280, 960), top=130
     ),
-    "mirrored": Mounted(Pose(-0.9, 0.0, 1.4, 180, 8), tuple(BEHIND), roi=(200, 60, 880, 495)),
+    "mirrored": Mounted(Pose(-0.9, 0.0, 1.4, 180, 8), tuple(BEHIND), roi=(240, 60, 880, 495)),
     "fisheye": Mounted(Pose(3.7, 0.0, 1.2, 0, 25), tuple(AHEAD), 130, "fisheye"),
 }
 
@@ -86,6 +89,24 @@ def _line_end(sign: int, far: int, side: int) -> Mark:
 
 
 LINE_ENDS = tuple(_line_end(*end) for end in (*AHEAD, *BEHIND))
+
+STEERED_RAD = 0.1
+# Points of the front wheels' paths at that angle, none of which is on a line's end: how many points from the end of the
+# path that the page draws, side as above, and how far the centre of the rear axle has travelled by then, m.
+STEERED = ((0, 0, 15.75), (0, -1, 15.75), (8, 0, 0.75 + 15 * (40 / 48) ** 2), (8, -1, 0.75 + 15 * (40 / 48) ** 2))
+
+
+def _wheel(side: int, travelled: float) -> Mark:
+    """Where a front wheel is then: all points of a vehicle turn about one on the line of its rear axle."""
+    radius = CAR.wheelbase_m / math.tan(STEERED_RAD)
+    wheel = complex(CAR.wheelbase_m, CAR.track_m / 2 * (1 + 2 * side))
+    centre = complex(0, radius)
+    place = centre + (wheel - centre) * cmath.exp(1j * travelled / radius)
+    at_camera = CAMERAS["scaled"].pose.x_m
+    return Mark(place.real, place.imag, turned=cmath.phase(place - at_camera))  # upright in its picture
+
+
+WHEELS = tuple(_wheel(side, travelled) for _, side, travelled in STEERED)
 
 # As tum_q7's, with pictures as they are delivered: scaled, cut from a larger native one, a region of it.
 TOP_SIZE = (1280, 800)
@@ -114,7 +135,7 @@ def _all_around() -> Iterator[Mark]:
 ALL_AROUND = tuple(_all_around())
 
 
-def paint(world: Path, marks: Sequence[Mark] = LINE_ENDS) -> None:
+def paint(world: Path, marks: Sequence[Mark] = (*LINE_ENDS, *WHEELS)) -> None:
     """Build the street, with marks around the start of the drive."""
     from runner.synthetic.world import GROUND, build_world, level_of, open_atlas, plan_course, shrink
 
@@ -128,7 +149,8 @@ def paint(world: Path, marks: Sequence[Mark] = LINE_ENDS) -> None:
         sides = (np.arange(-half, half, 0.004) for half in (mark.along, mark.aside))
         along, aside = np.meshgrid(*sides)  # m
         white = np.where((along < 0) == (aside < 0), 230, 25)
-        ahead, left = mark.x + along, mark.y + aside
+        place = complex(mark.x, mark.y) + (along + 1j * aside) * cmath.exp(1j * mark.turned)
+        ahead, left = place.real, place.imag
         x, y = at_x + cos * ahead - sin * left, at_y + sin * ahead + cos * left
         rows, columns = (np.floor(per_m * each).astype(int) for each in (y, x))
         texels = rows % luma.shape[0] * luma.shape[1] + columns % luma.shape[1]

@@ -161,6 +161,14 @@ def boxes(page):
     return page.evaluate(BOXES)
 
 
+SCREENS = ((1280, 720), (1920, 1080), (2560, 1440), (3840, 2160), (1024, 768))
+
+
+def sized(page, width, height):
+    page.set_viewport_size({"width": width, "height": height})
+    until(lambda: page.evaluate("[innerWidth, innerHeight]") == [width, height])
+
+
 def shot(page, name):
     SCREENSHOTS.mkdir(parents=True, exist_ok=True)
     page.screenshot(path=SCREENSHOTS / f"{name}.png")

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 from browser import (
+    SCREENS,
     all_live,
     boxes,
     luma,
@@ -25,6 +26,7 @@ from browser import (
     opened,
     send,
     shot,
+    sized,
     state,
     state_when,
     take_control,
@@ -513,14 +515,6 @@ def test_every_control_has_a_name_for_screen_readers(page):
     page.keyboard.press("Escape")
     page.wait_for_selector("dialog[open]", state="hidden")
     page.locator("#tab-camera").click()
-
-
-SCREENS = ((1280, 720), (1920, 1080), (2560, 1440), (3840, 2160), (1024, 768))
-
-
-def sized(page, width, height):
-    page.set_viewport_size({"width": width, "height": height})
-    until(lambda: page.evaluate("[innerWidth, innerHeight]") == [width, height])
 
 
 def overlap(a, b):

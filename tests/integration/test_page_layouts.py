@@ -13,7 +13,21 @@ from types import SimpleNamespace
 
 import pytest
 
-from browser import all_live, boxes, has_started, loaded, measure, opened, shot, take_control, until, visit
+from browser import (
+    SCREENS,
+    all_live,
+    boxes,
+    has_started,
+    loaded,
+    measure,
+    opened,
+    shot,
+    sized,
+    take_control,
+    until,
+    viewing,
+    visit,
+)
 from rig import SMALL_ROBOT, WAIT_S, answers, free_port, needs_browser, passes, process
 from runner.configuration.config import configuration
 from runner.configuration.layout import HEADER, NOWHERE, Layouts
@@ -63,9 +77,9 @@ def picture():
 
 
 @contextmanager
-def served(picture, layouts, *words, vehicle=SMALL_ROBOT):
+def served(picture, layouts, *words, vehicle=SMALL_ROBOT, conf=None):
     """A vehicle's page with pictures: its server and the station."""
-    vehicle = configuration([*vehicle, *WORDS, f"page.port={free_port()}", *words]).vehicle()
+    vehicle = configuration([*vehicle, *WORDS, f"page.port={free_port()}", *words], conf).vehicle()
     station = Station(vehicle)
     page, ended = PageServer(vehicle, station, layouts=layouts), threading.Event()
     page.silent = set()  # names of cameras that send nothing
@@ -358,6 +372,48 @@ INSIDE = """() => {
   const edges = [...document.querySelectorAll("#drive .words > *")].map((each) => each.getBoundingClientRect());
   return edges.every((each) => each.top >= top - 1 && each.bottom <= bottom + 1);
 }"""
+
+
+TRUCK = """
+# @package _global_
+name: truck
+dimensions: {wheelbase_m: 3.8, track_m: 2.1, width_m: 2.55, front_m: 5.2, rear_m: 1.1}
+cameras:
+  cab:
+    {width_px: 1920, height_px: 1080, fps: 30, fov_deg: 100, calibrated: true,
+     pose: {x_m: 5, y_m: 0, z_m: 2.4, yaw_deg: 0, pitch_deg: 8}, rate_quality: &curve
+     {scaling: [0.5, 1.0], b_min_kbps: [0, 600], b_full_kbps: 3000}}
+  left_mirror_of_the_cab:
+    {width_px: 720, height_px: 1280, fps: 30, pose: {x_m: 4.5, y_m: 1.4, z_m: 2.2, yaw_deg: 165}, rate_quality: *curve}
+  trailer:
+    {width_px: 1280, height_px: 960, fps: 25, pose: {x_m: -9, y_m: 0, z_m: 2, yaw_deg: 180}, rate_quality: *curve}
+"""
+OWNERS = {"paper": ["vehicle=tum_q7"], "robot": ["vehicle=delivery_robot"], "truck": ["vehicle=truck"]}
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("owner", OWNERS)
+def test_both_views_fit_every_screen(chromium, picture, tmp_path, owner):
+    (tmp_path / "vehicle").mkdir()
+    (tmp_path / "vehicle" / "truck.yaml").write_text(TRUCK.lstrip())
+    with (
+        served(picture, None, vehicle=OWNERS[owner], conf=tmp_path) as (server, station),
+        opened(chromium, server.url, 1920, 1080) as page,
+    ):
+        controlling(page)
+        all_live(page)
+        front = next(iter(name for name in station.state.cameras if name in ("front_center", "front", "cab")))
+        for view in ("configure", "drive"):
+            viewing(page, view)
+            for width, height in SCREENS:
+                sized(page, width, height)
+                time.sleep(EVERY_S)  # for the picture of the screen
+                shot(page, f"{owner}-{view}-{width}")
+                pictures, wrong = boxes(page)
+                assert wrong == {"outside": [], "cut": [], "low": [], "scrolls": False}, (view, width, height)
+                assert set(pictures) == set(station.state.cameras)
+                share = pictures[front]["width"] * pictures[front]["height"] / (width * height)
+                assert view == "configure" or share >= 0.4, (view, width, height)
 
 
 def test_eight_lost_pictures_are_named_in_full(chromium, picture):

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from painted import CAMERAS, SIZE, WITHIN_PX, ends_of, found, native_pictures, paint
+from painted import CAMERAS, SIZE, STEERED, STEERED_RAD, WITHIN_PX, ends_of, found, native_pictures, paint
 from stills import MARKS, Station, on_screen, serving
 
 from browser import PADS, all_live, opened, shot, until
@@ -133,10 +133,26 @@ def test_the_wheel_zooms_the_region_the_middle_button_moves_it_and_its_aspect_ma
     name = "mirrored"
     drag(page, at(0.5, 0.5), at(0.6, 0.5), button="middle")
     until(
-        lambda: (getattr(station, "last_request", None) or {}).get("x") == pytest.approx(288, abs=4)
+        lambda: (getattr(station, "last_request", None) or {}).get("x") == pytest.approx(328, abs=4)
     )  # only the last region
     roi = requested_roi()
     assert (roi["y"], roi["width"], roi["height"]) == (60, 880, 495)
+
+
+def test_a_picture_of_a_region_shows_where_it_lies_in_the_full_image(page):
+    def frame(name):
+        return page.locator(f"[data-camera={name}] .picture .diagram")
+
+    for key in (str(list(CAMERAS).index("mirrored") + 1), "Enter"):
+        page.locator("body").press(key)
+    until(lambda: page.locator("[data-camera=mirrored] .picture").bounding_box()["width"] > SIZE[0] / 2)
+    assert [name for name in CAMERAS if frame(name).is_visible()] == ["mirrored"]
+    full, part = (each.bounding_box() for each in (frame("mirrored"), frame("mirrored").locator(".is")))
+    (x, y, wide, high), (width, height) = CAMERAS["mirrored"].roi, SIZE
+    shares = [(part[side] - full[side]) / full[of] for side, of in (("x", "width"), ("y", "height"))]
+    shares += [part[side] / full[side] for side in ("width", "height")]
+    assert shares == pytest.approx([(width - x - wide) / width, y / height, wide / width, high / height], abs=0.03)
+    shot(page, "region")
 
 
 def drag(page, begin, end, button="left"):
@@ -185,6 +201,24 @@ def test_the_path_follows_the_steering_and_disappears_with_it(page, served):
         assert len(paths) == 2 and max(path[-1]["x"] for path in paths) < middle, "to the left"
         shot(page, "guides-steering")
     until(lambda: kinds() == {"width", "distance"})
+
+
+def test_the_path_passes_the_marks_where_the_wheels_will_go(page, served):
+    page.add_style_tag(content=".tile .head, canvas.guides { visibility: hidden; }")
+
+    def paths():
+        return [line["pieces"][0] for line in guides(page, "scaled") if line["kind"] == "path" and line["pieces"]]
+
+    with steering(served, STEERED_RAD):
+        until(lambda: len(paths()) == 2)
+        picture, _ = seen(page, "scaled")
+        points = [paths()[-side][-1 - before] for before, side, _ in STEERED]
+    drawn = [(point["x"], point["y"]) for point in points]
+    marks = [found(picture, each, [other for other in drawn if other is not each]) for each in drawn]
+    scale = scale_of(page, "scaled", CAMERAS["scaled"])
+    apart = [round(math.dist(*pair) / scale, 2) for pair in zip(drawn, marks, strict=True)]
+    print(apart)
+    assert max(apart) < WITHIN_PX
 
 
 @contextmanager

@@ -2,7 +2,8 @@
 
 import { camera, decisionOf, inControl, listen, mode, store } from "./store.js";
 import { pending, request, showProblem, whyNoControl } from "./requests.js";
-import { fullRegion, isLocked, pendingRegion, sendRegion, shownRegion, toggleLocked } from "./roi.js";
+import { fullRegion, isLocked, sendRegion, toggleLocked } from "./roi.js";
+import { RegionFrame } from "./region_frame.js";
 import { SMALLEST } from "./region.js";
 import { makeSlider } from "./slider.js";
 import { SHAPES, STALE, switchCamera, unapplied } from "./tiles.js";
@@ -48,7 +49,7 @@ const sides = Object.fromEntries(SIDES.map((side) => [side, number(`roi-${side}`
 const apply = make("button", { "data-control": "roi-apply", onclick: sendSides }, "Set ROI");
 const full = make("button", { "data-control": "roi-full", onclick: () => sendFull() }, "Full image");
 const locked = make("button", { "data-control": "roi-aspect", onclick: toggleLocked, title: "dragged regions keep the aspect ratio of the full image" }, "Lock aspect");
-const diagram = { box: make("div", { class: "diagram", "aria-hidden": "true" }), shown: make("i", { class: "is" }), requested: make("i", { class: "wish" }) };
+const frame = new RegionFrame();
 const differing = make("p", { class: "differing" });
 const rows = new Map();
 const STAGES = {
@@ -146,7 +147,7 @@ function refresh() {
   setAttribute(straight, "aria-pressed", isStraight(name()));
   refreshSettings(info, now);
   refreshComparison(now);
-  refreshDiagram(info);
+  frame.refresh(name());
   refreshStages();
 }
 
@@ -236,24 +237,6 @@ function refreshStages() {
   setText(age, latency(drawn?.age_ms, drawn?.bound_ms));
 }
 
-/** The region in the full image: solid as shown, dashed as requested. */
-function refreshDiagram(info) {
-  diagram.box.style.aspectRatio = `${info.width} / ${info.height}`;
-  const place = (element, roi) => {
-    element.hidden = !roi;
-    if (!roi) return;
-    const percent = (part, of) => `${(100 * part) / of}%`;
-    Object.assign(element.style, {
-      left: percent(roi.x, info.width),
-      top: percent(roi.y, info.height),
-      width: percent(roi.width, info.width),
-      height: percent(roi.height, info.height),
-    });
-  };
-  place(diagram.shown, shownRegion(name()));
-  place(diagram.requested, pendingRegion(name()));
-}
-
 function onSelected() {
   edited = new Set();
   bitrate.reset();
@@ -261,7 +244,6 @@ function onSelected() {
 }
 
 export function startPanel() {
-  diagram.box.append(diagram.shown, diagram.requested);
   free.addEventListener("change", () => setFactor(+free.value));
   weight.addEventListener("change", setWeight);
   for (const side of SIDES) sides[side].addEventListener("keydown", ({ key }) => key === "Enter" && sendSides());
@@ -273,7 +255,7 @@ export function startPanel() {
     field("ROI", make("div", { class: "sides" }, ...numbers)),
     make("div", { class: "beside" },
       make("div", {}, field("", apply, full, locked), field("Weight", weight, weightNote)),
-      diagram.box),
+      frame.element),
   );
   const head = make("div", { class: "head" }, swatch, title, status, straight, on);
   byId("camera-panel").append(head, reason, controls, comparison(), differing, stageTable());

@@ -4,6 +4,7 @@ import { camera, decisionOf, enlarge, inControl, listen, publish, select, store 
 import { drawFirst, reportSize, transferCanvas, transferGuides } from "./link.js";
 import { pending, request, whyNoControl } from "./requests.js";
 import { dragRegion, shownRegion } from "./roi.js";
+import { RegionFrame, showsPart } from "./region_frame.js";
 import { zoomRegion } from "./zoom.js";
 import { bandsOf, boxesOf, gridOf, heightsOf } from "./layout.js";
 import { arrange, BIRDSEYE, rolesOf, viewOf } from "./arrange.js";
@@ -100,10 +101,11 @@ function buildTile({ name, pose }) {
     box: make("div", { class: "picture", "data-name": name }, canvas),
     rates: make("span", { class: "rates" }),
     form: make("span", { class: "form" }),
+    frame: new RegionFrame(),
   };
   const reason = make("div", { class: "reason", role: "tooltip" });
   const refused = make("p", { class: "refused", hidden: true });
-  parts.box.append(reason, refused);
+  parts.box.append(parts.frame.element, reason, refused);
   const head = make("div", { class: "head" }, parts.swatch, make("b", {}, name), parts.shown, parts.status, parts.on);
   const foot = make("div", { class: "caption" }, parts.rates, parts.form);
   const element = make(
@@ -187,7 +189,9 @@ function layOutDrive() {
 function setView(name, view) {
   const part = tiles.get(name);
   part.view = view;
-  Object.assign(part.canvas.style, { objectFit: view.fit, objectPosition: `${100 * view.align}% 50%`, transform: view.mirrored ? "scaleX(-1)" : "" });
+  const transform = view.mirrored ? "scaleX(-1)" : "";
+  Object.assign(part.canvas.style, { objectFit: view.fit, objectPosition: `${100 * view.align}% 50%`, transform });
+  part.frame.element.style.transform = transform;
   reportFrame(name);
 }
 
@@ -199,8 +203,10 @@ function reportFrame(name) {
 }
 
 /** State which part of the picture is shown. */
-function refreshFraming(name, { box, shown, view }) {
+function refreshFraming(name, { box, shown, view, frame }) {
   const info = camera(name);
+  frame.element.hidden = !showsPart(name);
+  if (showsPart(name)) frame.refresh(name);
   const picture = (isStraight(name) ? null : shownRegion(name)) ?? info;
   const isLaidOut = info && picture && box.clientWidth && box.clientHeight;
   const framing = isLaidOut ? framingText({ width: box.clientWidth, height: box.clientHeight }, picture, view) : "";
