@@ -136,14 +136,19 @@ BOXES = """() => {
   const isLow = ({ scrollHeight, clientHeight }) => scrollHeight > clientHeight + 1;
   const named = ({ id, className, tagName, textContent }) => `${id || className || tagName}: ${textContent}`;
   const seen = ".tile, .picture, #header > *, #side, #drive *";
+  const inputs = "#side :is(input, button, label)";
+  const isBeside = (element) => {
+    const [own, panel] = [element, document.querySelector("#side")].map((each) => each.getBoundingClientRect());
+    return own.left < panel.left || own.right > panel.right;
+  };
   const measured = () => {
     const { scrollWidth, scrollHeight } = document.scrollingElement;
     return [
       Object.fromEntries(find(".picture").map((each) => [each.dataset.name, box(each)])),
       {
-        outside: find(seen).filter((each) => isOutside(box(each))).map(named),
-        cut: find("#drive *, .tile .head, .tile .head *, .tile .caption, #header *").filter(isCut).map(named),
-        low: find("#drive > *").filter(isLow).map(named),
+        outside: [...find(seen).filter((each) => isOutside(box(each))), ...find(inputs).filter(isBeside)].map(named),
+        cut: find(`#drive *, .tile .head, .tile .head *, .tile .caption, #header *, ${inputs}`).filter(isCut).map(named),
+        low: find("#drive > *, .tile .head, .tile .head b").filter(isLow).map(named),
         scrolls: scrollWidth > innerWidth || scrollHeight > innerHeight,
       },
     ];

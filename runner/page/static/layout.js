@@ -1,5 +1,6 @@
 /**
- * Layout of the tiles: bands of rows, pictures in the aspect ratio of the full image. Pure; lengths in px.
+ * Layout of the tiles: bands of rows, boxes in the aspect ratio of the full image, but never higher than wide, since
+ * names and figures need room. Pure; lengths in px.
  *
  * A row without a spanning picture is a band of its own: its pictures are equally high and stand side by side. Rows that
  * spanning pictures join are a band with a grid, whose columns are equally wide and whose rows are equally high.
@@ -117,7 +118,7 @@ const columnFor = (tile, height, chrome) => (heightOf(tile, height, chrome) * as
 /** Height of a tile's picture, with the gaps and the chrome of the tiles that it spans. */
 const heightOf = ({ row_span }, height, chrome) => height * row_span + (chrome + GAP) * (row_span - 1);
 
-const aspectOf = ({ width, height }) => width / height;
+const aspectOf = ({ width, height }) => Math.max(1, width / height);
 
 /** The level L with sum(min(limit, L)) = total. */
 function waterLevel(limits, total) {

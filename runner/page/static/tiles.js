@@ -106,7 +106,7 @@ function buildTile({ name, pose }) {
   const reason = make("div", { class: "reason", role: "tooltip" });
   const refused = make("p", { class: "refused", hidden: true });
   parts.box.append(parts.frame.element, reason, refused);
-  const head = make("div", { class: "head" }, parts.swatch, make("b", {}, name), parts.shown, parts.status, parts.on);
+  const head = make("div", { class: "head" }, parts.swatch, make("b", {}, ...breakable(name)), parts.shown, parts.status, parts.on);
   const foot = make("div", { class: "caption" }, parts.rates, parts.form);
   const element = make(
     "article",
@@ -127,6 +127,9 @@ function buildTile({ name, pose }) {
   zoomRegion(name, parts.box, () => tiles.get(name).view);
   sizes.observe(parts.box);
 }
+
+/** A name that may continue in a second line after an underscore. @param {string} name */
+const breakable = (name) => name.split(/(?<=_)/).flatMap((part) => [part, make("wbr")]);
 
 /** Request to switch a camera on or off: the opposite of the state that the vehicle reports. */
 export function switchCamera(name) {
