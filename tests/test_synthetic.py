@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
+import sys
 from collections import namedtuple
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -157,6 +159,29 @@ def test_an_interrupt_ends_the_workers_and_leaves_no_partial_clip(world: Path, t
 def test_failing_worker(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError, match="rendering the drive: FileNotFoundError"):
         synthetic._distribute([FORWARD], SECONDS, tmp_path, tmp_path / "no world", nothing)
+
+
+UNGUARDED = """
+from fractions import Fraction
+from pathlib import Path
+import sys
+from runner.clips import View
+from runner.core.model import Pose
+from runner.synthetic import render
+view = View(160, 96, Fraction(5), Pose(2, 0, 1.5, 0), 90, "pinhole")
+render([view], 4, Path(sys.argv[1]), lambda *_: None)
+"""
+
+
+def test_a_script_without_a_guard_ends_with_the_reason(tmp_path: Path) -> None:
+    """Each worker runs it again; there the call must not wait for the one that started the worker."""
+    script = tmp_path / "script.py"
+    script.write_text(UNGUARDED)
+    words = [sys.executable, str(script), str(tmp_path / "cache")]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 1
+    assert "if __name__ == '__main__':" in done.stderr
+    assert "RuntimeError: rendering the drive: a worker died with exit code 1" in done.stderr
 
 
 # --- the files ------------------------------------------------------------------------------------------------------

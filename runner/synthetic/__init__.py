@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
-import multiprocessing
+import multiprocessing.spawn
 import os
 import shutil
 import signal
@@ -40,6 +40,7 @@ def render(views: Sequence[View], seconds: float, cache: Path, progress: Progres
     if seconds < SHORTEST_S:
         raise ValueError(f"seconds: {seconds:g}: must be at least {SHORTEST_S}")
     cache.mkdir(parents=True, exist_ok=True)
+    _refuse_in_unguarded_script()
     with _only_renderer(cache, progress):
         _remove_unfinished(cache)  # left by a killed run
         missing = [view for view in dict.fromkeys(views) if not clip_path(view, seconds, cache).exists()]
@@ -51,6 +52,14 @@ def render(views: Sequence[View], seconds: float, cache: Path, progress: Progres
             finally:
                 _remove_unfinished(cache)
     progress("drive rendered", 1.0)
+
+
+def _refuse_in_unguarded_script() -> None:
+    """Raise RuntimeError in a worker that runs the caller's script again; it would wait for its parent's lock.
+
+    Workers import that script (start method "spawn"), which therefore needs `if __name__ == "__main__":`.
+    """
+    multiprocessing.spawn.get_preparation_data("worker")
 
 
 @contextmanager
@@ -142,7 +151,7 @@ def _receive(pipe: Connection, worker: BaseProcess) -> int | None:
     """Pixels done since the last report, or None for a finished clip."""
     try:
         report = pipe.recv()
-    except EOFError:
+    except (EOFError, ConnectionResetError):
         worker.join()
         raise RuntimeError(f"rendering the drive: a worker died with exit code {worker.exitcode}") from None
     if isinstance(report, str):

@@ -137,6 +137,7 @@ BOXES = """() => {
   const named = ({ id, className, tagName, textContent }) => `${id || className || tagName}: ${textContent}`;
   const seen = ".tile, .picture, #header > *, #side, #drive *";
   const inputs = "#side :is(input, button, label)";
+  const texts = `#drive *, .tile .head, .tile .head *, .tile .caption, #header *, ${inputs}`;
   const isBeside = (element) => {
     const [own, panel] = [element, document.querySelector("#side")].map((each) => each.getBoundingClientRect());
     return own.left < panel.left || own.right > panel.right;
@@ -147,7 +148,7 @@ BOXES = """() => {
       Object.fromEntries(find(".picture").map((each) => [each.dataset.name, box(each)])),
       {
         outside: [...find(seen).filter((each) => isOutside(box(each))), ...find(inputs).filter(isBeside)].map(named),
-        cut: find(`#drive *, .tile .head, .tile .head *, .tile .caption, #header *, ${inputs}`).filter(isCut).map(named),
+        cut: find(texts).filter(isCut).map(named),
         low: find("#drive > *, .tile .head, .tile .head b").filter(isLow).map(named),
         scrolls: scrollWidth > innerWidth || scrollHeight > innerHeight,
       },
