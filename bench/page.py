@@ -110,13 +110,12 @@ def overlays(
     """What lines on the ground, figures and frames of regions add to source to screen."""
 
     def show(page: Page, with_them: bool) -> None:
-        shows = bool(page.evaluate("document.querySelector('canvas.guides:not([hidden])') !== null"))
-        if shows != with_them:
+        if are_shown(page) != with_them:
             page.keyboard.press("g")
         page.evaluate("bare => document.body.classList.toggle('bare', bare)", not with_them)
 
     def are_shown(page: Page) -> bool:
-        return bool(page.evaluate("tod.guides('camera_0')"))
+        return bool(page.evaluate("document.querySelector('canvas.guides:not([hidden])') !== null"))
 
     names = [f"camera_{number}" for number in range(count)]
     with _vehicle(count, video, kbps) as words:
@@ -130,7 +129,10 @@ def birdseye(
     """What the bird's-eye view adds to source to screen of the cameras beside it, and what is skipped of them."""
 
     def show(page: Page, with_it: bool) -> None:
-        until(lambda: is_shown(page) == with_it or page.keyboard.press("e"), every_s=0.2)  # in the row, large, off
+        if is_shown(page) != with_it:
+            for _ in range(1 if with_it else 2):  # the key cycles: in the row, large, off
+                page.keyboard.press("e")
+            until(lambda: is_shown(page) == with_it)
 
     def is_shown(page: Page) -> bool:
         return bool(page.locator("#birdseye").is_visible())
