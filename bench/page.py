@@ -46,10 +46,10 @@ ONE, EIGHT = (
 )
 COUNTS = (1, 2, 4, 8)  # of cameras, for skipped pictures
 PAIRS = 10  # of blocks with and without overlays or the bird's-eye view
-TOP_VIEWS = 4  # cameras of a bird's-eye view; their own pictures are not shown beside it
+TOP_VIEWS = 4  # cameras of a bird's-eye view, which replaces their own pictures
 BLOCK_SETTLE_S = 0.3
 STEERING_S, STEERING_RAD = 0.05, 0.3  # between two reports, and amplitude: the path changes in each picture
-# The page's own frame of a region, which it normally shows only until the picture has the new region.
+# The rectangle of a requested region, which the page shows only until the picture has that region.
 OVERLAYS = ".bare #drive { visibility: hidden } body:not(.bare) .roi-drag { display: block !important; inset: 20% }"
 
 
@@ -107,7 +107,7 @@ def skipped(browser: Browser, count: int, seconds: float) -> Row:
 def overlays(
     browser: Browser, what: str, count: int, video: tuple[int, int, int], kbps: int, seconds: float
 ) -> Iterator[Row]:
-    """What lines on the ground, figures and frames of regions add to source to screen."""
+    """What lines on the ground, figures and rectangles of requested regions add to source to screen."""
 
     def show(page: Page, with_them: bool) -> None:
         if are_shown(page) != with_them:
@@ -126,7 +126,7 @@ def overlays(
 def birdseye(
     browser: Browser, what: str, count: int, video: tuple[int, int, int], kbps: int, seconds: float
 ) -> Iterator[Row]:
-    """What the bird's-eye view adds to source to screen of the cameras beside it, and what is skipped of them."""
+    """What the bird's-eye view, in place of its own cameras' pictures, adds to source to screen of the others."""
 
     def show(page: Page, with_it: bool) -> None:
         if is_shown(page) != with_it:
@@ -140,7 +140,7 @@ def birdseye(
     beside = [f"camera_{number}" for number in range(count - TOP_VIEWS)]
     with _vehicle(count, video, kbps, TOP_VIEWS) as words:
         blocks = _alternating(browser, words, beside, show, is_shown, seconds)
-    yield _added(f"{what}: bird's-eye view of {TOP_VIEWS} adds to the others", blocks)
+    yield _added(f"{what}: bird's-eye view in place of {TOP_VIEWS} pictures adds to the others", blocks)
     for with_it in (True, False):
         skipped = [block.skipped for block in blocks if block.with_them == with_it]
         how = "with" if with_it else "without"

@@ -100,7 +100,7 @@ class SupervisedPipeline:
 
     def _on_first_buffer(self, _pad: Gst.Pad, _info: Gst.PadProbeInfo, attempt: int) -> Gst.PadProbeReturn:
         """From a streaming thread."""
-        GLib.idle_add(self._on_working, attempt, priority=GLib.PRIORITY_DEFAULT)
+        GLib.idle_add(self._on_working, attempt, priority=GLib.PRIORITY_DEFAULT)  # idle priority may starve
         return Gst.PadProbeReturn.REMOVE
 
     def _on_working(self, attempt: int) -> bool:

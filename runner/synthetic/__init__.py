@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
-import multiprocessing.spawn
+import multiprocessing
 import os
 import shutil
 import signal
@@ -57,9 +57,11 @@ def render(views: Sequence[View], seconds: float, cache: Path, progress: Progres
 def _refuse_in_unguarded_script() -> None:
     """Raise RuntimeError in a worker that runs the caller's script again; it would wait for its parent's lock.
 
-    Workers import that script (start method "spawn"), which therefore needs `if __name__ == "__main__":`.
+    Workers import that script (start method "spawn"). While they do, this private attribute is set; `multiprocessing`
+    itself checks it for the same purpose, but only when the worker starts a process.
     """
-    multiprocessing.spawn.get_preparation_data("worker")
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
+        raise RuntimeError('a script that renders the synthetic drive needs `if __name__ == "__main__":`')
 
 
 @contextmanager

@@ -57,8 +57,13 @@ def visit(page, url):
 
 
 def has_started(page):
-    """Whether the page's main module has run."""
-    return page.evaluate("window.tod !== undefined")
+    """Whether the page's main module has run; not if the page loads again meanwhile."""
+    try:
+        return page.evaluate("window.tod !== undefined")
+    except sync_api.Error as error:
+        if "Execution context was destroyed" not in error.message:
+            raise
+        return False
 
 
 def loaded(page):
@@ -138,18 +143,18 @@ BOXES = """() => {
   const seen = ".tile, .picture, #header > *, #side, #drive *";
   const inputs = "#side :is(input, button, label)";
   const texts = `#drive *, .tile .head, .tile .head *, .tile .caption, #header *, ${inputs}`;
-  const isBeside = (element) => {
+  const leavesPanel = (element) => {
     const [own, panel] = [element, document.querySelector("#side")].map((each) => each.getBoundingClientRect());
-    return own.left < panel.left || own.right > panel.right;
+    return own.left < panel.left - 1 || own.right > panel.right + 1;
   };
   const measured = () => {
     const { scrollWidth, scrollHeight } = document.scrollingElement;
     return [
       Object.fromEntries(find(".picture").map((each) => [each.dataset.name, box(each)])),
       {
-        outside: [...find(seen).filter((each) => isOutside(box(each))), ...find(inputs).filter(isBeside)].map(named),
+        outside: [...find(seen).filter((each) => isOutside(box(each))), ...find(inputs).filter(leavesPanel)].map(named),
         cut: find(texts).filter(isCut).map(named),
-        low: find("#drive > *, .tile .head, .tile .head b").filter(isLow).map(named),
+        low: find("#drive > *, .tile .head").filter(isLow).map(named),
         scrolls: scrollWidth > innerWidth || scrollHeight > innerHeight,
       },
     ];

@@ -402,7 +402,7 @@ def test_both_views_fit_every_screen(chromium, picture, tmp_path, owner):
     ):
         controlling(page)
         all_live(page)
-        front = next(iter(name for name in station.state.cameras if name in ("front_center", "front", "cab")))
+        front = next(name for name in station.state.cameras if name in ("front_center", "front", "cab"))
         for view in ("configure", "drive"):
             viewing(page, view)
             for width, height in SCREENS:

@@ -26,6 +26,7 @@ from runner.core.model import Endpoint
 from runner.core.roles import Role
 from runner.drive.read import read_drive
 from runner.gst.secure import StreamLogin
+from runner.gst.server import NO_PASSWORD
 from runner.link import Limit, limited_link
 from runner.mqtt.broker import private_broker
 from runner.mqtt.link import ControlLink
@@ -412,8 +413,10 @@ def test_rtsp_refuses_intruders(keys, tmp_path):
             for holder, (own, _) in zip(intruders, all_seen, strict=True):
                 assert set(own().values()) == {0}, holder
             _revoked_while_watching(keys, plans, reports)
-    # On a busy machine, a watcher may end between the server's challenge and its answer.
-    refusals = [what for what in reports if "refused" in what and not what.endswith("it has given no password")]
+    refusals = [what for what in reports if "refused" in what]
+    # On a busy machine, a watcher may end between the challenge of the server and its answer.
+    for unanswered in [what for what in refusals if what.endswith(NO_PASSWORD)][:1]:
+        refusals.remove(unanswered)
     assert sorted(refusals) == sorted(
         f"keys: refused an RTSP client at 127.0.0.1: {why}"
         for why in (

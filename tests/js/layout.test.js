@@ -13,6 +13,15 @@ const at = (row, column, row_span = 1, column_span = 1) => ({ row, column, row_s
 const names = (bands) => bands.map(({ tiles }) => tiles.map((tile) => tile.camera.name));
 const where = (bands) => bands.map(({ tiles }) => tiles.map(({ camera: { name }, row, column }) => [name, row, column]));
 
+test("the box of a portrait picture is square, in a row and in a grid", () => {
+  const portrait = camera("mirror", 720, 1280);
+  const [row] = bandsOf([portrait], {});
+  assert.deepEqual(boxesOf(row, 300, 1000, CHROME).boxes, [{ width: 300, height: 300 }]);
+  const [grid] = bandsOf([portrait], { mirror: at(0, 0, 2, 1) });
+  const [{ width, height }] = boxesOf(grid, 100, 1000, CHROME).boxes;
+  assert.equal(width, height);
+});
+
 test("places give rows and their order, whatever the order of the cameras", () => {
   const places = { rear: at(2, 1), right: at(1, 3), left: at(1, 1), center: at(1, 2) };
   assert.deepEqual(names(bandsOf(cameras("rear", "right", "left", "center"), places)), [["left", "center", "right"], ["rear"]]);

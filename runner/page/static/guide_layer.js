@@ -31,9 +31,6 @@ export class GuideLayer {
   canvas = null;
   /** @type {OffscreenCanvasRenderingContext2D|null} */
   context = null;
-  // All lines but the paths, which change with the steering in each picture.
-  still = /** @type {OffscreenCanvasRenderingContext2D} */ (new OffscreenCanvas(1, 1).getContext("2d"));
-  still_drawn = "nothing yet"; // what that canvas shows
 
   /**
    * @param {import("./projection.js").Optics & {calibrated: boolean}} camera
@@ -50,7 +47,7 @@ export class GuideLayer {
   setOptics(optics) {
     this.toImage = projection(optics);
     this.straight = this.straightLines();
-    this.drawn = this.still_drawn = "nothing yet";
+    this.drawn = "nothing yet";
   }
 
   straightLines() {
@@ -88,40 +85,20 @@ export class GuideLayer {
   drawOn(context, display, { picture, region, rad }) {
     const shown = placement(display, picture, display.view);
     const toBox = imageToBox(display, picture, display.view, region);
-    const inBox = (guides) => guides.map((guide) => ({ ...guide, pieces: guide.pieces.map((piece) => piece.map(toBox)) }));
-    const straight = inBox(this.straight);
-    const paths = rad === null ? [] : inBox(pathGuides(this.dimensions, rad).map((guide) => this.project(guide)));
-    this.lines = [...straight, ...paths];
-    const described = JSON.stringify([display, picture, region]);
-    if (described !== this.still_drawn) this.drawStill(straight, display, shown);
-    this.still_drawn = described;
-    context.drawImage(this.still.canvas, 0, 0);
-    strokeIn(context, paths, display, shown);
-  }
-
-  drawStill(lines, display, shown) {
-    const { canvas } = this.still;
-    Object.assign(canvas, sizeOf(display)); // clears it
-    strokeIn(this.still, lines, display, shown);
+    const thick = Math.min(1.5, Math.max(0.6, shown.width / USUAL_PX));
+    const paths = rad === null ? [] : pathGuides(this.dimensions, rad).map((guide) => this.project(guide));
+    context.scale(display.ratio, display.ratio);
+    context.beginPath();
+    context.rect(shown.x, shown.y, shown.width, shown.height);
+    context.clip();
+    const lines = (this.lines = [...this.straight, ...paths].map((guide) => ({ ...guide, pieces: guide.pieces.map((piece) => piece.map(toBox)) })));
+    for (const { kind, pieces } of lines) for (const piece of pieces) stroke(context, piece, thick * (LINE_WIDTHS[kind] + 2), "rgba(0,0,0,0.55)");
+    for (const { kind, pieces } of lines) for (const piece of pieces) stroke(context, piece, thick * LINE_WIDTHS[kind], COLOURS[kind]);
     const visible = visibleIn(display, shown);
-    labelDistances(this.still, lines, visible);
-    if (this.label) labelPicture(this.still, this.label, visible);
+    labelDistances(context, lines, visible);
+    if (this.label) labelPicture(context, this.label, visible);
   }
 }
-
-/** Stroke lines within the part of the box that the picture covers. */
-function strokeIn(context, lines, { ratio }, shown) {
-  const thick = Math.min(1.5, Math.max(0.6, shown.width / USUAL_PX));
-  context.setTransform(ratio, 0, 0, ratio, 0, 0);
-  context.beginPath();
-  context.rect(shown.x, shown.y, shown.width, shown.height);
-  context.clip();
-  for (const { kind, pieces } of lines) for (const piece of pieces) stroke(context, piece, thick * (LINE_WIDTHS[kind] + 2), "rgba(0,0,0,0.55)");
-  for (const { kind, pieces } of lines) for (const piece of pieces) stroke(context, piece, thick * LINE_WIDTHS[kind], COLOURS[kind]);
-}
-
-/** Size in pixels of a canvas that fills a box. */
-const sizeOf = ({ width, height, ratio }) => ({ width: Math.round(width * ratio), height: Math.round(height * ratio) });
 
 /** The part of the box that the picture covers. */
 function visibleIn({ width, height }, shown) {
@@ -165,8 +142,8 @@ function labelDistances(context, lines, visible) {
  * @param {OffscreenCanvasRenderingContext2D} context  @param {Omit<Display, "view">} display
  * @returns {boolean} whether it has; if not, it will be drawn later
  */
-export function clearTo(context, display) {
-  const isResized = resize(context.canvas, sizeOf(display));
+export function clearTo(context, { width, height, ratio }) {
+  const isResized = resize(context.canvas, { width: Math.round(width * ratio), height: Math.round(height * ratio) });
   if (isResized) context.reset();
   return isResized;
 }

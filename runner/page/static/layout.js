@@ -1,6 +1,6 @@
 /**
- * Layout of the tiles: bands of rows, boxes in the aspect ratio of the full image, but never higher than wide, since
- * names and figures need room. Pure; lengths in px.
+ * Layout of the tiles: bands of rows, boxes in the aspect ratio of the full image. Those of portrait images are square,
+ * since names and figures need room. Pure; lengths in px.
  *
  * A row without a spanning picture is a band of its own: its pictures are equally high and stand side by side. Rows that
  * spanning pictures join are a band with a grid, whose columns are equally wide and whose rows are equally high.
@@ -88,14 +88,14 @@ export function heightsOf(bands, width, height, chrome) {
 
 /** Height of the pictures in a row at which a band is as wide as the area. */
 function highestOf(band, width, chrome) {
-  if (!band.grid) return (width - (band.tiles.length - 1) * GAP) / band.tiles.reduce((sum, { camera }) => sum + aspectOf(camera), 0);
+  if (!band.grid) return (width - (band.tiles.length - 1) * GAP) / band.tiles.reduce((sum, { camera }) => sum + boxAspect(camera), 0);
   const column = (width - (band.columns - 1) * GAP) / band.columns;
   return Math.max(...band.tiles.map((tile) => rowFor(tile, column, chrome)));
 }
 
 /** Height of the pictures in a row at which a tile's picture fills its columns. */
 const rowFor = ({ camera, row_span, column_span }, column, chrome) =>
-  ((column * column_span + GAP * (column_span - 1)) / aspectOf(camera) - (row_span - 1) * (chrome + GAP)) / row_span;
+  ((column * column_span + GAP * (column_span - 1)) / boxAspect(camera) - (row_span - 1) * (chrome + GAP)) / row_span;
 
 /**
  * The boxes of a band's pictures, in the order of its tiles, and the width of a grid's columns (0: no grid). In
@@ -104,7 +104,7 @@ const rowFor = ({ camera, row_span, column_span }, column, chrome) =>
  * @returns {{column: number, boxes: {width: number, height: number}[]}}
  */
 export function boxesOf(band, height, width, chrome) {
-  if (!band.grid) return { column: 0, boxes: band.tiles.map(({ camera }) => ({ width: Math.floor(height * aspectOf(camera)), height })) };
+  if (!band.grid) return { column: 0, boxes: band.tiles.map(({ camera }) => ({ width: Math.floor(height * boxAspect(camera)), height })) };
   const widest = (width - (band.columns - 1) * GAP) / band.columns;
   const wished = Math.max(...band.tiles.map((tile) => columnFor(tile, height, chrome)));
   const column = Math.floor(Math.min(widest, wished));
@@ -113,12 +113,12 @@ export function boxesOf(band, height, width, chrome) {
 }
 
 /** Width of the columns at which a tile's picture fills its height. */
-const columnFor = (tile, height, chrome) => (heightOf(tile, height, chrome) * aspectOf(tile.camera) - GAP * (tile.column_span - 1)) / tile.column_span;
+const columnFor = (tile, height, chrome) => (heightOf(tile, height, chrome) * boxAspect(tile.camera) - GAP * (tile.column_span - 1)) / tile.column_span;
 
 /** Height of a tile's picture, with the gaps and the chrome of the tiles that it spans. */
 const heightOf = ({ row_span }, height, chrome) => height * row_span + (chrome + GAP) * (row_span - 1);
 
-const aspectOf = ({ width, height }) => Math.max(1, width / height);
+const boxAspect = ({ width, height }) => Math.max(1, width / height);
 
 /** The level L with sum(min(limit, L)) = total. */
 function waterLevel(limits, total) {

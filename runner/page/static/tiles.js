@@ -128,7 +128,7 @@ function buildTile({ name, pose }) {
   sizes.observe(parts.box);
 }
 
-/** A name that may continue in a second line after an underscore. @param {string} name */
+/** A name that may be broken into lines after its underscores. @param {string} name */
 const breakable = (name) => name.split(/(?<=_)/).flatMap((part) => [part, make("wbr")]);
 
 /** Request to switch a camera on or off: the opposite of the state that the vehicle reports. */
@@ -208,8 +208,9 @@ function reportFrame(name) {
 /** State which part of the picture is shown. */
 function refreshFraming(name, { box, shown, view, frame }) {
   const info = camera(name);
-  frame.element.hidden = !showsPart(name);
-  if (showsPart(name)) frame.refresh(name);
+  const isPart = info && !isStraight(name) && showsPart(name);
+  frame.element.hidden = !isPart;
+  if (isPart) frame.refresh(name);
   const picture = (isStraight(name) ? null : shownRegion(name)) ?? info;
   const isLaidOut = info && picture && box.clientWidth && box.clientHeight;
   const framing = isLaidOut ? framingText({ width: box.clientWidth, height: box.clientHeight }, picture, view) : "";
