@@ -25,17 +25,31 @@ until = partial(rig.until, every_s=0.1)  # each poll costs the browser time
 NETWORK_CHANGED = "net::ERR_NETWORK_CHANGED"
 
 
+# Sound is blocked until a press, as in a browser that a person uses: Playwright's `evaluate` counts as one.
+SOUND_BLOCKED = """
+  let isPressed = false;
+  for (const kind of ["keydown", "pointerdown"]) addEventListener(kind, () => (isPressed = true), { capture: true });
+  AudioContext = class extends AudioContext {
+    constructor(...words) { super(...words); if (!isPressed) super.suspend(); }
+    get state() { return isPressed ? super.state : "suspended"; }
+    resume() { return isPressed ? super.resume() : Promise.reject(new Error("blocked")); }
+  };
+"""
+
+
 @contextmanager
-def opened(browser, url, width=1280, height=800, refused=False, **context):
+def opened(browser, url, width=1280, height=800, refused=False, script="", **context):
     """A page in its own browser context, which must stay free of errors and contact no other host.
 
     refused  the station goes offline in between, which the browser logs for each request
+    script   runs before the page's own
     """
     with browser.new_context(viewport={"width": width, "height": height}, **context) as tab:
         wrong, own = [], (url.partition("#")[0], "data:", "blob:")
         tab.on("weberror", lambda error: wrong.append(str(error.error)))
         tab.on("console", lambda message: wrong.append(message.text) if message.type == "error" else None)
         tab.on("request", lambda request: request.url.startswith(own) or wrong.append(request.url))
+        tab.add_init_script(script)
         page = tab.new_page()
         visit(page, url)
         assert rig.passes(lambda: has_started(page)), (wrong, loaded(page))

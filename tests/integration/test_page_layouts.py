@@ -15,6 +15,7 @@ import pytest
 
 from browser import (
     SCREENS,
+    SOUND_BLOCKED,
     all_live,
     boxes,
     has_started,
@@ -275,7 +276,7 @@ def colour_at(page, camera, across, down):
 
 def test_a_driver_is_warned_in_either_view(chromium, picture):
     """Out of focus, a picture that was lost before, another page that takes control."""
-    with served(picture, None) as (server, _), opened(chromium, server.url) as page:
+    with served(picture, None) as (server, _), opened(chromium, server.url, script=SOUND_BLOCKED) as page:
         all_live(page)
         controlling(page)
         count = "start(at) { globalThis.tones = (globalThis.tones ?? 0) + 1; super.start(at); }"
