@@ -53,11 +53,9 @@ def test_lines_end_at_the_marks_on_the_ground(page):
     until(lambda: guides(page, "fisheye"))
     page.add_style_tag(content=".tile .head, .drawn-off canvas.guides { visibility: hidden; }")
     apart = {}
-    for number, (name, camera) in enumerate(CAMERAS.items(), 1):
+    for name, camera in CAMERAS.items():
         if name in ("mirrored", "fisheye"):
-            for key in ("Escape", str(number), "Enter"):
-                page.locator("body").press(key)
-            until(lambda n=name: page.locator(f"[data-camera={n}] .picture").bounding_box()["width"] > SIZE[0] / 2)
+            enlarge(page, name)
         on, lines = seen(page, name)
         shot(page, f"guides-{name}")
         page.evaluate("document.body.classList.add('drawn-off')")
@@ -143,9 +141,7 @@ def test_a_picture_of_a_region_shows_where_it_lies_in_the_full_image(page):
     def frame(name):
         return page.locator(f"[data-camera={name}] .picture .diagram")
 
-    for key in (str(list(CAMERAS).index("mirrored") + 1), "Enter"):
-        page.locator("body").press(key)
-    until(lambda: page.locator("[data-camera=mirrored] .picture").bounding_box()["width"] > SIZE[0] / 2)
+    enlarge(page, "mirrored")
     assert [name for name in CAMERAS if frame(name).is_visible()] == ["mirrored"]
     full, part = (each.bounding_box() for each in (frame("mirrored"), frame("mirrored").locator(".is")))
     (x, y, wide, high), (width, height) = CAMERAS["mirrored"].roi, SIZE
@@ -153,6 +149,12 @@ def test_a_picture_of_a_region_shows_where_it_lies_in_the_full_image(page):
     shares += [part[side] / full[side] for side in ("width", "height")]
     assert shares == pytest.approx([(width - x - wide) / width, y / height, wide / width, high / height], abs=0.03)
     shot(page, "region")
+
+
+def enlarge(page, name):
+    for key in ("Escape", str(list(CAMERAS).index(name) + 1), "Enter"):
+        page.locator("body").press(key)
+    until(lambda: page.locator(f"[data-camera={name}] .picture").bounding_box()["width"] > SIZE[0] / 2)
 
 
 def drag(page, begin, end, button="left"):
