@@ -242,6 +242,6 @@ class Keyring:
         path = self.directory / name
         try:
             exposed = exposure(path)
-        except OSError as error:
-            return (error.strerror or str(error)).lower()
+        except ValueError as error:
+            return str(error)
         return None if name in PUBLIC else exposed

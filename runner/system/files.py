@@ -100,9 +100,12 @@ def read_file(path: Path, most_bytes: int) -> bytes:
 def exposure(path: Path) -> str | None:
     """What is wrong with the mode of a file that only its owner may read; None if nothing is.
 
-    raises  OSError
+    raises  ValueError with the reason why it has no mode, such as: no such file
     """
-    mode = path.stat().st_mode
+    try:
+        mode = path.stat().st_mode
+    except OSError as error:
+        raise ValueError((error.strerror or str(error)).lower()) from None
     if mode & (stat.S_IRWXG | stat.S_IRWXO):
         return f"others may read it (mode {stat.S_IMODE(mode):o}); chmod 600"
     return None

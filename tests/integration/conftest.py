@@ -27,7 +27,17 @@ LONGEST = (
     "test_secure",
     "test_server",
     "test_control",
+    "test_page_layouts",
+    "test_ends",
+    "test_page_sides",
     "test_ip_camera",
+    "test_link",
+    "test_latency",
+    "test_video_files",
+    "test_record",
+    "test_contract",
+    "test_receiver",
+    "test_quality",
 )
 
 # Files of drives among the tests marked `alone`, in two groups: the tests of a group run one after the other.
