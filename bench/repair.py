@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from uplinks import FIGURES, Figures, drive, figures, row, shown
+from uplinks import FIGURES, FPS, Figures, figures, measured_drive, row, shown
 
 KBPS, REDUNDANCY = 3000, 0.2
 LOSSES = (0.01, 0.03)
@@ -35,7 +35,7 @@ def main() -> None:
     for number in range(options.runs):
         for name, done in drives.items():
             path = options.output / f"{name}.{number}"
-            drive(path, [*BASE, *cases[name]], options.seconds)
+            measured_drive(path, [*BASE, *cases[name], f"fps_max={FPS}", f"duration_s={options.seconds}"])
             done.append(figures(path))
             print(path.name, {key: round(done[-1][key], 4) for key in COLUMNS}, flush=True)
     print(row("case", *(FIGURES[key] for key in COLUMNS)))

@@ -2,10 +2,12 @@
 
   sudo python bench/rfc8867.py OUT                            all cases, 25 minutes
   sudo python bench/rfc8867.py OTHER --only 5_6_long_tcp --runs 5 --words modes=paper
+  python bench/rfc8867.py THIRD --only 5_1_variable --quality
 
-A row for each case: medians over the runs, and their range. A row is void if a busy machine dropped frames. OUT keeps
-the drives, existing ones are not repeated, and OUT/rfc8867.png charts the first run of each case. Run it on an
-otherwise idle machine, as root for the cases with TCP.
+A row for each case: medians over the runs, and their range. A row is void if a busy machine dropped frames. --quality
+also measures the delivered pictures: the drives store videos, and take about twice as long in all. OUT keeps the
+drives, existing ones are not repeated, and OUT/rfc8867.png charts the first run of each case. Run it on an otherwise
+idle machine, as root for the cases with TCP.
 """
 
 from __future__ import annotations
@@ -25,6 +27,8 @@ from uplinks import (
     cameras,
     dropped_share,
     ensure_drive,
+    measured_drive,
+    mssim,
     queue_ms,
     row,
     shown,
@@ -55,8 +59,11 @@ FIGURES = {
     "up": "up s",
     "front": f"{WEIGHTED} of all cameras %",
     "busy": "frames dropped by the cameras %",
+    "mssim": "MSSIM mean",
+    "worst": "MSSIM worst",
 }
 SETTLED_SHARE = 0.8  # share of the new rate
+TCP_ALONE = "_tcp_alone"  # cases whose cameras send nothing
 TCP_WIRE = 1500 / 1448  # bytes on the wire of a full TCP segment with time stamps per byte of its payload
 
 
@@ -66,6 +73,7 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=1)
     parser.add_argument("--only", nargs="*", help="cases; all if not given")
     parser.add_argument("--words", nargs="*", default=[], help="further overrides")
+    parser.add_argument("--quality", action="store_true", help="also measure the delivered pictures")
     options = parser.parse_args()
     cases = configuration([EXPERIMENT]).experiment().runs
     print(row("case", *FIGURES.values()))
@@ -73,8 +81,9 @@ def main() -> None:
     charted: dict[str, Drive] = {}
     for name in options.only or cases:
         paths = [options.output / f"{name}.{number}" for number in range(options.runs)]
-        drives = [_drive(path, (*cases[name], *options.words)) for path in paths]
-        found = [figures(drive) for drive in drives]
+        words = [EXPERIMENT, "~experiment.runs", *cases[name], *options.words]
+        quality = options.quality and not name.endswith(TCP_ALONE)
+        drives, found = zip(*(_drive(path, words, quality) for path in paths), strict=True)
         void = median(one["busy"] for one in found) > DROPPED
         label = f"{name} (void)" if void else name
         print(row(label, *(shown(key, [one[key] for one in found]) for key in FIGURES)), flush=True)
@@ -82,9 +91,10 @@ def main() -> None:
     picture(charted).savefig(options.output / "rfc8867.png", dpi=100)
 
 
-def _drive(path: Path, words: Sequence[str]) -> Drive:
-    ensure_drive(path, [EXPERIMENT, "~experiment.runs", *words])
-    return read_drive(path)
+def _drive(path: Path, words: Sequence[str], quality: bool) -> tuple[Drive, Figures]:
+    (measured_drive if quality else ensure_drive)(path, words)
+    drive = read_drive(path)
+    return drive, figures(drive) | (mssim(path, drive) if quality else {"mssim": np.nan, "worst": np.nan})
 
 
 def figures(drive: Drive) -> Figures:

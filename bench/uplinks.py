@@ -97,7 +97,7 @@ def main() -> None:
             for name, done in drives.items():
                 path = options.output / uplink.stem / f"{name}.{number}"
                 words = [EXPERIMENT, "~experiment.runs", *conditions[name], _trace(uplink)]
-                drive(path, words, options.seconds, options.fps)
+                measured_drive(path, [*words, f"fps_max={options.fps}", f"duration_s={options.seconds}"])
                 done.append(figures(path))
                 print(uplink.stem, path.name, {key: round(value, 3) for key, value in done[-1].items()}, flush=True)
             write_whole(options.output / "uplinks.json", json.dumps(found, indent=1).encode())
@@ -122,9 +122,9 @@ def _trace(uplink: Path) -> str:
     return f"pqos.file={uplink.resolve()}"
 
 
-def drive(path: Path, words: Sequence[str], seconds: int, fps: int = FPS) -> None:
-    """Drive and measure the pictures, unless that has been done."""
-    ensure_drive(path, [*words, f"fps_max={fps}", "log.video=true", f"duration_s={seconds}"])
+def measured_drive(path: Path, words: Sequence[str]) -> None:
+    """Drive and measure the delivered pictures, unless that has been done."""
+    ensure_drive(path, [*words, "log.video=true"])
     if not (path / DOCUMENT).exists():
         run = [sys.executable, "-m", "runner", "quality", str(path)]
         subprocess.run(run, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -158,10 +158,6 @@ def figures(path: Path) -> Figures:
     ms = np.concatenate([received.arrival_ms for received in arrived])
     usable = _at(link_t, link_kbps, times) >= USABLE_KBPS
     counts = usable & (times > SETTLED_S) & np.isfinite(ms)
-    delivered = read_quality(path)
-    if missing := cameras(logged).keys() - delivered.keys():
-        raise SystemExit(f"{path}: no pictures were delivered of {', '.join(sorted(missing))}")
-    means = [_mssim(camera, link_t, link_kbps) for camera in delivered.values()]
     return {
         "frozen": 100 * whole.frozen,
         "back_s": _recovery_s(over_time, link_t, link_kbps),
@@ -170,16 +166,24 @@ def figures(path: Path) -> Figures:
         "used": 100 * _link_use(logged, over_time),
         "damaged": 100 * whole.damaged,
         "lost": float(whole.lost or 0),
-        "mssim": fmean(means),
-        "worst": min(means),
+        **mssim(path, logged),
         **queue_ms(logged, "queue_"),
         "switches": switches(over_time),
         "dropped": dropped_share(over_time, cameras(logged)),
     }
 
 
-def _mssim(camera: DeliveredQuality, link_t: Floats, link_kbps: Floats) -> float:
-    """Mean over the time in which the link carries at least USABLE_KBPS."""
+def mssim(path: Path, drive: Drive) -> Figures:
+    """Quality of the delivered pictures: mean of the cameras, and the worst camera."""
+    delivered = read_quality(path)
+    if missing := cameras(drive).keys() - delivered.keys():
+        raise SystemExit(f"{path}: no pictures were delivered of {', '.join(sorted(missing))}")
+    means = [_mean(camera, *_link(drive)) for camera in delivered.values()]
+    return {"mssim": fmean(means), "worst": min(means)}
+
+
+def _mean(camera: DeliveredQuality, link_t: Floats, link_kbps: Floats) -> float:
+    """Over the time in which the link carries at least USABLE_KBPS."""
     t, scores = np.array(camera.t), np.array(camera.mssim)
     return float(scores[(t > SETTLED_S) & (_at(link_t, link_kbps, t) >= USABLE_KBPS)].mean())
 
