@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
+
+from runner.system.memory import libc
 
 PICTURE_BYTES = 256 * 1024  # blocks of this size and more are mapped individually, and unmapped when freed
 _M_MMAP_THRESHOLD, _M_ARENA_MAX = -3, -8  # malloc.h
@@ -16,7 +17,7 @@ def limit_heaps() -> None:
     pipeline threads use, and it raises the size from which it maps blocks to the largest ever freed, up to 32 MB.
     Pools and encoders allocate their pictures once, so this costs no time while streaming.
     """
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    mallopt = getattr(libc(), "mallopt", None)
     if mallopt:
         mallopt(_M_MMAP_THRESHOLD, PICTURE_BYTES)
         mallopt(_M_ARENA_MAX, max(2, os.cpu_count() or 1))
@@ -24,6 +25,6 @@ def limit_heaps() -> None:
 
 def give_back() -> None:
     """Return freed memory to the system; takes a few ms, see malloc_trim(3)."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    trim = getattr(libc(), "malloc_trim", None)
     if trim:
         trim(0)

@@ -12,7 +12,7 @@ import itertools
 from collections.abc import Callable
 from ctypes import CFUNCTYPE, POINTER, Structure, c_char_p, c_int, c_size_t, c_uint, c_uint64, c_ulong, c_void_p
 from typing import Any
-from weakref import WeakValueDictionary
+from weakref import WeakMethod, WeakValueDictionary
 
 from gi.repository import Gst
 
@@ -90,12 +90,13 @@ class PassingBuffer:
 class OneShot:
     """A probe that can be armed repeatedly. While it is not armed, buffers cost nothing.
 
-    on_buffer  called in the streaming thread with the pad and each buffer, until it returns True
+    on_buffer  method of the owner, which it does not keep alive: called in the streaming thread with the pad and each
+               buffer, until it returns True
     armed      whether it waits for a buffer
     """
 
     def __init__(self, pad: Gst.Pad, on_buffer: Callable[[Gst.Pad, PassingBuffer], bool]) -> None:
-        self._pad, self._on_buffer = pad, on_buffer
+        self._pad, self._on_buffer = pad, WeakMethod(on_buffer)
         self._key = next(_keys)
         self.armed = False
         _shots[self._key] = self
@@ -108,7 +109,8 @@ class OneShot:
             _add_probe(address, Gst.PadProbeType.BUFFER, _on_probe, self._key, None)
 
     def handle(self, address: int) -> int:
-        if not self._on_buffer(self._pad, PassingBuffer(address)):
+        on_buffer = self._on_buffer()
+        if on_buffer and not on_buffer(self._pad, PassingBuffer(address)):
             return int(Gst.PadProbeReturn.OK)
         self.armed = False
         return int(Gst.PadProbeReturn.REMOVE)

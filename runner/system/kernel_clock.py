@@ -7,6 +7,8 @@ import sys
 import time
 from collections.abc import Callable
 
+from runner.system.memory import libc
+
 TIME_ERROR = 5  # state of a clock that is not synchronised (adjtimex(2))
 STA_NANO = 0x2000  # the offset is in ns, otherwise in us
 MICRO, NANO = 1e-6, 1e-9
@@ -58,7 +60,7 @@ def clock_error_s() -> float | None:
     if not sys.platform.startswith("linux"):
         return None
     timex = _Timex()
-    state = ctypes.CDLL(None).adjtimex(ctypes.byref(timex))
+    state = libc().adjtimex(ctypes.byref(timex))
     if not 0 <= state < TIME_ERROR or timex.esterror <= 0:
         return None
     return float(timex.maxerror * MICRO + abs(timex.offset) * (NANO if timex.status & STA_NANO else MICRO))

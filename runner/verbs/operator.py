@@ -16,7 +16,6 @@ UTC. With experiment= it sends that experiment's requests at their times.
 
 from __future__ import annotations
 
-import gc
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -26,6 +25,7 @@ from typing import TYPE_CHECKING
 from runner.configuration.layout import WITHOUT_KEYS, Layouts
 from runner.operator.live import LiveOperator, live_operator
 from runner.security.exposure import page_keyring
+from runner.system.memory import freeze_loaded
 from runner.system.signals import stopping
 from runner.verbs import Arguments
 from runner.verbs.screen import SWITCH_S, streaming
@@ -49,7 +49,7 @@ def run(arguments: Arguments) -> int:
         station.listeners.append(table)
         with _served(operator, arguments.conf) as page:
             operator.start(page.show if page else None, duration)
-            gc.freeze()  # objects loaded so far are permanent: rescanning them would delay frames
+            freeze_loaded()
             with stopping(action=operator.end) as stop:
                 running = True
                 while running:  # once more after the end, to show the last notes

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import sys
 
+from runner.system.memory import freeze_loaded
 from runner.system.signals import stopping
 from runner.vehicle.live import live_vehicle
 from runner.verbs import Arguments
@@ -29,5 +30,6 @@ def run(arguments: Arguments) -> int:
         live_vehicle(arguments.overrides, arguments.conf, log=arguments.drive(), say=say, progress=progress) as vehicle,
         stopping(action=vehicle.loop.stop) as stop,
     ):
+        freeze_loaded()
         vehicle.run(duration)
     return stop.status

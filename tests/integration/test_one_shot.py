@@ -40,6 +40,17 @@ def playing():
         yield parts
 
 
+class Watcher:
+    """An owner of a probe."""
+
+    def __init__(self, pad, on_buffer):
+        self._on_buffer = on_buffer
+        self.shot = OneShot(pad, self.on_passed)
+
+    def on_passed(self, pad, buffer):
+        return self._on_buffer(pad, buffer)
+
+
 def resident_kb():
     status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
     return int(status["RssAnon"].split()[0])
@@ -75,9 +86,9 @@ def test_it_reads_the_same_as_the_binding():
         return len(read) >= 3
 
     with running(FED) as (pipeline, pad):
-        shot = OneShot(pad, on_buffer)
+        watcher = Watcher(pad, on_buffer)
         pad.add_probe(Gst.PadProbeType.BUFFER, on_binding)  # probes of a pad are called in order
-        shot.arm()
+        watcher.shot.arm()
         pipeline.set_state(Gst.State.PLAYING)
         for buffer in fed_buffers():
             pipeline.get_by_name("fed").emit("push-buffer", buffer)
@@ -95,12 +106,12 @@ def test_reading_keeps_no_memory(playing):
         looks[0] += 1
         return True
 
-    shot = OneShot(pad, on_buffer)
+    watcher = Watcher(pad, on_buffer)
     pipeline.set_state(Gst.State.PLAYING)
 
     def look(count):
         def looked():
-            shot.arm()
+            watcher.shot.arm()
             return looks[0] >= count
 
         until(looked, every_s=0)
@@ -113,14 +124,16 @@ def test_reading_keeps_no_memory(playing):
 def test_a_deleted_owner_is_no_longer_called(playing):
     pipeline, pad = playing
     seen = []
-    shot = OneShot(pad, lambda _pad, _buffer: seen.append(1))
-    shot.arm()
-    del shot
-    last = OneShot(pad, lambda _pad, _buffer: True)
+    owner = Watcher(pad, lambda _pad, _buffer: seen.append(1))
+    owner.shot.arm()
+    shot = owner.shot
+    Watcher(pad, lambda _pad, _buffer: seen.append(2)).shot.arm()
+    del owner  # neither owner is kept alive, although a probe is
+    last = Watcher(pad, lambda _pad, _buffer: True)
     pipeline.set_state(Gst.State.PLAYING)
-    last.arm()
-    until(lambda: not last.armed)
-    assert seen == []
+    last.shot.arm()
+    until(lambda: not last.shot.armed)
+    assert seen == [] and not shot.armed
 
 
 def counting(made, name, function):
