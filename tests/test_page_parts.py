@@ -621,6 +621,30 @@ def test_a_reload_keeps_control_and_a_page_that_left_loses_it():
     assert control.holder_for("a") == "another"
 
 
+def test_a_watching_page_that_connects_again_gets_no_control():
+    control = Control()
+    control.on_opened("driver", 0)
+    control.on_opened("watcher", 1)
+    for page in ("driver", "watcher"):  # the network fails for longer than a reload takes
+        control.on_closed(page, 2)
+    control.on_opened("watcher", 12, before="another")
+    assert control.holder_for("watcher") == "nobody"
+    control.on_opened("driver", 13, before="you")
+    assert control.holder_for("driver") == "you"
+
+
+def test_after_a_restart_of_the_station_its_driver_gets_control_again():
+    control = Control()
+    for page, before in (("watcher", "another"), ("released", "nobody"), ("driver", "you"), ("opened", None)):
+        control.on_opened(page, 1, before)
+    assert control.holder_for("driver") == "you"
+    control.release("driver")
+    control.on_opened("watcher", 2, "nobody")  # nobody asked for it
+    assert control.holder_for("watcher") == "nobody"
+    control.on_opened("newcomer", 3)
+    assert control.holder_for("newcomer") == "you"
+
+
 def sample(time, position=None):
     camera = CameraSample(
         fps=10,

@@ -15,16 +15,21 @@ PRECEDENCE = (Attention.HIDDEN, Attention.SLOW, Attention.WATCHING, Attention.UN
 class Control:
     """At most one page holds control; a page is known by its token, which survives a reload.
 
-    A page that opens takes control if it is free. Any page may take it on request; the previous holder then watches.
+    A page that opens takes control if it is free. One that only connects again does so if it held control before: nobody
+    asked for another one to drive. Any page may take control on request; the previous holder then watches.
     """
 
     def __init__(self) -> None:
         self._holder = ""
         self._closed_at: float | None = None  # when the holder's last page closed
 
-    def on_opened(self, token: str, now: float) -> None:
+    def on_opened(self, token: str, now: float, before: str | None = None) -> None:
+        """A page has connected.
+
+        before  the holder from the page's point of view when it was last connected; None: it has just opened
+        """
         free = not self._holder or (self._closed_at is not None and now - self._closed_at > GRACE_S)
-        if free or token == self._holder:
+        if token == self._holder or (free and before in (None, "you")):
             self.take(token)
 
     def on_closed(self, token: str, now: float) -> None:

@@ -330,7 +330,7 @@ class PageServer(Listener):
         self._viewers.append(viewer)
         self._send_current_state(viewer)
         if not monitor:
-            self._control.on_opened(token, time.monotonic())
+            self._control.on_opened(token, time.monotonic(), request.query.get("before"))
         self._broadcast_control()
         tasks = [asyncio.create_task(_send(ws, viewer)), asyncio.create_task(self._ping(ws, request))]
         try:

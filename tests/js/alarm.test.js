@@ -31,6 +31,29 @@ test("a picture that fails a second after another one triggers a tone", () => {
   assert.deepEqual(tones([0, "frozen", "front"], [300, "live", "front"], [1000, "lost", "rear"]), ["lost", null, "lost"]);
 });
 
+test("a picture that recovers and fails again for good sounds once two seconds are over", () => {
+  const alarm = new Alarm();
+  for (const [now, status, tone] of [[0, "frozen", "lost"], [200, "live", null], [420, "frozen", null], [1300, "lost", null]]) assert.equal(alarm.due("front", status, now), tone);
+  assert.deepEqual([1999, 2000, 2250, 9000].map((now) => alarm.overdue(now)), [null, "lost", null, null]);
+});
+
+test("a picture that recovers again, or never did, sounds no more", () => {
+  for (const changes of [[[200, "live"], [420, "frozen"], [900, "live"]], [[900, "lost"]]]) {
+    const alarm = new Alarm();
+    alarm.due("front", "frozen", 0);
+    for (const [now, status] of changes) alarm.due("front", status, now);
+    assert.equal(alarm.overdue(5000), null);
+  }
+});
+
+test("of several pictures that failed again, one tone sounds, the worst", () => {
+  const alarm = new Alarm();
+  for (const [camera, status] of [["front", "frozen"], ["rear", "late"], ["left", "frozen"]]) alarm.due(camera, status, 0);
+  for (const camera of ["front", "rear", "left"]) alarm.due(camera, "live", 300);
+  for (const [camera, status] of [["rear", "late"], ["front", "frozen"], ["left", "lost"]]) alarm.due(camera, status, 600);
+  assert.deepEqual([alarm.overdue(2100), alarm.overdue(2400)], ["lost", null]);
+});
+
 test("a late picture does not mask a stalled one, but is masked by it", () => {
   assert.deepEqual(tones([0, "late"], [50, "frozen"], [100, "late"], [2100, "late"]), ["late", "lost", null, "late"]);
 });

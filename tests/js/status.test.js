@@ -8,7 +8,7 @@ import { alarmText, judge } from "../../runner/page/static/status.js";
 const NOW = 100_000;
 const LIMITS = { frozen_ms: 120 };
 const LIVE = {
-  connected: true, online: true, on: true, sending: true, refused: "", drawn: true, damaged: false, faulty: false,
+  connected: true, online: true, on: true, sending: true, refused: "", drawn: true, stood_since: null, damaged: false, faulty: false,
   arrived: NOW - 20, decoded: NOW - 10, late_until: 0, fps: 40,
 };
 const judged = (more) => judge({ ...LIVE, ...more }, LIMITS, NOW);
@@ -27,6 +27,9 @@ const CASES = [
   ["unsupported", { refused: "no decoder" }],
   ["lost", { refused: "no decoder", arrived: NOW - 1001 }],
   ["synchronising", { drawn: false }],
+  ["live", { drawn: false, stood_since: NOW - 120 }], // the decoder restarts: the last picture is still recent,
+  ["frozen", { drawn: false, stood_since: NOW - 121 }], // and then it stands, although units arrive
+  ["live", { stood_since: NOW - 5000 }], // pictures are drawn again
   ["frozen", { arrived: NOW - 121 }],
   ["live", { arrived: NOW - 120 }],
   ["frozen", { decoded: NOW - 121 }], // units arrive but are not decoded

@@ -53,12 +53,13 @@ export const ACTIONS = {
 };
 
 // Only the page shows what these change, so a monitor passes them on to it.
-const OF_PAGE = ["camera_left", "camera_front", "camera_right", "camera_rear", "reverse", "view", "birdseye", "drawer", "map", "monitors", "full_image"];
+const OF_PAGE = ["camera_left", "camera_front", "camera_right", "camera_rear", "reverse", "view", "birdseye", "drawer", "map", "monitors", "full_image", "total_lower", "total_raise"];
 const channel = new BroadcastChannel("tod-actions");
 
 export function startActions() {
   for (const name of OF_PAGE) passOn(name, () => false);
   passOn("back", () => store.enlarged !== null || !inControl());
+  passOn("enlarge", () => camera(store.selected) !== undefined);
   passOn("straighten", () => camera(store.selected) !== undefined);
   channel.onmessage = ({ data }) => store.view !== "monitor" && inControl() && (typeof data === "number" ? selectNumber(data) : ACTIONS[data]?.run());
 }
@@ -98,9 +99,10 @@ function enlargeSelected() {
   if (store.selected && !isEditing()) enlarge(store.enlarged === store.selected ? null : store.selected);
 }
 
+/** In the Drive view a driver who looks aside keeps the large picture; elsewhere the enlarged one changes. */
 export function selectCamera(name) {
   if (name === undefined) return;
-  if (store.enlarged) enlarge(name);
+  if (store.enlarged && store.view !== "drive") enlarge(name);
   select(name);
   focusTile(name);
 }

@@ -4,6 +4,13 @@ const TOGETHER_MS = 1000; // a link that fails takes eight pictures with it: one
 const REPEAT_MS = 2000; // a picture that flickers does not sound each time
 const KINDS = { lost: "lost", frozen: "lost", unsupported: "lost", late: "late", damaged: "late" };
 const never = () => ({ lost: -Infinity, late: -Infinity });
+/**
+ * @typedef {object} Sounded what was sounded of a camera
+ * @property {number} lost when its last tone of this kind was due
+ * @property {number} late
+ * @property {boolean} recovered whether it was live since
+ * @property {"lost"|"late"|null} waiting kind of its present status, if that came too soon after a tone to sound
+ */
 
 /** The tone for the worst of these statuses; null: none is needed. @param {string[]} statuses @returns {"lost"|"late"|null} */
 export function worstKind(statuses) {
@@ -16,7 +23,8 @@ const latest = (tones, kind) => Math.max(tones.lost, kind === "late" ? tones.lat
 
 export class Alarm {
   #last = never();
-  #ofCamera = {}; // the last tones that announced each camera
+  /** @type {Record<string, Sounded>} */
+  #ofCamera = {};
 
   /**
    * @param {string} camera
@@ -26,11 +34,29 @@ export class Alarm {
    */
   due(camera, status, now) {
     const kind = KINDS[status];
-    const own = (this.#ofCamera[camera] ??= never());
-    if (!kind || now - latest(own, kind) < REPEAT_MS) return null;
+    const own = (this.#ofCamera[camera] ??= { ...never(), recovered: false, waiting: null });
+    own.waiting = null;
+    own.recovered ||= !kind;
+    if (!kind) return null;
+    if (now - latest(own, kind) < REPEAT_MS) {
+      if (own.recovered) own.waiting = kind;
+      return null;
+    }
+    return this.#sound(own, kind, now);
+  }
+
+  /** The tone of a picture that failed again too soon to sound, and has not recovered since; to be called a few times a second. @param {number} now */
+  overdue(now) {
+    const due = Object.values(this.#ofCamera).filter((own) => own.waiting && now - latest(own, own.waiting) >= REPEAT_MS);
+    const tones = due.map((own) => this.#sound(own, own.waiting ?? "late", now));
+    return tones.includes("lost") ? "lost" : tones.includes("late") ? "late" : null;
+  }
+
+  /** @param {Sounded} own  @param {"lost"|"late"} kind  @param {number} now */
+  #sound(own, kind, now) {
     const tone = latest(this.#last, kind);
     const announced = now - tone < TOGETHER_MS;
-    own[kind] = announced ? tone : now;
+    Object.assign(own, { [kind]: announced ? tone : now, recovered: false, waiting: null });
     if (announced) return null;
     this.#last[kind] = now;
     return kind;

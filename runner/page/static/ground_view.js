@@ -81,7 +81,7 @@ export class GroundView {
 
   /** Set whether the streams' full-size pictures are needed. */
   updateStreams() {
-    for (const stream of this.streams) stream.isInBirdseye = this.isOn();
+    for (const stream of this.streams) stream.setInBirdseye(this.isOn() && !this.why);
   }
 
   isOn() {
@@ -113,7 +113,7 @@ export class GroundView {
   drawPictures(seen) {
     const { warp, layers, dimensions, display, drawn } = this;
     if (!warp || !dimensions) return;
-    if (warp.lost) return void (this.why = `${warp.lost}; reload the page`);
+    if (warp.lost) return this.fail(`${warp.lost}; reload the page`);
     const size = warp.sizeFor({ width: display.width * display.ratio, height: display.height * display.ratio });
     const picture = JSON.stringify([size, seen.map(({ fill, region }) => [fill, region])]);
     const frames = JSON.stringify(seen.map(({ timestamp }) => timestamp));
@@ -124,19 +124,27 @@ export class GroundView {
     const { extent } = groundOf(dimensions);
     const middle = { x: -(extent.left + extent.right) / 2, y: (extent.front + extent.rear) / 2 };
     const extents = { ...middle, width: size.width / px_per_m, height: size.height / px_per_m };
-    this.order(size, extents, seen.map((each, i) => ({ ...each, layer: layers[i] })), seen.map(({ label }) => label));
+    this.order(size, extents, seen.map((each, i) => ({ ...each, layer: layers[i] })));
   }
 
-  /** Have a picture drawn; labels: of its cameras. @param {string[]} labels */
-  async order(size, extents, parts, labels = []) {
-    const { drawn } = this;
+  /** Have a picture drawn, and tell its cameras once it is on the screen. */
+  async order(size, extents, parts) {
+    const { drawn, warp, streams } = this;
     try {
-      await this.warp?.draw(size, extents, parts);
-      if (drawn === this.drawn) this.drawn_labels = labels;
+      await warp?.draw(size, extents, parts);
       this.count++;
+      if (drawn !== this.drawn) return; // another box or other cameras since
+      this.drawn_labels = parts.map(({ label }) => label);
+      for (const [i, { newest, picture }] of parts.entries()) streams[i].onComposed(newest, picture !== null, warp?.fps ?? Infinity);
     } catch (error) {
-      this.why = error instanceof Error ? error.message : String(error);
+      this.fail(error instanceof Error ? error.message : String(error));
     }
+  }
+
+  /** There will be no picture. @param {string} why */
+  fail(why) {
+    this.why = why;
+    this.updateStreams();
   }
 
   /** Set which camera shows which part of the ground. @param {import("./framing.js").Rectangle[]} regions that the pictures show */

@@ -30,7 +30,7 @@ const isTyping = ({ target }) =>
 
 function onKeyDown(event) {
   if (event.ctrlKey || event.altKey || event.metaKey || event.repeat) return;
-  if (document.querySelector("dialog[open]") || (isTyping(event) && event.key !== "Escape")) return;
+  if (document.querySelector("dialog[open]") || isTyping(event)) return leaveField(event);
   const key = keyOf(event);
   const mode = performance.now() - chordAt < CHORD_MS ? MODES[key.toLowerCase()] : undefined;
   if (key !== "Shift") chordAt = -Infinity;
@@ -40,6 +40,16 @@ function onKeyDown(event) {
   if (action.onCameras && !isForCameras(event)) return;
   if (action.onCameras) event.preventDefault();
   action.run();
+}
+
+/**
+ * Enter in a number field sends the number, Escape reverts it; both give the focus back to the cameras. In a dialog
+ * these keys belong to the dialog.
+ */
+function leaveField({ key, target }) {
+  if (!(target instanceof HTMLInputElement) || target.type !== "number" || target.closest("dialog") || !["Enter", "Escape"].includes(key)) return;
+  if (key === "Escape") target.dispatchEvent(new Event("revert"));
+  target.blur();
 }
 
 /**

@@ -68,6 +68,10 @@ let edited = new Set(); // inputs that the operator is editing: not to be overwr
 function number(control, label, limits) {
   const input = make("input", { type: "number", "data-control": control, "aria-label": label, ...limits });
   input.addEventListener("input", () => edited.add(input));
+  input.addEventListener("revert", () => {
+    edited.delete(input);
+    refresh();
+  });
   return input;
 }
 

@@ -25,11 +25,15 @@ export function makeSlider({ label, data, id, target, send, control }) {
   let isEdited = false;
   let touchedAt = -Infinity;
   let isHeld = false;
+  let shown = ""; // value in force
 
   const chosen = () => toKbps(+range.value, max);
   const sendSoon = throttle((value) => send(value.kbps, value.target), SEND_EVERY_MS);
   range.addEventListener("pointerdown", () => (isHeld = true));
-  range.addEventListener("pointerup", () => (isHeld = false));
+  range.addEventListener("pointerup", () => {
+    isHeld = false;
+    range.blur(); // arrow keys select cameras again
+  });
   range.addEventListener("pointercancel", () => (isHeld = false));
   range.addEventListener("input", () => {
     touchedAt = performance.now();
@@ -38,6 +42,7 @@ export function makeSlider({ label, data, id, target, send, control }) {
   });
   number.addEventListener("input", () => (isEdited = true));
   number.addEventListener("blur", () => (isEdited = false));
+  number.addEventListener("revert", () => (number.value = shown));
   number.addEventListener("change", () => {
     isEdited = false;
     if (number.value === "") return;
@@ -51,6 +56,7 @@ export function makeSlider({ label, data, id, target, send, control }) {
     reset: () => (isEdited = isHeld = false),
     update({ value, max: limit, why }) {
       max = limit || 1;
+      shown = Number.isFinite(value) ? String(Math.round(value)) : "";
       setAttribute(number, "max", max);
       range.disabled = number.disabled = Boolean(why);
       range.title = number.title = why ?? "";
@@ -62,7 +68,7 @@ export function makeSlider({ label, data, id, target, send, control }) {
       setAttribute(range, "aria-valuetext", `${chosen()} kbit/s, in force ${whole(value)}`);
       if (isHeld || isPending || performance.now() - touchedAt < HAND_MS) return;
       range.value = String(toStep(value || 1, max));
-      if (!isEdited) number.value = Number.isFinite(value) ? String(Math.round(value)) : "";
+      if (!isEdited) number.value = shown;
     },
   };
 }

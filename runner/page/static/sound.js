@@ -12,6 +12,7 @@ const KEY = "tod-muted";
 const TONES = { lost: [880, 587, 880, 587], late: [659] }; // Hz, one after the other
 const TONE_S = 0.15;
 const VOLUME = 0.3;
+const CHECK_MS = 250;
 
 const alarm = new Alarm();
 const buttons = ["sound", "sound-configure"].map((id) => byId(id));
@@ -104,5 +105,6 @@ export function startSound() {
   listen("status", onStatus);
   listen("deposed", () => sound("lost"));
   addEventListener("storage", refresh); // muted in another window
+  setInterval(() => isDriving && sound(alarm.overdue(performance.now())), CHECK_MS);
   refresh();
 }

@@ -14,6 +14,7 @@ export const INTERVALS = 1.3; // this many frame intervals without a picture are
  * @property {boolean|null} sending
  * @property {string} refused why there is no decoder, "" if there is one
  * @property {boolean} drawn whether a picture was drawn since the stream last started
+ * @property {number|null} stood_since page time of the last picture before the decoder restarted in the middle of the stream; null: it did not
  * @property {boolean} faulty whether the source has a fault: it may repeat old pictures
  * @property {boolean} damaged whether the picture shows that packets were lost
  * @property {number} arrived page time of the newest unit, or of the start of the stream
@@ -32,9 +33,9 @@ export function judge(s, limits, now) {
   if (reachable && s.sending === false) return "paused";
   if (!reachable || now - s.arrived > LOST_MS) return "lost";
   if (s.refused) return "unsupported";
-  if (!s.drawn) return "synchronising";
+  if (!s.drawn && s.stood_since === null) return "synchronising";
   const limit = Math.max(limits.frozen_ms, (INTERVALS * 1000) / s.fps);
-  if (s.faulty || now - Math.min(s.arrived, s.decoded) > limit) return "frozen";
+  if (s.faulty || now - Math.min(s.arrived, s.drawn ? s.decoded : (s.stood_since ?? 0)) > limit) return "frozen";
   if (s.damaged) return "damaged";
   return now < s.late_until ? "late" : "live";
 }

@@ -41,6 +41,8 @@ export class Stream {
   arrived = now(); // page times of the newest unit and of the newest picture to draw, or of the start of the stream
   decoded = this.arrived;
   drawn = false;
+  /** @type {number|null} */
+  stood_since = null; // when the last picture before a restart of the decoder was drawn; null: none was since the stream started
   damaged = false; // the picture drawn shows that packets were lost
   late_until = 0;
 
@@ -101,6 +103,8 @@ export class Stream {
     /** @type {StraightView|null} */
     this.straight = null; // shows the picture straightened
     this.isInBirdseye = false; // whether the bird's-eye view uses the picture, too
+    this.composed_at = -Infinity; // when the picture in it was decoded; -Infinity: it has not been drawn since it was shown
+    this.composed_fps = Infinity; // how often it is drawn, at most
     this.resetTimes();
   }
 
@@ -108,6 +112,7 @@ export class Stream {
   resetTimes() {
     this.arrived = this.decoded = now();
     this.drawn = this.damaged = false;
+    this.stood_since = null;
     this.late_until = 0;
   }
 
@@ -179,6 +184,7 @@ export class Stream {
 
   restart() {
     this.close();
+    if (this.drawn) this.stood_since = this.last_drawn;
     this.drawn = false;
     this.transit = null;
     this.restarted = now();
@@ -292,7 +298,7 @@ export class Stream {
     if (decoder !== this.decoder || meta.timestamp < (this.waiting?.meta.timestamp ?? 0)) return picture.close();
     this.waiting?.picture.close();
     this.waiting = { picture, meta };
-    if (!this.straight) this.decoded = now(); // a picture that cannot be drawn does not count: the display stays frozen
+    if (!this.straight && !this.isOnlyInBirdseye) this.decoded = now(); // a picture that cannot be drawn does not count: the display stays frozen
     this.station.wake();
   }
 
@@ -315,7 +321,7 @@ export class Stream {
     const { straight, decoder } = this;
     const isStraightened = await this.straightenPicture(next);
     if (!isStraightened || straight !== this.straight || decoder !== this.decoder) return next.picture.close();
-    this.decoded = now();
+    if (!this.isOnlyInBirdseye) this.decoded = now();
     this.show(next);
   }
 
@@ -339,11 +345,12 @@ export class Stream {
     this.drawn = true;
     this.last_drawn = now();
     this.damaged = Boolean(next.meta.flags & DAMAGED);
-    this.checkAge(next.meta, now());
+    this.counts.drawn++;
+    if (!this.isOnlyInBirdseye) this.checkAge(next.meta, now());
     this.status = judge(this.times(), this.station.limits, now());
     this.paint(now());
     this.drawGuides();
-    this.recordStages(next.meta, now());
+    if (!this.isOnlyInBirdseye) this.recordStages(next.meta, now());
     if (this.station.keep) this.first ??= this.picture();
     if (this.station.counted === this.name) this.readCounter(next);
   }
@@ -392,7 +399,32 @@ export class Stream {
     const picture = moves && region ? (this.shown?.picture ?? null) : null;
     const fill = picture ? FILLS.picture : STALLED.includes(this.status) ? FILLS.alarm : FILLS.none;
     const { timestamp = null, captured = NaN } = (picture && this.shown?.meta) ?? {};
-    return { picture, fill, timestamp, captured, region: this.region ?? this.full, status: this.status, label: this.overlayText(now()) || (region ? "" : NEW_REGION) };
+    return { picture, fill, timestamp, captured, newest: this.shown, region: this.region ?? this.full, status: this.status, label: this.overlayText(now()) || (region ? "" : NEW_REGION) };
+  }
+
+  /** Whether the bird's-eye view alone shows the picture. */
+  get isOnlyInBirdseye() {
+    return this.isInBirdseye && !this.display.width;
+  }
+
+  /** Start or end being a part of the bird's-eye view. @param {boolean} shown */
+  setInBirdseye(shown) {
+    if (shown && !this.isInBirdseye) this.composed_at = -Infinity;
+    this.isInBirdseye = shown;
+  }
+
+  /**
+   * The bird's-eye view was drawn.
+   * @param {Shown|null} one the picture that was the newest when drawing began  @param {boolean} isPart whether it was drawn  @param {number} fps
+   */
+  onComposed(one, isPart, fps) {
+    this.composed_fps = fps;
+    if (!this.isOnlyInBirdseye || !one || one.meta.decoded <= this.composed_at) return;
+    this.composed_at = one.meta.decoded;
+    this.decoded = now();
+    if (!isPart) return;
+    this.checkAge(one.meta, now());
+    this.recordStages(one.meta, now());
   }
 
   checkAge({ captured }, time) {
@@ -402,7 +434,6 @@ export class Stream {
   }
 
   recordStages(meta, drawn) {
-    this.counts.drawn++;
     this.first_drawn ??= drawn;
     const page = [meta.received, meta.decoded, drawn].map((time) => this.station.clock.toStation(time));
     this.stages.push([meta.captured, meta.arrived, ...page]);
@@ -427,9 +458,11 @@ export class Stream {
 
   times() {
     const { connected, online } = this.station;
-    const { on, sending, refused, drawn, damaged, arrived, decoded, late_until } = this;
-    const faulty = this.failed_at !== null;
-    return { connected, online, on, sending, refused, drawn, damaged, faulty, arrived, decoded, late_until, fps: Math.min(this.camera.fps, this.straight?.warp.fps ?? Infinity) };
+    const { on, sending, refused, stood_since, damaged, arrived, decoded, late_until } = this;
+    const [faulty, isAbove] = [this.failed_at !== null, this.isOnlyInBirdseye];
+    const drawn = this.drawn && (!isAbove || this.composed_at > -Infinity);
+    const fps = Math.min(this.camera.fps, this.straight?.warp.fps ?? Infinity, isAbove ? this.composed_fps : Infinity);
+    return { connected, online, on, sending, refused, drawn, stood_since, damaged, faulty, arrived, decoded, late_until, fps };
   }
 
   /** Whether too few of the received pictures are drawn; to be called a few times a second. */
@@ -459,7 +492,8 @@ export class Stream {
   overlayText(time) {
     if (this.status === "live") return this.straight && !this.shown?.image ? NEW_REGION : "";
     const late = this.isLateToo(time) ? `, ${alarmText("late", 0, this.late_age)}` : "";
-    return alarmText(this.status, time - Math.min(this.arrived, this.failed_at ?? Infinity), this.late_age) + late;
+    const stood = this.status === "frozen" ? (this.drawn ? this.decoded : this.stood_since) : null; // units may still arrive
+    return alarmText(this.status, time - Math.min(this.arrived, stood ?? Infinity, this.failed_at ?? Infinity), this.late_age) + late;
   }
 
   /** Whether a damaged picture is late as well. */
@@ -469,7 +503,7 @@ export class Stream {
 
   paint(time) {
     const { canvas, context } = this;
-    if (!canvas || !context || (this.isInBirdseye && !this.display.width)) return; // the bird's-eye view is shown in its place
+    if (!canvas || !context || this.isOnlyInBirdseye) return;
     const text = this.overlayText(time);
     this.resizeCanvas(canvas, STALLED.includes(this.status));
     if (this.shown && this.status !== "off" && this.status !== "unsupported") this.paintPicture(context, this.shown);

@@ -73,6 +73,7 @@ let tickedAt = now();
 let wasLate = false; // at the last tick
 let attention = ""; // of the operator, as the page states it
 let reported = ""; // to the station
+let holder = ""; // of control, as the station last stated it
 let unanswered = 0; // reports since the page's main thread has last answered; not a time, which passes while this worker waits, too
 const log = []; // [page time, camera, mark] when a changed mark was drawn
 
@@ -82,7 +83,7 @@ const find = (name) => streams.find((stream) => stream.name === name);
 // --- the socket -------------------------------------------------------------------------------------------------------
 
 function connect() {
-  const own = (socket = new WebSocket(settings.url));
+  const own = (socket = new WebSocket(holder ? `${settings.url}&before=${holder}` : settings.url));
   receivedAt = now();
   own.binaryType = "arraybuffer";
   own.onopen = () => (receivedAt = now());
@@ -141,6 +142,7 @@ function onText(message) {
   if (message.kind === "steering") return station.steering.onReport(message.at_ms, message.rad);
   if (message.kind === "hello") onHello(message);
   if (message.kind === "state") onState(message);
+  if (message.kind === "control") holder = message.holder;
   if (message.kind === "sample") station.bound = message.clock_bound_ms ?? NaN;
   toPage({ kind: "server", message });
 }
