@@ -15,7 +15,7 @@ PRECEDENCE = (Attention.HIDDEN, Attention.SLOW, Attention.WATCHING, Attention.UN
 class Control:
     """At most one page holds control; a page is known by its token, which survives a reload.
 
-    A page that opens takes control if it is free. One that only connects again does so if it held control before: nobody
+    A page that opens takes control if it is free; one that only connects again, if it held control before, since nobody
     asked for another one to drive. Any page may take control on request; the previous holder then watches.
     """
 
