@@ -106,6 +106,22 @@ def test_a_camera_that_starts_slowly_hides_no_queue() -> None:
     assert min(shown[19:25]) > 90
 
 
+@pytest.mark.parametrize("fps", [2, 3, 5, 8])
+def test_a_slow_camera_that_is_left_alone_is_no_stall(fps: int) -> None:
+    """Two fast cameras are switched off after 4 s; reports go on, 25 a second."""
+    frames = [("slow", n / fps) for n in range(8 * fps)]
+    frames += [(name, n / 30) for name in ("front", "rear") for n in range(4 * 30)]
+    units = sorted((ReceivedUnit(name, t, t + 0.02, 4000) for name, t in frames), key=lambda unit: unit.arrived)
+    uplink, states = UplinkMemory(), []
+    for number in range(1, 8 * 25):
+        at = number / 25
+        uplink, estimated = estimate(uplink, LinkReport(at, tuple(u for u in units if at - 0.04 < u.arrived <= at), 1))
+        states += [(at, estimated.state, estimated.kbps)] if estimated else []
+    stalled = [at for at, state, _ in states if state is LinkState.STALLED]
+    assert all(4 < at < 4.1 + 1 / fps for at in stalled)
+    assert all(kbps for at, _, kbps in states if at > 4.5 + 3 / fps)
+
+
 def test_the_rest_of_a_frame_in_a_later_report_is_no_clock_step() -> None:
     """With rounded times it seems older than its first part."""
     uplink = UplinkMemory()

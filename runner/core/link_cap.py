@@ -134,6 +134,7 @@ class LinkCap:
     measured    t of the last measurement
     idle        t at which there was last nothing to send
     alone       whether nothing else limits the total
+    reserve     kbit/s of the cap that are left to other traffic
     trust       how far the limit is trusted
     most        the most that arrived
     began       t of the first measurement
@@ -157,6 +158,7 @@ class LinkCap:
     measured: float = -float("inf")
     idle: float = -float("inf")
     alone: bool = False
+    reserve: Kbps = Fraction(0)
     trust: Trust = UNDOUBTED
     most: Most = NOTHING
     began: float = float("inf")
@@ -273,7 +275,15 @@ def probe(cap: LinkCap, t: float, asked: Kbps, limit: Kbps) -> LinkCap:
     if cap.alone:
         return cap
     kbps = _short(asked if cap.kbps is None else min(asked, cap.kbps))
-    return replace(cap, alone=True, kbps=kbps, overuse=Overuse(t, _short(asked), limit), steps=0, provisional=False)
+    known = _short(asked if cap.overuse is None else min(asked, cap.overuse.carried))
+    return replace(cap, alone=True, kbps=kbps, overuse=Overuse(t, known, limit), steps=0, provisional=False)
+
+
+def end_probe(cap: LinkCap, limit: Kbps) -> LinkCap:
+    """The cap once the limit counts again: what the link carried was measured under another one."""
+    if not cap.alone:
+        return cap
+    return replace(cap, alone=False, overuse=cap.overuse and cap.overuse._replace(limit=limit))
 
 
 def mark_idle(cap: LinkCap, t: float) -> LinkCap:
@@ -301,7 +311,7 @@ def _is_narrow(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> bool:
     assert link.kbps is not None
     if _is_short(link):
         return False
-    held_s, sent = t - max(cap.changed, cap.short), _in_force(cap, limit)
+    held_s, sent = t - max(cap.changed, cap.short), _sent(cap, limit)
     if held_s >= TRIED_S and cap.passed[1] < TRIED * sent:
         return True
     return any(held_s >= least_s and link.kbps < share * sent for least_s, share in NARROW)
@@ -429,7 +439,7 @@ def _recover(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps
         return replace(cap, kbps=None, provisional=False, changed=t)
     if cap.provisional and cap.before is None:
         return cap  # it does not grow before a rate has been measured
-    if link.kbps is not None and cap.kbps > TESTED * link.kbps:
+    if link.kbps is not None and _sent(cap, limit) > TESTED * link.kbps:
         return cap  # nor does a cap that static pictures are far from using
     steps, factor, last = cap.steps, FAST, cap.overuse
     if cap.provisional or (last and last.t - cap.began < BEGIN_S):
@@ -485,6 +495,11 @@ def _rtt_s(link: LinkMeasured) -> float:
 
 def _in_force(cap: LinkCap, limit: Kbps) -> Kbps:
     return limit if cap.kbps is None else min(cap.kbps, limit)
+
+
+def _sent(cap: LinkCap, limit: Kbps) -> Kbps:
+    """What the cameras may send: a cap in force leaves its reserve to others."""
+    return limit if cap.kbps is None else min(limit, max(LEAST, cap.kbps - cap.reserve))
 
 
 def _short(kbps: Kbps) -> Kbps:

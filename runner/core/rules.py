@@ -12,6 +12,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from fractions import Fraction
 from functools import cache
+from math import isfinite
 from typing import Any
 
 from runner.core import allocation, scaling
@@ -23,6 +24,7 @@ from runner.core.link_cap import (
     UNCAPPED,
     LinkCap,
     believed_limit,
+    end_probe,
     is_fresh,
     mark_idle,
     probe,
@@ -315,13 +317,17 @@ def fade_when_stale(
     """A stale prediction is trusted less and less, unless the measured link replaces it (`cap_by_link`).
 
     Once it is older than its own `valid_s`, otherwise `after_s`, the total is halved, and again every `halve_every_s`,
-    down to `floor_kbps`; never above the prediction. Before the first one, the age counts from the start of the run.
+    down to `floor_kbps`; never above the prediction. Before the first one, the age counts from the start of the run;
+    the halvings count from the last measurement, if there was one since.
     """
     age, limit = _age(state, after_s)
     assert draft.total is not None
     if age <= limit or draft.measured:
         return draft, memory
-    halvings = int((age - limit) / halve_every_s) + 1
+    overdue, cap = age - limit, memory.get("cap_by_link", UNCAPPED)
+    if isfinite(cap.measured):
+        overdue = min(overdue, max(allocation.ZERO, exact(state.t) - exact(cap.measured)))
+    halvings = int(overdue / halve_every_s) + 1
     # 64 halvings are below any floor; more would only produce long fractions.
     total = max(Fraction(draft.total) / 2 ** min(halvings, 64), min(floor_kbps, draft.total))
     why = f"no prediction for {float(age):.1f} s, limit {plain(limit)} s"
@@ -363,15 +369,18 @@ def cap_by_link(
     cameras = [c for name, c in vehicle.cameras.items() if state.on[name] for _ in range(state.copies.get(name, 1))]
     limit, least = wire_kbps(cameras, draft.total), wire_kbps(cameras, max(LEAST, Fraction(len(cameras))))
     cap, link = memory.get("cap_by_link", UNCAPPED), _of_all_copies(vehicle, state)
-    if draft.total < max(1, len(cameras)) or not cameras or state.operator_lost is not None:
+    alone = alone_after_s is not None and _is_stale(state, alone_after_s) and is_fresh(link, state.t)
+    if not cameras or state.operator_lost is not None or (draft.total < max(1, len(cameras)) and not alone):
         cap = mark_idle(cap, state.t)
     else:
-        if alone_after_s is not None and _is_stale(state, alone_after_s) and is_fresh(link, state.t):
+        if alone:
             most = sum((camera.rate_quality.b_full for camera in cameras), allocation.ZERO)
             draft, asked, limit = draft.replaced(measured=True, total=most), limit, wire_kbps(cameras, most)
             cap = probe(cap, state.t, asked, limit)
+        else:
+            cap = end_probe(cap, limit)
         cap = start_cap(cap, link, state.operator_since, limit, start)
-        cap = update_cap(replace(cap, alone=draft.measured), link, state.t, limit, least_trust, state.position)
+        cap = update_cap(replace(cap, reserve=reserve_kbps), link, state.t, limit, least_trust, state.position)
         cap = raise_cap(cap, least)  # with less, some cameras would not be sent, and so not measured
     memory = {**memory, "cap_by_link": cap}
     carried = believed_limit(cap, limit, least_trust)

@@ -25,6 +25,7 @@ KEPT_S, MAX_UNITS = 1.0, 5000  # units are stored for this long, and at most thi
 SAME_S = 0.001  # closer capture times, after rounding, belong to the same frame
 STEADY_S = 0.25  # the link's rate is the highest measured in this time: late units make it look lower
 LONGEST_INTERVAL_S = 1.0  # between two frames; a longer one is a pause
+SILENT = 4  # a camera without a frame for this many of its intervals, while others send, no longer does
 RECENT_S = 0.06  # the queue is the shortest that a unit met in this time, or in a frame interval
 RATE_S = 0.25  # the rate is averaged over this time, or over three frame intervals
 # With a queue longer than the first of these, the rate of the link has probably dropped and earlier measurements are
@@ -189,7 +190,7 @@ def estimate(uplink: UplinkMemory, report: LinkReport) -> tuple[UplinkMemory, Li
     uplink = replace(uplink, packets=packets)
     if not uplink.units:
         return uplink, None
-    frame, last = _frame_interval(uplink.intervals), uplink.units[-1].arrived
+    frame, last = _frame_interval(uplink.intervals, uplink.captured), uplink.units[-1].arrived
     queue = min(unit.queue for unit in uplink.units if unit.arrived > last - max(RECENT_S, frame))
     if queue <= EMPTY_S:
         onset = None
@@ -233,7 +234,7 @@ def _add_units(uplink: UplinkMemory, units: Iterable[ReceivedUnit]) -> UplinkMem
             path = (path or _new_path(unit, paths.values())).after(unit, empty=uplink.onset is None)
             paths[unit.camera] = path
         shortest = path.delay if path and path.own else min((other.delay for other in paths.values()), default=inf)
-        if newest and unit.arrived - newest > PAUSE_S + 1.5 * _frame_interval(intervals):
+        if newest and unit.arrived - newest > PAUSE_S + 1.5 * _frame_interval(intervals, captured):
             resumed = unit.arrived
         newest = max(newest, unit.arrived) if newest else unit.arrived
         queue = max(0.0, unit.arrived - unit.captured - shortest)
@@ -243,8 +244,11 @@ def _add_units(uplink: UplinkMemory, units: Iterable[ReceivedUnit]) -> UplinkMem
     return replace(uplink, paths=paths, captured=captured, intervals=intervals, units=recent, resumed=resumed)
 
 
-def _frame_interval(intervals: Mapping[str, float]) -> float:
-    return median(intervals.values()) if intervals else 0.0
+def _frame_interval(intervals: Mapping[str, float], captured: Mapping[str, float]) -> float:
+    """Median of the cameras that send, s."""
+    newest = max(captured.values(), default=0.0)
+    active = [interval for name, interval in intervals.items() if newest - captured[name] <= SILENT * interval]
+    return median(active) if active else 0.0
 
 
 def _longest_gap(frame: float) -> float:
