@@ -378,6 +378,7 @@ class ReceptionReport:
     latency_ms     upper bound of the age of the oldest displayed picture, capture to decoding; absent: unknown
     damaged        cameras whose newest picture shows unrecovered packet loss; absent: none
     sent           s since 1970 by the operator's clock; present if the vehicle should answer with a `ClockAnswer`
+    run            random number of this run of the operator's side, to which delays and times are relative
     """
 
     at: float
@@ -388,6 +389,7 @@ class ReceptionReport:
     latency_ms: float | UnsetType = UNSET
     damaged: tuple[str, ...] | UnsetType = UNSET
     sent: float | UnsetType = UNSET
+    run: int | UnsetType = UNSET
 
 
 @dataclass(frozen=True, slots=True)

@@ -53,7 +53,7 @@ def test_a_report_is_read_back_as_it_was_sent() -> None:
         ({"lost": -1}, "lost: -1: must be at least 0"),
         (
             {"extra": 1},
-            "extra: unknown key; expected one of at, as_of, units, packets, lost, latency_ms, damaged, sent",
+            "extra: unknown key; expected one of at, as_of, units, packets, lost, latency_ms, damaged, sent, run",
         ),
     ],
 )
@@ -102,6 +102,32 @@ def test_a_change_of_control_restarts_the_estimate() -> None:
     assert {link.queue_ms for link in measured if link} == {0}
 
 
+def of_run(run: int, begin: float, count: int, delay_s: float) -> list[ReceptionReported]:
+    """Reports of one process, from a time on."""
+    return [
+        replace(each, t=each.t + begin, report=replace(each.report, at=each.report.at + begin, run=run))
+        for each in reports(count, delay_s=delay_s)
+    ]
+
+
+def test_a_restarted_operator_restarts_the_estimate() -> None:
+    """Its delays have another base: those of the process before would look like a queue."""
+    uplink = MeasuredUplink(ROBOT)
+    for reported in of_run(1, 0, 100, -0.25):
+        uplink.take(reported)
+    measured = [uplink.take(reported) for reported in of_run(2, 6, 100, 0)]
+    assert {(link.queue_ms, link.state) for link in measured if link} == {(0, LinkState.CLEAR)}
+    assert measured[-1]
+
+
+def test_of_two_processes_of_one_operator_the_first_is_measured() -> None:
+    uplink, both = MeasuredUplink(ROBOT), zip(of_run(1, 0, 50, 0), of_run(2, 0.02, 50, 0.5), strict=True)
+    found = [(uplink.take(first), uplink.has_rival, uplink.take(second), uplink.has_rival) for first, second in both]
+    assert [(rival, ignored, is_rival) for _, rival, ignored, is_rival in found] == [(False, None, True)] * 50
+    assert found[-1][0]
+    assert uplink.take(of_run(2, 3.2, 1, 0)[0]) is not None or not uplink.has_rival  # the first has ended
+
+
 def test_units_of_unknown_cameras_are_left_out() -> None:
     uplink = MeasuredUplink(ROBOT)
     strange = replace(REPORT, units=(UnitReceived("side", 0.0, 0.0, 5),))
@@ -135,6 +161,16 @@ def test_a_reserve_is_left_to_others() -> None:
         drive.accept("bitrate_predicted", kbps=6000)
         drive.accept("link_measured", kbps=3000, queue_ms=60, state="filling", rtt_ms=30)
     assert drives[0].total - drives[1].total == pytest.approx(200, rel=0.1)
+
+
+def test_a_cap_of_little_more_than_the_reserve_recovers() -> None:
+    drive = Drive("vehicle=delivery_robot", "modes=safe", RESERVE.replace("200", "1000"))
+    drive.accept("bitrate_predicted", kbps=4000, valid_s=1000)
+    measured(drive, 0.1, 1400, "filling", 60)
+    assert drive.total < 400
+    for t in range(10, 1000):
+        measured(drive, t / 25, float(drive.total))
+    assert drive.total == 4000
 
 
 RESERVE = "modes.automatic=[{total_from_prediction:{start_kbps:3000}},{cap_by_link:{reserve_kbps:200}},{demand_from_roi:{}},{share_by_demand:{}},{scaling_from_rate_quality:{}}]"  # fmt: skip  # noqa: E501
@@ -184,6 +220,59 @@ def test_without_a_prediction_the_measurement_alone_decides() -> None:
     assert cut < 2000
     drive.accept("bitrate_predicted", t=10.1, kbps=1000)
     assert drive.total == 1000
+
+
+@pytest.mark.parametrize("prediction", [{"kbps": 2000, "lower_kbps": 0}, {"kbps": 0}, {"kbps": 2}])
+def test_a_stale_prediction_of_nothing_stops_no_video(prediction: dict[str, int]) -> None:
+    """As in a dead spot, after which the predictor falls silent: the link measured before shows that reports arrive."""
+    drive = Drive("vehicle=delivery_robot", "modes=safe")
+    drive.accept("bitrate_predicted", t=0, **prediction)
+    assert measured_until(drive, 0, 2, kbps=100) < 3
+    assert measured(drive, 2.04, 100, "stalled") >= 50
+    for t in range(200):
+        measured(drive, 2.1 + t / 25, float(drive.total))
+    assert drive.total > 2000
+    drive.accept("bitrate_predicted", t=11, **prediction)
+    assert drive.total < 3
+
+
+def test_a_link_known_to_be_narrow_is_probed_from_what_it_carries() -> None:
+    """Once the prediction, which was too high, is stale."""
+    drive = Drive("vehicle=delivery_robot", "modes=safe")
+    drive.accept("bitrate_predicted", t=0, kbps=3000, valid_s=5)
+    measured_until(drive, 0, 4, kbps=3000)
+    for t in range(100, 115):  # for longer than jitter lasts
+        measured(drive, t / 25, 1000, "filling", 60)
+    totals = [measured(drive, t / 25, min(1000, float(drive.total))) for t in range(115, 200)]
+    steps = [after / before for before, after in pairwise(totals) if before > 1000]
+    assert steps
+    assert max(steps) < 1.1
+
+
+def test_a_prediction_that_returns_restores_the_total_at_once() -> None:
+    """What the link carried was measured under another limit, the sum of all b_full."""
+    drive = Drive("vehicle=tum_q7", "modes=safe")
+    drive.accept("bitrate_predicted", t=0, kbps=3000)
+    measured_until(drive, 0, 4, kbps=3000)
+    for t in range(100, 110):
+        measured(drive, t / 25, 2500, "filling", 200)
+    assert drive.total < 1700
+    for t in range(111, 113):
+        measured(drive, t / 25, 1500)
+    drive.accept("bitrate_predicted", t=7, kbps=2200, valid_s=1000)
+    for t in range(25):
+        measured(drive, 7 + t / 25, float(drive.total))
+    assert drive.total >= 2000
+
+
+def test_the_total_fades_from_the_last_measurement_on() -> None:
+    drive = Drive("vehicle=delivery_robot", "modes=safe")
+    drive.accept("bitrate_predicted", t=0, kbps=3000)
+    measured_until(drive, 0, 20, kbps=3000)
+    assert drive.total > 3000
+    drive.accept("control_passed", t=20, operator="another")
+    totals = [drive.accept("clock_advanced", t=t).decision.total for t in (20.5, 21.1, 21.5)]
+    assert totals == [1500, 750, 750]
 
 
 def test_without_a_prediction_and_a_measurement_the_total_fades() -> None:

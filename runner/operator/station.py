@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 import threading
 import time
 import uuid
@@ -135,6 +136,7 @@ class Station:
         self._newest: Mapping[str, Arrival] = {}  # by camera
         self._sampled = 0.0  # time.monotonic of `samples`
         self._delay_s: float | None = None  # of the first access unit: reported delays are relative to it
+        self._run = secrets.randbits(32)  # identifies the reports of this process
         listen = {
             topic("+", "state"): self._on_any_state,
             topic(vehicle.name, "reply", self.identity): self._on_reply,
@@ -261,7 +263,8 @@ class Station:
         )
         if not self._may_reach_vehicle(now):
             return
-        report = ReceptionReport(round(now, 4), self._vehicle_now(now), received, arrivals.packets, arrivals.lost)
+        counts = (arrivals.packets, arrivals.lost)
+        report = ReceptionReport(round(now, 4), self._vehicle_now(now), received, *counts, run=self._run)
         if arrivals.damaged:
             report = replace(report, damaged=tuple(arrivals.damaged))
         if (latency_ms := self._worst_latency_ms(now)) is not None:

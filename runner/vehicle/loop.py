@@ -304,6 +304,8 @@ class ControlLoop:
         self.log.record(reported)
         if link := self._uplink.take(reported):
             self._take(link)
+        if self._uplink.has_rival:
+            self._report_once(f"{item.sender}: two processes of this operator send reception reports; one is ignored")
         if reported.in_control and item.report.damaged is not UNSET:
             self._repair(item.report.damaged, t)
 

@@ -14,15 +14,21 @@ from runner.records import ReceptionReport, ReceptionReported
 
 ROUND_TRIPS = 64  # remembered; the smallest is the round trip
 LONGEST_S = 60.0  # upper limit of a reported round trip
+PRESENT_S = 1.0  # an operator's side that has reported within this time still runs
 
 
 @dataclass
 class MeasuredUplink:
-    """Estimates the uplink from what the operator in control receives; restarts when the operator changes."""
+    """Estimates the uplink from what the operator in control receives; a new operator, or process of it, restarts it.
+
+    has_rival  whether the last report was ignored because another process of the same operator reports, too
+    """
 
     vehicle: Vehicle
-    _operator: str = ""
+    has_rival: bool = False
+    _source: tuple[str, object] = ("", None)  # operator, and its run
     _at: float = 0.0
+    _t: float = 0.0
     _memory: UplinkMemory = field(default_factory=UplinkMemory)
     _round_trips: deque[float] = field(default_factory=lambda: deque(maxlen=ROUND_TRIPS))
 
@@ -30,10 +36,14 @@ class MeasuredUplink:
         """The event that results from a report; None if its operator is not in control, or nothing has arrived."""
         if not reported.in_control:
             return None
-        if reported.operator != self._operator or reported.report.at < self._at:
-            self._operator, self._memory = reported.operator, UplinkMemory()
+        source, known = (reported.operator, reported.report.run), self._source
+        self.has_rival = source != known and source[0] == known[0] and reported.t - self._t < PRESENT_S
+        if self.has_rival:
+            return None
+        if source != known or reported.report.at < self._at:
+            self._source, self._memory = source, UplinkMemory()
             self._round_trips.clear()
-        self._at = reported.report.at
+        self._at, self._t = reported.report.at, reported.t
         self._round_trips.append(max(0.0, reported.t - reported.report.as_of))
         self._memory, link = estimate(self._memory, _on_the_wire(self.vehicle, reported.report))
         if link is None:
