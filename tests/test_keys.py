@@ -171,6 +171,32 @@ def test_the_next_run_completes_what_a_killed_run_left_out(authority):
     assert Keyring(authority.directory / "car").revoked() == {0xAB}
 
 
+def test_an_interrupted_revocation_is_completed_by_repeating_it(authority, monkeypatch):
+    serial = certificate(authority, "a-watcher").serial_number
+    with monkeypatch.context() as killed, pytest.raises(KeyboardInterrupt):
+        killed.setattr(Authority, "_distribute", lambda _: (_ for _ in ()).throw(KeyboardInterrupt))
+        authority.revoke("a-watcher")
+    assert Keyring(authority.directory / "car").revoked() == set()
+    authority.revoke("a-watcher")
+    assert Keyring(authority.directory / "car").revoked() == {serial}
+    assert "a-watcher" not in Keyring(authority.directory / "car").people()
+    assert not (authority.directory / "a-watcher").exists()
+
+
+def test_new_secrets_that_others_may_read_are_not_used(authority, monkeypatch):
+    monkeypatch.setattr(keyring, "CHECK_S", 0)
+    ring, notes = Keyring(authority.directory / "car"), []
+    passphrase = ring.watched_passphrase(notes.append)
+    known, file = passphrase.get(), ring.directory / "srt.passphrase"
+    file.unlink()
+    file.write_text("another, longer than before")
+    file.chmod(0o644)
+    assert passphrase.get() == known
+    assert "others may read it (mode 644); chmod 600; the previous content stays in force" in notes[0]
+    file.chmod(0o600)
+    assert passphrase.get() == "another, longer than before"
+
+
 @pytest.mark.parametrize("action", ["rotate", "revoke"])
 def test_all_others_learn_what_was_revoked(authority, action):
     before, secret = certificate(authority, "a-watcher").serial_number, (authority.directory / "a-watcher/own.secret")

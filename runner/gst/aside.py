@@ -12,6 +12,7 @@ from runner.gst.memory import give_back
 
 HUNG_S = 5.0  # a state change that takes longer counts as hung
 HUNG = f"did not stop within {HUNG_S:g} s, and was abandoned"
+HUNG_STARTING = f"did not start within {HUNG_S:g} s"
 
 _workers: set[threading.Thread] = set()
 _lock = threading.Lock()
@@ -23,10 +24,25 @@ def set_state_in_thread(
     on_hung: Callable[[], None] = lambda: None,
     after: threading.Thread | None = None,
 ) -> threading.Thread:
+    """Set an element's state as `change_in_thread` does."""
+
+    def change() -> None:
+        element.set_state(state)
+        if state == Gst.State.NULL:
+            give_back()
+
+    return change_in_thread(state.value_nick, change, on_hung, after)
+
+
+def change_in_thread(
+    to: str, change: Callable[[], object], on_hung: Callable[[], None], after: threading.Thread | None = None
+) -> threading.Thread:
     """Change an element's state in a separate thread, which ends with the change.
 
-    Network elements can deadlock in a state change. A thread cannot be killed, so a hung one is abandoned.
+    Network elements can deadlock in a state change, and devices block it for seconds. A thread cannot be killed, so a
+    hung one is abandoned.
 
+    to       the new state, for the thread's name
     on_hung  called once, from another thread, when the change has taken HUNG_S
     after    an earlier state change of this element, which must finish first
     """
@@ -36,14 +52,12 @@ def set_state_in_thread(
     def work() -> None:
         if after:
             after.join()
-        element.set_state(state)
-        if state == Gst.State.NULL:
-            give_back()
+        change()
         watchdog.cancel()
         with _lock:
             _workers.discard(worker)
 
-    worker = threading.Thread(target=work, name=f"to {state.value_nick}", daemon=True)
+    worker = threading.Thread(target=work, name=f"to {to}", daemon=True)
     watchdog.start()
     with _lock:
         worker.start()

@@ -34,6 +34,7 @@ class RtspConnection:
     interleaved  whether this connection also carries video
     last_request monotonic time of its last complete request, s; before the first, of its start
     peer         its IP address and port
+    closed       whether it was told to close
     refusal      why it may not watch, so far as it has shown; "" if it may
     """
 
@@ -45,7 +46,7 @@ class RtspConnection:
             self._socket.setsockopt(socket.IPPROTO_TCP, getattr(socket, f"TCP_{option}"), value)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         self.peer = self._socket.getpeername()[:2]
-        self.refusal = ""
+        self.refusal, self.closed = "", False
         self.viewer = StreamViewer(connection.get_ip(), since=time.monotonic())
         self.cameras: dict[str, GstRtspServer.RTSPStreamTransport | None] = {}
         self.described = ""
@@ -102,6 +103,7 @@ class RtspConnection:
 
     def close(self) -> None:
         """Shut the connection down; the server notices in its own thread."""
+        self.closed = True
         with suppress(OSError):  # it may have ended already
             self._socket.shutdown(socket.SHUT_RDWR)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -63,7 +64,8 @@ class CameraPipeline:
         last = next(pad for element in reversed(self._elements) if (pad := element.get_static_pad("src")))
         self._add_capture_time(last.get_parent_element())
         self.knobs.set_now(self._allowed(self._first))
-        last.add_probe(Gst.PadProbeType.BUFFER | Gst.PadProbeType.BUFFER_LIST, self._on_first_packet)
+        packets = Gst.PadProbeType.BUFFER | Gst.PadProbeType.BUFFER_LIST
+        last.add_probe(packets, _on_first_packet, weakref.ref(self))  # weak: there may never be a packet
         last.add_probe(Gst.PadProbeType.QUERY_UPSTREAM, _refuse_seeks)
 
     @property
@@ -159,13 +161,14 @@ class CameraPipeline:
         self._repeats.check_next()
         return self._encoder.take()
 
-    def _on_first_packet(self, _pad: Gst.Pad, _info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+    def begin(self) -> None:
+        """The first packet has left. From a streaming thread."""
         self._started = True
         self._elements[0].get_static_pad("sink").add_probe(Gst.PadProbeType.EVENT_UPSTREAM, _drop_reconfigure)
-        wanted = self._wanted()
-        if "sending" in wanted:
+        known: Mapping[str, KnobValue] = {}
+        while (wanted := self._wanted()).get("sending") != known.get("sending"):  # `turn` may set a newer one meanwhile
+            known = wanted
             self.knobs.turn({"sending": wanted["sending"]})
-        return Gst.PadProbeReturn.REMOVE
 
     def _add_capture_time(self, payloader: Gst.Element) -> None:
         """Add the capture time of its frame to the header of every packet."""
@@ -173,6 +176,13 @@ class CameraPipeline:
             extension = GstRtp.RTPHeaderExtension.create_from_uri(CAPTURE_TIME)
             extension.set_id(CAPTURE_ID)
             payloader.emit("add-extension", extension)
+
+
+def _on_first_packet(_pad: Gst.Pad, _info: Gst.PadProbeInfo, owner: weakref.ref[CameraPipeline]) -> Gst.PadProbeReturn:
+    """Not a method: the pad would keep the pipeline that contains it."""
+    if pipeline := owner():
+        pipeline.begin()
+    return Gst.PadProbeReturn.REMOVE
 
 
 def _drop_reconfigure(_pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:

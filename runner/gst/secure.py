@@ -95,6 +95,7 @@ class StreamLogin:
         returns  why it cannot connect, for example while new files are being copied; None if it can
         raises   RunError for a graph whose client cannot be encrypted
         """
+        self._accepted = None  # until the next handshake
         is_rtsp = client.find_property("tls-interaction")
         try:
             if is_rtsp:

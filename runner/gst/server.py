@@ -6,10 +6,12 @@ callbacks run in any of these threads, and one lock guards all shared state.
 
 from __future__ import annotations
 
+import resource
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from enum import Enum, auto
 from typing import TYPE_CHECKING
@@ -42,6 +44,9 @@ BACKLOG = 128  # connections waiting to be accepted; with the library's 5, furth
 # TLS handshakes wait in a pool of ten threads, to which GLib adds slowly. A client without a request is dropped after
 # FIRST_REQUEST_S, or after CROWDED_S if there are more than CROWD of them.
 FIRST_REQUEST_S, CROWD, CROWDED_S = 5.0, 8, 1.0
+# A connection and its thread take three descriptors, and some more until it has ended. Beyond this many connections the
+# one that has waited longest for a first request is dropped.
+DESCRIPTORS, RESERVED, LEAST, MOST = 5, 256, 16, 1000
 QUEUE_BYTES = 2_000_000  # more than a viewer may lag at any bitrate
 LAG_S = 1.0  # a TCP viewer that lags by more is disconnected
 WATCH_MS = 200
@@ -147,6 +152,7 @@ class CameraServer:
         self.pipelines: dict[str, CameraPipeline] = {}
         self._changed = threading.Condition()  # a camera's stage; also guards the state shared by clients' threads
         self._connections: dict[GstRtspServer.RTSPClient, RtspConnection] = {}
+        self._most = min(MOST, max(LEAST, (resource.getrlimit(resource.RLIMIT_NOFILE)[0] - RESERVED) // DESCRIPTORS))
         self._holds: list[tuple[float, GstRtspServer.RTSPClient, GstRtspServer.RTSPMedia]] = []
         self._left: dict[str, float] = {}  # cameras that a viewer has left, and until when they are monitored
         self._progress: dict[str, tuple[int, float]] = {}  # by such a camera, frame count and when it last changed
@@ -327,16 +333,8 @@ class CameraServer:
     # --- clients ------------------------------------------------------------------------------------------------------
 
     def _on_connected(self, _server: object, client: GstRtspServer.RTSPClient) -> None:
-        try:
-            connection = RtspConnection(client, self._media.session_timeout_s)
-        except OSError:  # the client has already disconnected, or there are no descriptors left: it may not watch
-            return
-        if self._viewers:
-            connection.refusal = NO_CERTIFICATE
-        with self._changed:
-            self._connections[client] = connection
-            if self._stopped.is_set():
-                connection.close()
+        with suppress(OSError):  # it has already disconnected, or no descriptor is left: SETUP will be refused
+            self._add(client, RtspConnection(client, self._media.session_timeout_s))
         client.connect("closed", self._on_closed)
         client.connect("new-session", self._on_session)
         for method in METHODS:
@@ -347,6 +345,18 @@ class CameraServer:
         client.connect("setup-request", self._on_set_up)
         client.connect("play-request", self._on_playing)
         client.connect("teardown-request", self._on_teardown)
+
+    def _add(self, client: GstRtspServer.RTSPClient, connection: RtspConnection) -> None:
+        if self._viewers:
+            connection.refusal = NO_CERTIFICATE
+        with self._changed:
+            self._connections[client] = connection
+            if self._stopped.is_set():
+                connection.close()
+            elif len(self._connections) > self._most:  # now: the library aborts the process without descriptors
+                now = time.monotonic()
+                silent = [other for other in self._connections.values() if other.unused_s(now) and not other.closed]
+                max(silent, key=lambda other: other.unused_s(now), default=connection).close()
 
     def _on_closed(self, client: GstRtspServer.RTSPClient) -> None:
         with self._changed:

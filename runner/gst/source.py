@@ -33,26 +33,29 @@ def loop_clip(pipeline: Gst.Bin, plan: Plan) -> None:
 
 
 class _Loop:
-    """Watches the pad before the pacing element. The first seek, which flushes, is invisible downstream of it."""
+    """Watches the pad before the pacing element. The first seek, which flushes, is invisible downstream of it.
+
+    It is kept by the pad, so it does not keep the pad.
+    """
 
     def __init__(self, pad: Gst.Pad, identity: Gst.Element, fps: float) -> None:
-        self._pad, self._identity, self._fps = pad, identity.weak_ref(), fps
+        self._identity, self._fps = identity.weak_ref(), fps
         self._starts_round = True  # the next segment starts a round, and is not the current one with another offset
         self._round: tuple[int, int] | None = None  # start of this round: running time in ns, frames before it
         self._seek_sent = self._flushed = False
         pad.add_probe(Gst.PadProbeType.BUFFER, self._on_early_frame)
         pad.add_probe(Gst.PadProbeType.EVENT_DOWNSTREAM | Gst.PadProbeType.EVENT_FLUSH, self._on_event)
 
-    def _on_early_frame(self, _pad: Gst.Pad, _info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+    def _on_early_frame(self, pad: Gst.Pad, _info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
         """Drop frames from before the first seek, which would otherwise appear twice."""
         if self._flushed:
             return Gst.PadProbeReturn.REMOVE
         if not self._seek_sent:
             self._seek_sent = True
-            self._seek(Gst.SeekFlags.FLUSH | Gst.SeekFlags.SEGMENT)
+            _seek(pad, Gst.SeekFlags.FLUSH | Gst.SeekFlags.SEGMENT)
         return Gst.PadProbeReturn.DROP
 
-    def _on_event(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+    def _on_event(self, pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
         match info.get_event().type:
             case Gst.EventType.FLUSH_START:
                 return Gst.PadProbeReturn.DROP
@@ -61,14 +64,14 @@ class _Loop:
                 return Gst.PadProbeReturn.DROP
             case Gst.EventType.SEGMENT if self._starts_round:
                 self._starts_round = False
-                self._extend_round(info.get_event().parse_segment().base)
+                self._extend_round(pad, info.get_event().parse_segment().base)
             case Gst.EventType.SEGMENT_DONE | Gst.EventType.EOS:
                 self._starts_round = True
-                self._seek(Gst.SeekFlags.SEGMENT)
+                _seek(pad, Gst.SeekFlags.SEGMENT)
                 return Gst.PadProbeReturn.DROP
         return Gst.PadProbeReturn.OK
 
-    def _extend_round(self, base: int) -> None:
+    def _extend_round(self, pad: Gst.Pad, base: int) -> None:
         """Extend a round to the duration of its frames.
 
         Demuxers end it at the start of its last frame, where the next round's first frame would coincide with it.
@@ -76,18 +79,19 @@ class _Loop:
         identity = self._identity()
         if identity is None:
             return
-        base -= self._pad.get_offset()  # the demuxer's own value
+        base -= pad.get_offset()  # the demuxer's own value
         frames = identity.get_property("stats").get_value("num-buffers")
         if self._round:
             began, before = self._round
             missing = round((frames - before) / self._fps * Gst.SECOND) - (base - began)
-            self._pad.set_offset(self._pad.get_offset() + missing)
+            pad.set_offset(pad.get_offset() + missing)
         self._round = (base, frames)
 
-    def _seek(self, flags: Gst.SeekFlags) -> None:
-        event = Gst.Event.new_seek(1.0, Gst.Format.TIME, flags, Gst.SeekType.SET, 0, Gst.SeekType.NONE, 0)
-        # Not from the streaming thread, which the seek waits for. A source pad accepts it from downstream.
-        threading.Thread(target=self._pad.send_event, args=(event,), daemon=True).start()
+
+def _seek(pad: Gst.Pad, flags: Gst.SeekFlags) -> None:
+    event = Gst.Event.new_seek(1.0, Gst.Format.TIME, flags, Gst.SeekType.SET, 0, Gst.SeekType.NONE, 0)
+    # Not from the streaming thread, which the seek waits for. A source pad accepts it from downstream.
+    threading.Thread(target=pad.send_event, args=(event,), daemon=True).start()
 
 
 class _Pace:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from gi.repository import GLib, Gst
 
 from runner.graph import Plan, launch
-from runner.gst.aside import HUNG, set_state_in_thread
+from runner.gst.aside import HUNG, HUNG_STARTING, change_in_thread, set_state_in_thread
 from runner.gst.credentials import log_in
 from runner.gst.outage import Outage
 from runner.gst.source import fixed_rate
@@ -17,6 +17,7 @@ from runner.system.backoff import pause_s
 
 CHECK_MS = 100
 FIRST_FRAME_S = 10.0  # a UDP source may take 5 s to fail, and the first keyframe may be late
+IN_FLIGHT = 5  # frames that may still pass after an error that stops the source
 BACKOFF_S = (1.0, 10.0)  # between the starts of two attempts: doubled from the first value up to the second
 
 
@@ -49,7 +50,8 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         )  # for the child: the server's threads start and stop it, GLib's thread replaces it
         self._child: Gst.Bin | None = None
         self._timer = 0
-        self._error: str | None = None  # the source's own error, set from its threads
+        self._starting: threading.Thread | None = None  # starts the child
+        self._error: tuple[str, int] | None = None  # the source's own error, and frames before it; set from its threads
         self._progress = (0, 0.0)  # frames at the last change of the counter, and when
         self._attempts = 0  # in this outage
         self._last_attempt = (0, 0.0)  # frames when the last attempt began, and when
@@ -70,17 +72,24 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
             self._progress = (self._frames(), time.monotonic())
             self._timer = GLib.timeout_add(CHECK_MS, self._watch)
         elif transition == Gst.StateChange.PAUSED_TO_READY:
-            with self._lock:
+            self._end()
+        result = Gst.Bin.do_change_state(self, transition)
+        if transition == Gst.StateChange.READY_TO_PAUSED and result == Gst.StateChangeReturn.FAILURE:
+            self._end()  # the bin stays in READY
+        return result
+
+    def _end(self) -> None:
+        with self._lock:
+            if self._timer:
                 GLib.source_remove(self._timer)
-                self._timer = 0
-                self._remove_child()
-                self.outage, self._attempts = Outage(self._on_report), 0
-        return Gst.Bin.do_change_state(self, transition)
+            self._timer = 0
+            self._remove_child()
+            self.outage, self._attempts = Outage(self._on_report), 0
 
     def do_handle_message(self, message: Gst.Message) -> None:
         if self._frames():
             if message.type == Gst.MessageType.ERROR:
-                self._error = message.parse_error()[0].message
+                self._set_error(message.parse_error()[0].message)
                 return
             if message.type in (Gst.MessageType.ASYNC_START, Gst.MessageType.ASYNC_DONE):
                 return
@@ -90,15 +99,20 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         """The source sends no more. Returns whether this bin handles that."""
         if not self._frames():
             return False
-        self._error = "the stream ended"
+        self._set_error("the stream ended")
         return True
+
+    def _set_error(self, what: str) -> None:
+        self._error = self._error or (what, self._frames())  # the first one: others follow from it
 
     # --- in GLib's thread ---------------------------------------------------------------------------------------------
 
     def _watch(self) -> bool:
         now, frames = time.monotonic(), self._frames()
         if frames != self._progress[0] or not self._is_playing():
-            self._progress, self._error = (frames, now), None  # an error that does not stop frames is not the video's
+            self._progress = (frames, now)
+            if self._error and frames > self._error[1] + IN_FLIGHT:
+                self._error = None  # it does not stop the video
         if not frames:
             return True
         if not self._attempts:
@@ -116,7 +130,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
             return
         if self._is_idle():
             self.outage.report_failure(
-                f"source: {self._error or f'no frame for {self._frozen_s:g} s'}", self._progress[1]
+                f"source: {self._error[0] if self._error else f'no frame for {self._frozen_s:g} s'}", self._progress[1]
             )
             self._replace(now)
         else:
@@ -125,7 +139,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
     def _check_attempt(self, now: float) -> None:
         """After an attempt that has not delivered a frame yet."""
         if self._error:
-            self.outage.report_failure(f"source: {self._error}", self._progress[1])
+            self.outage.report_failure(f"source: {self._error[0]}", self._progress[1])
         pause = pause_s(self._attempts - 1, *BACKOFF_S)
         if now - self._last_attempt[1] > (pause if self._error else max(pause, FIRST_FRAME_S)):
             self._replace(now)
@@ -139,7 +153,9 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
             self._remove_child()
             self._error = None
             child = self._add_child()
-        child.sync_state_with_parent()
+            self._starting = change_in_thread(
+                "start", child.sync_state_with_parent, lambda: self._on_report(f"source: {HUNG_STARTING}")
+            )
 
     # --- the child, under its lock ------------------------------------------------------------------------------------
 
@@ -163,7 +179,8 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         child, self._child = self._child, None
         if child is not None:
             self.remove(child)
-            set_state_in_thread(child, Gst.State.NULL, lambda: self._on_report(f"source: {HUNG}"))
+            set_state_in_thread(child, Gst.State.NULL, lambda: self._on_report(f"source: {HUNG}"), self._starting)
+            self._starting = None
 
     # ------------------------------------------------------------------------------------------------------------------
 

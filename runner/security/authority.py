@@ -118,12 +118,13 @@ class Authority:
         self._renew(known.name, known.role, known.hosts)
 
     def revoke(self, name: str) -> None:
-        """Revoke a holder's keys, and remove its directory.
+        """Revoke a holder's keys, and remove its directory. Repeating it completes a revocation that was interrupted.
 
         raises  UserError for an unknown name
         """
-        self._renew_media_secret(self._known(name, "revoke").role)
-        self._write_issued(self._revoked(name))
+        if not any(issued.name == name and issued.revoked for issued in self.holders()):
+            self._renew_media_secret(self._known(name, "revoke").role)
+            self._write_issued(self._revoked(name))
         self._distribute()
         shutil.rmtree(self.directory / name, ignore_errors=True)
 

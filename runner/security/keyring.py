@@ -194,12 +194,16 @@ class Keyring:
     def read(self, name: str) -> bytes:
         """Content of a file, without a trailing newline that an editor may have added.
 
-        raises  UserError
+        raises  UserError, also for a secret that others may read
         """
+        path = self.directory / name
         try:
-            content = read_file(self.directory / name, MOST_BYTES).strip()
+            content = read_file(path, MOST_BYTES).strip()
+            exposed = None if name in PUBLIC else exposure(path)
         except ValueError as error:
             raise UserError("keys", name, str(self.directory), str(error)) from None
+        if exposed:
+            raise UserError("keys", name, str(self.directory), exposed)
         if not content:  # for example while it is being copied; anybody could compute what is derived from it
             raise UserError("keys", name, str(self.directory), "is empty")
         return content

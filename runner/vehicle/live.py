@@ -232,6 +232,8 @@ class _VehicleControl:
         return topic(self._name, *parts)
 
     def _on_connected(self, connected: bool) -> None:
+        if self._announce_timer:
+            self._announce_timer.cancel()  # it has not listened for long enough
         if connected and self._is_name_free.is_set():
             self._announce()
         elif connected:

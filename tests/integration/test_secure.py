@@ -458,6 +458,22 @@ def test_without_its_secret_an_operator_accepts_no_stream(keys, monkeypatch):
     assert all(10 <= len(passphrase) <= 79 for passphrase in passphrases)
 
 
+def test_a_new_pipeline_is_not_ended_for_the_certificate_of_the_last_one(keys):
+    """The handshake that shows the vehicle's new one may take longer than until the next check."""
+    from gi.repository import Gio, Gst
+
+    login = StreamLogin(Keyring.of(keys / "alice"), NAME, print)
+    certificate = Gio.TlsCertificate.new_from_file(str(keys / NAME / keyring.CERTIFICATE))
+    pipeline = Gst.parse_launch("rtspsrc name=client ! fakesink")
+    assert login.prepare(pipeline, pipeline.get_by_name("client")) is None
+    assert login._accept(None, None, certificate, None)
+    assert login.withdrawn() is None
+    changed(keys, "rotate", NAME)
+    until(login.withdrawn)
+    assert login.prepare(pipeline, pipeline.get_by_name("client")) is None
+    assert login.withdrawn() is None
+
+
 def test_a_peer_that_is_not_the_broker_is_left_until_the_broker_is_back(keys):
     impostor = keys.parent / "impostor"
     shutil.copytree(keys / "broker", impostor)

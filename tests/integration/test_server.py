@@ -493,11 +493,53 @@ def test_an_ended_pipeline_leaves_no_watched_source():
         for number in range(1, 4):
             with RtspClient(vehicle.url(SMALL_CAMERA)) as viewer:
                 assert viewer.open() == [200, 200, 200]
-                assert _watched_sources() == 1
+                assert _alive("WatchedSource") == 1
             until(lambda n=number: vehicle.reported.count(f"{SMALL_CAMERA}: pipeline stopped") == n)
-            until(lambda: _watched_sources() == 0)
+            until(lambda: _alive("WatchedSource") == 0)
 
 
-def _watched_sources():
+@pytest.mark.parametrize(
+    "dead",
+    [
+        ("graph.sender.0={name: sent, element: identity, properties: {error-after: 1}}",),
+        ("source=v4l2", "source.device=/dev/missing", "source.frozen_s=1"),
+    ],
+    ids=["delivers nothing", "does not start"],
+)
+def test_a_camera_that_never_delivers_leaves_nothing(dead):
+    """Viewers try again for as long as it is dead."""
+    with serving(*SMALL, *dead, cameras=(SMALL_CAMERA,)) as vehicle:
+        for _ in range(3):
+            with RtspClient(vehicle.url(SMALL_CAMERA)) as viewer:
+                assert viewer.open() == [503]
+            until(lambda: _alive("CameraPipeline") == _alive("WatchedSource") == 0, every_s=0.1)
+
+
+def _alive(kind):
     gc.collect()
-    return sum(type(each).__name__ == "WatchedSource" for each in gc.get_objects())
+    return sum(type(each).__name__ == kind for each in gc.get_objects())
+
+
+def test_the_reason_of_a_source_that_fails_is_reported():
+    elements = (
+        "source.elements=[{name: source, element: videotestsrc, properties: {is-live: true}},"
+        " {name: fails, element: identity, properties: {error-after: 12}},"
+        ' {name: raw, element: capsfilter, properties: {caps: "{raw_caps}"}}]'
+    )
+    with serving(*SMALL, elements, "source.frozen_s=0.5", cameras=(SMALL_CAMERA,)) as vehicle:
+        with watched(vehicle, SMALL_CAMERA):
+            until(lambda: any("source: " in report for report in vehicle.reported))
+        reason = next(report for report in vehicle.reported if "source: " in report)
+        assert "Failed after iterations" in reason
+
+
+def test_idle_connections_take_no_descriptors_from_others(monkeypatch):
+    """Without descriptors the library aborts the process."""
+    monkeypatch.setattr("runner.gst.server.MOST", 16)
+    with serving(*SMALL, cameras=(SMALL_CAMERA,)) as vehicle, watched(vehicle, SMALL_CAMERA), ExitStack() as stack:
+        address = ("127.0.0.1", vehicle.port)
+        idle = [stack.enter_context(socket.create_connection(address, 5)) for _ in range(60)]
+        for connection in idle[:40]:
+            assert connection.recv(1) == b""
+        with watched(vehicle, SMALL_CAMERA):
+            pass
