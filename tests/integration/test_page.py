@@ -186,6 +186,15 @@ def test_single_numbers_and_sliders_set_one_camera(page):
     field.fill("777")
     field.press("Enter")
     state_when(page, lambda now: now["cameras"]["top_left"]["applied"].get("bitrate") == 777)
+    page.keyboard.press("1")  # is no further digit of the number
+    assert page.evaluate("tod.selected") == TUM[0]
+    before = field.input_value()
+    field.fill("999")
+    field.press("Escape")
+    assert (field.input_value(), page.evaluate("document.activeElement.tagName")) == (before, "BODY")
+    page.keyboard.press("2")
+    page.keyboard.press("1")
+    assert field.input_value() == before, "nothing was sent"
 
 
 @pytest.mark.parametrize("mode", ["automatic", "collective"])
@@ -206,6 +215,8 @@ def test_a_camera_switched_off_frees_its_share(page, mode):
 def test_collective_the_slider_changes_all(page):
     before = choose(page, "collective")
     slider = page.locator("[data-control=total-slider]")
+    slider.click()  # as a drag ends
+    assert slider.evaluate("range => range !== document.activeElement"), "arrow keys select cameras"
     slider.focus()
     for _ in range(3):
         slider.press("PageDown")
@@ -624,6 +635,13 @@ def test_keys_of_the_drive_view(page):
         assert selected_by("r") == front
         is_at(front, "front_center")
         is_at(rear, "rear_center")
+    page.keyboard.press("r")
+    assert selected_by("ArrowLeft") == "front_left"  # a look aside
+    page.wait_for_timeout(200)
+    is_at("rear_center", "front_center")
+    is_at("front_left", "front_left")
+    page.keyboard.press("Escape")
+    is_at("rear_center", "rear_center")
     page.keyboard.press("p")
     assert page.locator("#map-panel").is_visible()
     page.keyboard.press("p")

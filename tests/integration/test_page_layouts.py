@@ -465,6 +465,12 @@ def test_a_monitor_passes_on_keys_for_what_only_the_page_shows(chromium, picture
         until(lambda: monitor.evaluate("tod.selected") == "front")
         monitor.keyboard.press("2")  # it does not show the rear camera
         until(lambda: page.evaluate("tod.selected") == "rear")
+        monitor.keyboard.press("Enter")
+        until(lambda: edges(page)["rear"]["width"] == usual["front"]["width"])
+        monitor.keyboard.press("Escape")
+        until(lambda: edges(page) == usual)
+        monitor.keyboard.press("+")  # the total of all cameras, not of those that it shows
+        until(lambda: "choose C to set it" in page.inner_text("#toasts"))
         monitor.keyboard.press("l")
         until(lambda: "rear: lines are already straight" in page.inner_text("#toasts"))
         monitor.keyboard.press("w")
