@@ -42,7 +42,7 @@ def loaded(*words: str) -> tuple[int, set[str]]:
 RUNNING = {  # modules of the project and heavy packages; `validate` reads maps and queries GStreamer's registry
     "print": (41, COMPOSING),
     "replay": (44, COMPOSING),
-    "validate": (90, COMPOSING | {"numpy", "gi"}),
+    "validate": (91, COMPOSING | {"numpy", "gi"}),
 }
 HELP = {
     "vehicle": {"paho"},

@@ -217,6 +217,7 @@ class Requests:
         named = {"driver": Role.CONTROLLER, "other": Role.CONTROLLER, **{f"a-{role}": role for role in Role}}
         people = {name: Person(role) for name, role in named.items()}
         (directory / keyring.PEOPLE).write_bytes(msgspec.json.encode(people))
+        (directory / keyring.PEOPLE).chmod(0o600)
         self.watched = Watched(access=Access(keyring.Keyring(directory), print))
         self._decided: list[dict[str, Any]] = []
         monkeypatch.setattr("runner.vehicle.loop.step", self._step)
