@@ -267,12 +267,20 @@ def test_a_prediction_that_returns_restores_the_total_at_once() -> None:
 
 def test_the_total_fades_from_the_last_measurement_on() -> None:
     drive = Drive("vehicle=delivery_robot", "modes=safe")
-    drive.accept("bitrate_predicted", t=0, kbps=3000)
+    drive.accept("bitrate_predicted", t=0, kbps=20000)
     measured_until(drive, 0, 20, kbps=3000)
-    assert drive.total > 3000
     drive.accept("control_passed", t=20, operator="another")
-    totals = [drive.accept("clock_advanced", t=t).decision.total for t in (20.5, 21.1, 21.5)]
-    assert totals == [1500, 750, 750]
+    totals = [drive.accept("clock_advanced", t=t).decision.total for t in (20.5, 21.1, 21.5, 23.2)]
+    assert [round(total) for total in totals] == [10000, 5000, 5000, 1250]
+
+
+@pytest.mark.parametrize("kbps", [0, 2])
+def test_a_stale_prediction_of_nothing_that_was_never_measured_leaves_the_floor(kbps: int) -> None:
+    """Otherwise nothing is sent, so that nothing can be measured, until the next prediction."""
+    drive = Drive("vehicle=delivery_robot", "modes=safe")
+    drive.accept("bitrate_predicted", t=0, kbps=kbps)
+    totals = [drive.accept("clock_advanced", t=t).decision.total for t in (1, 1.9, 2.1, 5)]
+    assert totals == [kbps, kbps, 500, 500]
 
 
 def test_without_a_prediction_and_a_measurement_the_total_fades() -> None:

@@ -243,8 +243,8 @@ def start_cap(cap: LinkCap, link: LinkMeasured | None, since: float | None, limi
 
 
 def _reset(cap: LinkCap) -> LinkCap:
-    """A new cap that keeps only the places where limits proved too high."""
-    return LinkCap(trust=Trust(places=cap.trust.places), connected=cap.connected)
+    """A new cap that keeps only the places where limits proved too high, and when the link was last measured."""
+    return LinkCap(trust=Trust(places=cap.trust.places), connected=cap.connected, measured=cap.measured)
 
 
 def believed_limit(cap: LinkCap, limit: Kbps, least_trust: Fraction) -> Kbps:

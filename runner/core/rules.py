@@ -303,7 +303,7 @@ def cap_at_lower_bound(vehicle: Vehicle, state: State, draft: Draft, memory: Mem
     return draft.noted(note, total=lower), memory
 
 
-@rule(needs=["total"], gives=["total"], reads=["prediction", "t"])
+@rule(needs=["total"], gives=["total"], reads=["on", "prediction", "t"])
 def fade_when_stale(
     vehicle: Vehicle,
     state: State,
@@ -317,8 +317,9 @@ def fade_when_stale(
     """A stale prediction is trusted less and less, unless the measured link replaces it (`cap_by_link`).
 
     Once it is older than its own `valid_s`, otherwise `after_s`, the total is halved, and again every `halve_every_s`,
-    down to `floor_kbps`; never above the prediction. Before the first one, the age counts from the start of the run;
-    the halvings count from the last measurement, if there was one since.
+    down to `floor_kbps`; never above the prediction. If that was to send nothing, `floor_kbps` is sent, since otherwise the
+    link could never be measured. Before the first prediction, the age counts from the start of the run; the halvings
+    count from the last measurement, if there was one since.
     """
     age, limit = _age(state, after_s)
     assert draft.total is not None
@@ -329,7 +330,8 @@ def fade_when_stale(
         overdue = min(overdue, max(allocation.ZERO, exact(state.t) - exact(cap.measured)))
     halvings = int(overdue / halve_every_s) + 1
     # 64 halvings are below any floor; more would only produce long fractions.
-    total = max(Fraction(draft.total) / 2 ** min(halvings, 64), min(floor_kbps, draft.total))
+    least = floor_kbps if draft.total < max(1, sum(state.on.values())) else min(floor_kbps, draft.total)
+    total = max(Fraction(draft.total) / 2 ** min(halvings, 64), least)
     why = f"no prediction for {float(age):.1f} s, limit {plain(limit)} s"
     note = f"total {_short(draft.total)} -> {_short(total)}: {why}"
     return draft.noted(note, total=total, uncapped=None if draft.uncapped is None else total), memory

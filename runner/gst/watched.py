@@ -145,6 +145,8 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
             self._replace(now)
 
     def _replace(self, now: float) -> None:
+        if self._starting and self._starting.is_alive():
+            return  # a device that hangs would hang again
         self._last_attempt = (self._progress[0], now)
         self._attempts += 1
         with self._lock:

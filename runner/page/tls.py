@@ -5,8 +5,8 @@ from __future__ import annotations
 import ssl
 from collections.abc import Callable
 
-from runner.errors import RunError
-from runner.security.keyring import Keyring
+from runner.errors import RunError, UserError
+from runner.security.keyring import KEY, Keyring
 
 
 class PageTls:
@@ -14,7 +14,7 @@ class PageTls:
 
     context    for the server; after `refresh`, new connections use it with the current certificate
     on_report  called with the problem of new files
-    raises     RunError if certificate and key do not match
+    raises     RunError if certificate and key do not match, or others may read the key
     """
 
     def __init__(self, keyring: Keyring, on_report: Callable[[str], None]) -> None:
@@ -40,7 +40,10 @@ def _context(keyring: Keyring) -> ssl.SSLContext:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = ssl.TLSVersion.TLSv1_3
     try:
+        keyring.read(KEY)  # nobody else may
         context.load_cert_chain(keyring.certificate, keyring.key)
+    except UserError as error:
+        raise RunError(str(error)) from None
     except OSError as error:  # ssl.SSLError among them
         raise RunError(f"{keyring.directory}: {error}") from None
     return context

@@ -34,6 +34,7 @@ class MeasuredUplink:
 
     def take(self, reported: ReceptionReported) -> LinkMeasured | None:
         """The event that results from a report; None if its operator is not in control, or nothing has arrived."""
+        self.has_rival = False
         if not reported.in_control:
             return None
         source, known = (reported.operator, reported.report.run), self._source

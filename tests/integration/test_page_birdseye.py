@@ -157,6 +157,21 @@ def test_a_stalled_picture_is_not_shown(page, station):
     assert red(sides(*seen(page))[0]) == 0
 
 
+def test_pictures_that_stalled_together_are_shown_again(page, station):
+    """Only what was drawn counts: with all of them stalled, nothing is drawn that shows that they move again."""
+    shown_large(page)
+    for _ in range(3):
+        station.silent.update(TOP_CAMERAS)
+        until(lambda: all(words.startswith(("FROZEN", "LOST")) for words in above(page)["states"]))
+        station.silent.clear()
+        until(lambda: moves(above(page)))
+    page.locator("body").press("e")  # off, and on again: no picture counts as frozen meanwhile
+    before = len(page.evaluate("tod.measure()")["status_log"])
+    shown_large(page)
+    marks = page.evaluate("tod.measure()")["status_log"][before:]
+    assert not [mark for _, name, mark in marks if name in TOP_CAMERAS and mark in ("frozen", "lost")]
+
+
 def test_all_fisheyes_may_be_straightened_beside_it(page):
     """Chromium drops the oldest of more than four WebGL contexts of a worker."""
     shown_large(page)

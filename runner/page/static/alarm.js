@@ -8,7 +8,7 @@ const never = () => ({ lost: -Infinity, late: -Infinity });
  * @typedef {object} Sounded what was sounded of a camera
  * @property {number} lost when its last tone of this kind was due
  * @property {number} late
- * @property {boolean} recovered whether it was live since
+ * @property {boolean} recovered whether there was no reason for a tone since
  * @property {"lost"|"late"|null} waiting kind of its present status, if that came too soon after a tone to sound
  */
 

@@ -116,7 +116,7 @@ export class GroundView {
     if (warp.lost) return this.fail(`${warp.lost}; reload the page`);
     const size = warp.sizeFor({ width: display.width * display.ratio, height: display.height * display.ratio });
     const picture = JSON.stringify([size, seen.map(({ fill, region }) => [fill, region])]);
-    const frames = JSON.stringify(seen.map(({ timestamp }) => timestamp));
+    const frames = JSON.stringify(seen.map(({ newest }) => newest?.meta.timestamp ?? null)); // of stalled ones, too: drawing shows that they move again
     if (warp.isBusy || (picture === drawn.picture && (frames === drawn.frames || !warp.isDue))) return;
     Object.assign(drawn, { picture, frames });
     this.share(seen.map(({ region }) => region));

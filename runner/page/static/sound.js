@@ -68,7 +68,8 @@ function sound(kind) {
 const soundCurrent = () => isDriving && sound(worstKind(Object.values(store.status)));
 
 function onStatus({ camera, status }) {
-  if (isDriving) sound(alarm.due(camera, status, performance.now()));
+  const kind = alarm.due(camera, status, performance.now());
+  if (isDriving) sound(kind);
 }
 
 function onControl() {
@@ -105,6 +106,9 @@ export function startSound() {
   listen("status", onStatus);
   listen("deposed", () => sound("lost"));
   addEventListener("storage", refresh); // muted in another window
-  setInterval(() => isDriving && sound(alarm.overdue(performance.now())), CHECK_MS);
+  setInterval(() => {
+    const kind = alarm.overdue(performance.now());
+    if (isDriving) sound(kind);
+  }, CHECK_MS);
   refresh();
 }

@@ -113,6 +113,7 @@ export class Stream {
     this.arrived = this.decoded = now();
     this.drawn = this.damaged = false;
     this.stood_since = null;
+    this.composed_at = -Infinity;
     this.late_until = 0;
   }
 
@@ -343,6 +344,7 @@ export class Stream {
     this.shown?.picture.close();
     this.shown = next;
     this.drawn = true;
+    this.stood_since = null;
     this.last_drawn = now();
     this.damaged = Boolean(next.meta.flags & DAMAGED);
     this.counts.drawn++;
@@ -398,8 +400,8 @@ export class Stream {
     const moves = MOVING.includes(this.status);
     const picture = moves && region ? (this.shown?.picture ?? null) : null;
     const fill = picture ? FILLS.picture : STALLED.includes(this.status) ? FILLS.alarm : FILLS.none;
-    const { timestamp = null, captured = NaN } = (picture && this.shown?.meta) ?? {};
-    return { picture, fill, timestamp, captured, newest: this.shown, region: this.region ?? this.full, status: this.status, label: this.overlayText(now()) || (region ? "" : NEW_REGION) };
+    const { captured = NaN } = (picture && this.shown?.meta) ?? {};
+    return { picture, fill, captured, newest: this.shown, region: this.region ?? this.full, status: this.status, label: this.overlayText(now()) || (region ? "" : NEW_REGION) };
   }
 
   /** Whether the bird's-eye view alone shows the picture. */
