@@ -196,6 +196,19 @@ def problems(tod: Command, conf: UserConf, *words: str) -> list[str]:
     return [problem.replace(str(conf.path), "~") for problem in found.problems]
 
 
+@pytest.mark.parametrize("key", ["modes.automatic.cap_by_link.reserve_kbps", "modes.automatic.x"])
+def test_an_entry_of_a_list_is_named_by_its_number(tod: Command, key: str) -> None:
+    found = tod("print", f"{key}=200")
+    assert found.status == 2
+    assert found.err.startswith(f"command line: {key}=200: ")
+    assert "name an entry of a list by its number, from 0 on" in found.err
+
+
+def test_a_graph_without_efforts_has_the_usual_one(tod: Command) -> None:
+    (problem,) = tod("print", "graph.efforts=null").problems
+    assert "nothing fills {preset}" in problem
+
+
 def test_the_three_messages_of_the_style_guide(
     conf: UserConf, tod: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -345,6 +358,7 @@ def test_a_mistake_in_a_file(conf: UserConf, tod: Command, file: str, changes: d
         ("weight: 2", "weight: -2", "cameras.front.weight: -2: must be at least 0"),
         ("weight: 2", "graph: h264_srt", "cameras.front.graph: 'h264_srt': must be a mapping"),
         ("name: delivery_robot", "name: on", 'name: true: must be text, quote it: "on" or "off"'),
+        ("name: delivery_robot", "name: delivery_robot\nno: 7", "False: a key must be text, quote it"),
         ("name: delivery_robot", "name: my robot", "name: 'my robot': must be letters, digits, _ and - only"),
         ("# @package _global_\n", "", "must begin with the line # @package _global_"),
         ("{row: 0, column: 0}", "{row: 0}", "cameras.front.place.column: missing: must be given"),

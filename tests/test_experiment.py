@@ -39,6 +39,13 @@ def test_every_packaged_experiment_and_each_of_its_runs_can_be_driven(name: str)
         run.pqos()
 
 
+@pytest.mark.parametrize("words", [["pqos=live"], ["pqos=map", "pqos.position={kind: live}"]])
+def test_a_link_without_a_rate_is_a_problem(words: list[str]) -> None:
+    """It would pass nothing, without a word."""
+    with pytest.raises(ConfigError, match="file: must be given: predictions from outside state no rates"):
+        configuration([*words, "link=relay"], runnable=False).link()
+
+
 PAUSE = "{at_s: 9, request: {event: camera_switched, camera: rear_center, on: false}}"
 
 

@@ -412,6 +412,28 @@ def test_the_input_is_not_overwritten(tod: Command, drive: Path) -> None:
         assert result.err == f"command line: output: '{path}': is the input, choose another file\n"
 
 
+@pytest.mark.parametrize(
+    ("words", "problem"),
+    [
+        (["link=agian"], "link: 'agian': must be one of"),
+        (["log={}"], "already contains a drive"),
+        (["positions={}/no.bag", "topic=/fix"], "no such file"),
+        (["-m", "log={}/sweep", "cameras.front_left.weight=1,2"], "already contains a drive"),
+    ],
+)
+def test_a_wrong_command_line_leaves_the_output_of_an_earlier_run(
+    tod: Command, drive: Path, tmp_path: Path, words: list[str], problem: str
+) -> None:
+    output = tmp_path / "decisions.jsonl"
+    output.write_text("kept\n")
+    (drive / "sweep/1").mkdir(parents=True)
+    (drive / "sweep/1/drive.jsonl").write_text("a drive\n")
+    result = tod("replay", *(word.format(drive) for word in words), f"input={drive}", f"output={output}")
+    assert (result.status, output.read_text()) == (2, "kept\n")
+    assert problem in result.err
+    assert not (drive / "sweep/0").exists()
+
+
 def test_a_replay_that_fails_leaves_no_drive(tod: Command, events_file: Path, tmp_path: Path) -> None:
     with events_file.open("a") as file:
         file.write("no\n")

@@ -288,6 +288,16 @@ def test_a_file_is_checked_with_those_that_build_on_it(tod: Command, conf: UserC
     assert [problem.split(": ")[0] for problem in tod("validate", *names).problems] == sorted(names)
 
 
+def test_a_file_that_the_command_line_chooses_is_checked(tod: Command, conf: UserConf) -> None:
+    van = "# @package _global_\ndefaults: [/cameras@cameras.front: missing, _self_]\nname: van\n"
+    conf.write("vehicle/van.yaml", van).write("modes/mine.yaml", "defaults: [paper, _self_]\n")
+    file = str(conf.path / "vehicle/van.yaml")
+    for words in ([], ["vehicle=van"], ["modes=mine", "vehicle=van"]):
+        assert [p.split(": ")[0] for p in tod("validate", file, *words).problems] == [file]
+    result = tod("validate", str(conf.path / "modes/mine.yaml"), "modes=mine", "modes.single.0=null")
+    assert result.status == 2
+
+
 def test_files_of_two_directories(tod: Command, conf: UserConf) -> None:
     for name in ("one", "two"):
         conf.write(f"{name}/modes/a.yaml", "defaults: [paper, _self_]\n")
@@ -300,6 +310,8 @@ def test_files_of_two_directories(tod: Command, conf: UserConf) -> None:
     [
         ("{}/modes/b.yaml", "{}/modes/b.yaml: no such file"),
         ("{}/modes", "{}/modes: must be NAME=VALUE, or a file that ends in .yaml or .yml"),
+        ("", "must be NAME=VALUE, or a file that ends in .yaml or .yml"),
+        (".", ".: must be NAME=VALUE, or a file that ends in .yaml or .yml"),
         ("{}/../x.yaml", "{}/../x.yaml: is in no configuration directory: none above it has vehicle/, cameras/, ..."),
     ],
 )

@@ -454,7 +454,7 @@ def _elements(data: Sequence[Mapping[str, Any]] | None) -> tuple[Element, ...]:
 
 def _effort(data: Mapping[str, Any]) -> dict[str, Any]:
     """Settings for a graph's `effort`, by key; None for an element's own default."""
-    efforts: Mapping[str, Mapping[str, Any]] = data.get("efforts", {})
+    efforts: Mapping[str, Mapping[str, Any]] = data.get("efforts") or {}
     elements = str(data["vehicle"])
     is_used = any(f"{{{key}}}" in elements for values in efforts.values() for key in values)
     known = list(efforts) if is_used else [ONLY_EFFORT]

@@ -158,6 +158,9 @@ def _compose(overrides: Sequence[Override], directories: Sequence[Path]) -> tupl
             config = hydra_compose("config", words, return_hydra_config=True)
     except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError([_hydra_problem(error, directories)]) from None
+    except (TypeError, ValueError) as error:
+        rule = f"{str(error).lower()}: name an entry of a list by its number, from 0 on"
+        raise ConfigError([Problem(COMMAND_LINE, "", " ".join(o.text for o in overrides), rule)]) from None
     except RecursionError:
         rule = "files include each other in a cycle"
         raise ConfigError([Problem(COMMAND_LINE, "", " ".join(o.text for o in overrides), rule)]) from None

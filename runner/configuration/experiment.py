@@ -78,6 +78,10 @@ def read_link(data: Mapping[str, Any], predicted: RateAtTime, bases: Sequence[Pa
     bases      directories in which a relative file is looked up
     raises     ModelError with the key, the value found and the rule
     """
+    if predicted is no_rates and not data["file"]:
+        raise ModelError(
+            "file", None, "must be given: predictions from outside state no rates that the link could follow"
+        )
     rates = _recorded(data, data["loop"], bases) if data["file"] else predicted
     share = float(data["share"])
 
@@ -136,11 +140,19 @@ def _path(data: Mapping[str, Any]) -> dict[str, float]:
     return {"queue_ms": float(data["queue_ms"]), "delay_ms": float(data["delay_ms"])} | lost
 
 
+def no_rates(_t: float) -> Kbps:
+    """Nothing states the rate of the link."""
+    return exact(0)
+
+
 def true_rates(pqos: Mapping[str, Any], bases: Sequence[Path]) -> RateAtTime:
     """The rate that the source of the `pqos` section states for each time and place, without look-ahead or `wrong`.
 
-    raises  ModelError with the key, the value found and the rule
+    returns  `no_rates` if predictions, or the positions that they depend on, come from outside
+    raises   ModelError with the key, the value found and the rule
     """
+    if pqos["kind"] == "live" or (pqos["kind"] == "map" and pqos["position"]["kind"] == "live"):
+        return no_rates
     return _recorded_rates(build_pqos({**pqos, "look_ahead_s": 0, "wrong": None}, bases), build_track(pqos, bases))
 
 

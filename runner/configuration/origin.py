@@ -74,7 +74,7 @@ class Composed:
         used = {(path[:-2], origin[-2]) for path, origin in self.moved.items()}
         mounts = self.document.get("cameras")
         names = mounts if isinstance(mounts, dict) else ()
-        picked = ((key,) for key in self.document if key.startswith(PICKED))
+        picked = ((key,) for key in self.document if str(key).startswith(PICKED))
         for place in (("graph",), *picked, *(("cameras", name, "graph") for name in names)):
             graph = value_at(self.document, place)
             given = [key for key in GRAPH_PARTS if key in graph] if isinstance(graph, dict) else []

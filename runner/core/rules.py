@@ -317,9 +317,9 @@ def fade_when_stale(
     """A stale prediction is trusted less and less, unless the measured link replaces it (`cap_by_link`).
 
     Once it is older than its own `valid_s`, otherwise `after_s`, the total is halved, and again every `halve_every_s`,
-    down to `floor_kbps`; never above the prediction. If that was to send nothing, `floor_kbps` is sent, since otherwise the
-    link could never be measured. Before the first prediction, the age counts from the start of the run; the halvings
-    count from the last measurement, if there was one since.
+    down to `floor_kbps`; never above the prediction. If that was to send nothing, `floor_kbps` is sent, since otherwise
+    the link could never be measured. Before the first prediction, the age counts from the start of the run; the
+    halvings count from the last measurement, if there was one since.
     """
     age, limit = _age(state, after_s)
     assert draft.total is not None

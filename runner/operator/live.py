@@ -226,12 +226,11 @@ def live_operator(
     keyring = viewer_keyring(vehicle)
     station = Station(vehicle, agreement.settings(document), keyring)
     versions = apply.versions(element for plan in plans for element in plan.operator)
+    pictures, requests = _ros_pictures(vehicle, station), config.experiment().requests
     drive = Log(log, "operator", document if log else {}, versions, station.note)
     if log:
         station.listeners.append(DriveLog(station, drive))
     video = apply.VideoFiles(log, drive.video, drive.video_shift) if log and vehicle.log_video else None
-
-    pictures = _ros_pictures(vehicle, station)
 
     def publish(camera: str, captured: float | None, width: int, height: int, data: bytes) -> None:
         assert pictures
@@ -252,7 +251,7 @@ def live_operator(
             vehicle=vehicle.name,
         )
 
-    operator = LiveOperator(vehicle, station, drive, build, config.experiment().requests)
+    operator = LiveOperator(vehicle, station, drive, build, requests)
     metrics = metrics_of(vehicle.name, vehicle.metrics.operator_port, log)
     station.listeners.append(_MetricsListener(metrics))
     try:

@@ -13,7 +13,7 @@ import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -349,27 +349,34 @@ def live_vehicle(
     plans = compile_plans(vehicle)
     apply.check_machine(plans)
     console = _Console(say)
-    versions = apply.versions(e for p in plans for e in (*p.source, *p.vehicle))
-    drive = Log(log, "vehicle", document if log else {}, versions, console.say)
+    with ExitStack() as ending:  # in reverse order, also of a vehicle that cannot start
+        ending.callback(console.close)
+        versions = apply.versions(e for p in plans for e in (*p.source, *p.vehicle))
+        drive = Log(log, "vehicle", document if log else {}, versions, console.say)
+        ending.callback(drive.close)
 
-    def report(what: str) -> None:
-        console.say(what)
-        drive.note(what)
+        def report(what: str) -> None:
+            console.say(what)
+            drive.note(what)
 
-    video = apply.VideoFiles(log, drive.video, drive.video_shift) if log and vehicle.log_video else None
-    side = apply.VehicleSide(plans, vehicle.media, lambda camera, what: report(f"{camera}: {what}"), video, keyring)
-    control = _VehicleControl(vehicle, document, report, keyring)
-    metrics = metrics_of(vehicle.name, vehicle.metrics.vehicle_port, log)
+        video = apply.VideoFiles(log, drive.video, drive.video_shift) if log and vehicle.log_video else None
+        side = apply.VehicleSide(plans, vehicle.media, lambda camera, what: report(f"{camera}: {what}"), video, keyring)
+        ending.callback(side.stop)
+        control = _VehicleControl(vehicle, document, report, keyring)
+        ending.callback(control.close)
+        metrics = metrics_of(vehicle.name, vehicle.metrics.vehicle_port, log)
+        ending.callback(metrics.close)
 
-    def publish(record: VehicleState | Telemetry | SpeedAdvice | SteeringAngle) -> bool:
-        metrics.take(record)
-        return control.publish(record)
+        def publish(record: VehicleState | Telemetry | SpeedAdvice | SteeringAngle) -> bool:
+            metrics.take(record)
+            return control.publish(record)
 
-    loop = ControlLoop(vehicle, side, pqos, track, drive, publish, report, Access(keyring, report))
-    side.on_turned = loop.wake
-    live = LiveVehicle(side, loop)
-    ros = ros_cameras(vehicle, side.push_shared, report)
-    try:
+        loop = ControlLoop(vehicle, side, pqos, track, drive, publish, report, Access(keyring, report))
+        side.on_turned = loop.wake
+        live = LiveVehicle(side, loop)
+        if ros := ros_cameras(vehicle, side.push_shared, report):
+            ending.callback(ros.close)
+        ending.callback(live.stop)
         if ros:
             ros.start()
         metrics.serve(live.problem)
@@ -379,12 +386,3 @@ def live_vehicle(
                 f"{plan.camera.name}: {rtsp_url(vehicle.media, plan.camera.name) if plan.serves else 'dials out'}"
             )
         yield live
-    finally:
-        live.stop()
-        if ros:
-            ros.close()
-        metrics.close()
-        control.close()
-        side.stop()
-        drive.close()
-        console.close()

@@ -50,7 +50,7 @@ from runner.core.decision import Decision
 from runner.core.events import NAMES, BitratePredicted, Event, LinkMeasured, PositionReported, parse, to_json
 from runner.core.model import Vehicle
 from runner.core.step import Run, start, step
-from runner.drive.log import FILES, Log, log_run
+from runner.drive.log import FILES, Log, check_free, log_run
 from runner.drive.read import OTHER_KINDS, REPORTS, check_began, is_log, read_line, read_lines, text_lines
 from runner.errors import UserError
 from runner.records import Began, ReceptionReported, decision_to_json, line_from_json
@@ -59,6 +59,7 @@ from runner.system.files import whole_file
 from runner.verbs import Arguments
 
 if TYPE_CHECKING:
+    from runner.drive.positions import RecordedPositions
     from runner.pqos import Pqos
     from runner.vehicle.uplink import MeasuredUplink
 
@@ -68,12 +69,13 @@ _encode = json.JSONEncoder(ensure_ascii=False, check_circular=False).encode
 
 
 class _Prepared(NamedTuple):
-    """Everything a run needs apart from the events. pqos: its predictions replace those of the events"""
+    """Everything a run needs apart from the events. pqos, positions: they replace those of the events"""
 
     arguments: Arguments
     config: Mapping[str, Any]
     vehicle: Vehicle
     pqos: Pqos | None
+    positions: RecordedPositions | None
 
 
 def run(arguments: Arguments) -> int:
@@ -82,6 +84,7 @@ def run(arguments: Arguments) -> int:
     with _input(arguments) as (name, text):
         lines, began = _begin(text, name)
         one = _prepare(arguments, name, began)
+        _check(arguments)
         with _output(arguments) as output:
             output.writelines(_output_lines(one, lines, name, began))
     return 0
@@ -95,9 +98,11 @@ def _sweep(arguments: Arguments) -> int:
     with _input(arguments) as (name, text):
         _, began = _begin(text, name)
     runs = prepare_all(arguments, lambda own: _prepare(own, name, began))
+    logged = [one._replace(arguments=one.arguments.in_directory(str(n), ["log"])) for n, (_, one) in enumerate(runs)]
+    for one in logged:
+        _check(one.arguments)
     with _output(arguments) as output:
-        for number, (words, one) in enumerate(runs):
-            own = one._replace(arguments=one.arguments.in_directory(str(number), ["log"]))
+        for (words, _), own in zip(runs, logged, strict=True):
             with _input(arguments) as (_, text):
                 lines, _ = _begin(text, name)
                 output.writelines(
@@ -110,14 +115,33 @@ def _prepare(arguments: Arguments, name: str, began: Began | None) -> _Prepared:
     config = configuration(arguments.overrides, arguments.conf, base=_base(name, began), runnable=False)
     chosen = any(word.lstrip("+").startswith(("pqos=", "pqos.")) for word in arguments.overrides)
     pqos = config.pqos()[0] if chosen else None
-    return _Prepared(arguments, config.document, config.vehicle(), pqos)
+    return _Prepared(arguments, config.document, config.vehicle(), pqos, _positions(arguments, began))
+
+
+def _positions(arguments: Arguments, began: Began | None) -> RecordedPositions | None:
+    if arguments.values.keys().isdisjoint(("positions", "topic")):
+        return None
+    from runner.drive.positions import given_positions
+
+    recorded = given_positions(arguments.values)
+    if began is None:
+        rule = "needs a drive as input: events alone do not state when they happened"
+        raise UserError("command line", "positions", recorded.where, rule)
+    return recorded
+
+
+def _check(arguments: Arguments) -> None:
+    """Check the command line before the output is opened, which keeps what was written before an error in the input."""
+    arguments.choice("link")
+    if directory := arguments.path("log"):
+        check_free(directory, "vehicle")
 
 
 def _output_lines(run: _Prepared, lines: Iterable[str], name: str, began: Began | None) -> Iterator[str]:
     """The output lines of a run, which is logged if requested."""
     inputs = events(lines, name, _uplink(run.arguments, run.vehicle))
-    if not run.arguments.values.keys().isdisjoint(("positions", "topic")):
-        inputs = _with_positions(inputs, run.arguments, began)
+    if run.positions and began:
+        inputs = _with_positions(inputs, run.positions, began)
     with _log(run.arguments, run.config, began) as log:
         yield from replay(run.vehicle, inputs, run.pqos, log)
 
@@ -184,14 +208,10 @@ def replay(
         yield answers.line(document, now)
 
 
-def _with_positions(inputs: Iterable[InputEvent], arguments: Arguments, began: Began | None) -> Iterator[InputEvent]:
+def _with_positions(inputs: Iterable[InputEvent], recorded: RecordedPositions, began: Began) -> Iterator[InputEvent]:
     """The events with the positions of a bag in place of their own."""
-    from runner.drive.positions import given_positions, time_span
+    from runner.drive.positions import time_span
 
-    recorded = given_positions(arguments.values)
-    if began is None:
-        rule = "needs a drive as input: events alone do not state when they happened"
-        raise UserError("command line", "positions", recorded.where, rule)
     waiting, last, found = deque(recorded.since(began.time)), 0.0, False
     for document, event in inputs:
         last = event.t

@@ -181,7 +181,7 @@ def _yaml_files(directory: Path) -> Iterator[Path]:
 
 
 def _is_yaml(name: str) -> bool:
-    return name[0] != "." and name.lower().endswith((".yaml", ".yml"))
+    return not name.startswith(".") and name.lower().endswith((".yaml", ".yml"))
 
 
 def check_file(path: Path, relative: Path) -> Iterator[Problem]:
@@ -252,6 +252,10 @@ class _Tasks:
         fixed = _fixed_groups(overrides)
         self._files = {group: options(group, searched) for group in GROUPS if group not in fixed}
         self._vehicle_fixed = "vehicle" in fixed
+        words = (word.lstrip("+").partition("=") for word in overrides)
+        self._given = [
+            (key, name) for key, _, name in words if key in GROUPS and name in options(key, self._directories)
+        ]
         self._tasks = list(dict.fromkeys(filter(self._is_selected, self._all())))
 
     def __iter__(self) -> Iterator[ValidationTask]:
@@ -299,7 +303,8 @@ class _Tasks:
     def _is_selected(self, task: ValidationTask) -> bool:
         if self._named is None:
             return True
-        chosen = (find_file(self._directories, group, name) for group, name in task.choices)
+        choices = (*task.choices, *self._given)
+        chosen = (find_file(self._directories, group, name) for group, name in choices)
         files = {file for path in chosen for file in built_on(path, self._directories)}
         return not files.isdisjoint(self._named) or (not task.choices and self._root in self._named)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
 import time
 
 import pytest
@@ -321,6 +322,12 @@ def test_missing_requirements_are_reported_in_one_line_with_status_1(broker, tmp
     assert absent.returncode == 1
     assert "camera front_left: Cannot identify device '/dev/video99'." in absent.stderr
     assert "Traceback" not in absent.stderr
+
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        words = (f"media.port={other.getsockname()[1]}", f"log={tmp_path / 'never'}")
+        taken = run("vehicle", *ROBOT, port, *words)
+    assert taken.returncode == 1
+    assert not (tmp_path / "never").exists()
 
     taken = run("vehicle", *ROBOT, port, f"media.port={broker.port}")
     assert taken.returncode == 2  # the same port twice is a mistake in the configuration
