@@ -102,6 +102,8 @@ def to_yaml(measured: Measured) -> str:
         f"width_px: {camera.width}",
         f"height_px: {camera.height}",
         f"fps: {plain(camera.fps)}",
+        f"lens: {camera.lens}",
+        f"fov_deg: {camera.fov_deg:g}",
     ]
     if camera.native:
         width, height = camera.native

@@ -139,7 +139,7 @@ def _read_mask(path: Path, name: str, camera: Camera) -> Mask:
         raise UserError("command line", where, repr(str(path)), rule)
     if picture.shape != (camera.height, camera.width):
         found = f"{picture.shape[1]}x{picture.shape[0]}"
-        raise UserError("command line", where, found, f"must be {camera.width}x{camera.height}, as the sequence is")
+        raise UserError("command line", where, found, f"must be {camera.width}x{camera.height}, as the full image is")
     mask: Mask = picture > 127
     if not mask.any():
         raise UserError("command line", where, repr(str(path)), "is all black: no pixel would count")

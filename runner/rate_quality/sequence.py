@@ -119,7 +119,7 @@ def _is_recording(path: Path) -> bool:
     """Whether `tod-runner record` made the clip, which is lossless with any codec."""
     try:
         cameras = json.loads(path.with_name(INDEX).read_text(encoding="utf-8"))["cameras"]
-        return path.name in {camera["file"] for camera in cameras.values()}
+        return path.name in {camera.get("file") for camera in cameras.values()}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return False
 

@@ -25,7 +25,7 @@ from runner.system.backoff import pause_s
 START_S = 30.0  # the node usually starts within a second, but takes much longer while a machine boots
 RETRY_S = (1.0, 10.0)  # between two starts: exponential backoff from the first value up to the second
 END_S = 2.0
-LOCAL = ("off", "localhost")  # discovery ranges that stay on this machine
+LOCAL = ("off", "localhost")  # ranges in which the node looks for no other on another machine
 
 INSTALL_HINT = {1: "`make ros1` installs it", 2: "`make ros2` creates .venv-ros2"}  # by version of ROS
 MASTER = "http://localhost:11311"  # of ROS 1, as in rosgraph
@@ -77,6 +77,8 @@ def _environment(settings: RosSettings, insecure: bool, publishes: bool) -> dict
         own = {"ROS_MASTER_URI": _master_uri(), "ROS_NAMESPACE": settings.namespace}
         return own if insecure else {**own, "ROS_HOSTNAME": "127.0.0.1"}  # listens only there
     own = {"ROS_AUTOMATIC_DISCOVERY_RANGE": settings.discovery.upper()}
+    if settings.discovery in LOCAL and not insecure:
+        own["ROS_STATIC_PEERS"] = ""  # they would be connected, whatever the range
     if publishes and not any(name in os.environ for name in OWN_TRANSPORTS):
         own["FASTDDS_DEFAULT_PROFILES_FILE"] = str(PROFILE)
     return own

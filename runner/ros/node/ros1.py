@@ -343,17 +343,21 @@ class Ros1Outputs:
 
 
 class Ros1Pictures(PictureQueue):
-    """Publishers of sensor_msgs/Image and CameraInfo, made with the first picture for their topics."""
+    """Publishers of sensor_msgs/Image and CameraInfo, made soon after the first picture for their topics."""
 
     def __init__(self) -> None:
         super().__init__()
         self._publishers: dict[str, tuple[Any, Any]] = {}
+        self._new: set[str] = set()  # topics without publishers
 
     def publish(self, topic: str) -> None:
-        """Publish the picture that waits."""
+        """Publish the picture that waits, unless its topic has no publishers yet."""
         order, memory = self.take(topic)
         try:
-            image, info = self._publishers_of(topic)
+            if topic not in self._publishers:
+                self._new.add(topic)
+                return
+            image, info = self._publishers[topic]
             if image.get_num_connections():
                 data = os.pread(memory, order["step"] * order["height"], 0)
                 image.publish(stamped(image.data_class(data=data, **image_fields(order)), order))
@@ -362,17 +366,17 @@ class Ros1Pictures(PictureQueue):
         finally:
             os.close(memory)
 
-    def _publishers_of(self, topic: str) -> tuple[Any, Any]:
+    def advertise(self) -> None:
+        """Make the publishers of new topics. Only while the master answers."""
         import rospy
         from sensor_msgs.msg import CameraInfo, Image
 
-        if topic not in self._publishers:
+        for topic in self._new - self._publishers.keys():
             image, info = (
                 rospy.Publisher(ros1_name(f"{topic}/{name}"), kind, queue_size=2, tcp_nodelay=True)
                 for kind, name in ((Image, "image"), (CameraInfo, "camera_info"))
             )
             self._publishers[topic] = image, info
-        return self._publishers[topic]
 
 
 def stamped(message: Any, order: dict[str, Any]) -> Any:
@@ -417,17 +421,20 @@ def run(port: Port, task: dict[str, Any]) -> None:
         worker.check()
         if rospy.is_shutdown():
             raise NodeError("another node of the same name has started, or it was shut down over ROS")
-        update_all(master, topics, inputs)
+        update_all(master, topics, inputs, pictures)
     rospy.signal_shutdown("closed")
 
 
-def update_all(master: RosMaster, topics: list[Ros1PictureTopic], inputs: list[Ros1InputTopic]) -> None:
+def update_all(
+    master: RosMaster, topics: list[Ros1PictureTopic], inputs: list[Ros1InputTopic], pictures: Ros1Pictures
+) -> None:
     known = master.query()
     if known:
         with suppress(*UNREACHABLE):  # the next update reports it
             master.register(known)
         for one in inputs:
             one.update(known)
+        pictures.advertise()
     for topic in topics:
         topic.update(known)
 
