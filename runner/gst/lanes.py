@@ -47,6 +47,7 @@ class _Run:
     fps: Fraction
     form: str = ""
     frames: int = 0
+    first_ns: int = 0  # running time of the first frame: in a clip with sound it may be later than 0
     last_frame: float = field(default_factory=time.monotonic)  # time at which a frame last passed
     error: BaseException | None = None
 
@@ -127,6 +128,9 @@ def _on_source(run: _Run, pad: Gst.Pad, info: Gst.PadProbeInfo, on_frame: OnFram
             _check_form(run, event.parse_caps())
         return Gst.PadProbeReturn.OK
     number, run.frames, run.last_frame = run.frames, run.frames + 1, time.monotonic()
+    if number == 0:
+        segment = pad.get_sticky_event(Gst.EventType.SEGMENT, 0).parse_segment()
+        run.first_ns = segment.to_running_time(Gst.Format.TIME, info.get_buffer().pts)
     _guarded(run, lambda: on_frame(number, luma_of(info.get_buffer(), pad.get_current_caps())))
     return Gst.PadProbeReturn.OK
 
@@ -161,7 +165,7 @@ def _on_sample(run: _Run, sink: Gst.Element, lane: int, result: Encoded, on_pict
     buffer = sample.get_buffer()
     running_ns = sample.get_segment().to_running_time(Gst.Format.TIME, buffer.pts)
     # An encoder may skip frames; the timestamp identifies this one.
-    number = round(Fraction(running_ns, Gst.SECOND) * run.fps)
+    number = round(Fraction(running_ns - run.first_ns, Gst.SECOND) * run.fps)
     result.frames += 1
     run.last_frame = time.monotonic()
     _guarded(run, lambda: on_picture(lane, number, luma_of(buffer, sample.get_caps())))

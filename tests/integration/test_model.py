@@ -389,6 +389,18 @@ def test_an_invalid_sequence_is_reported(tod, tmp_path, cache, monkeypatch, name
     assert expected in line
 
 
+def test_a_clip_whose_video_begins_after_its_sound(tmp_path, cache):
+    line = (
+        f"matroskamux name=file ! filesink location={tmp_path / 'late.mkv'}"
+        " audiotestsrc num-buffers=80 ! audioconvert ! vorbisenc ! file."
+        " videotestsrc num-buffers=40 timestamp-offset=100000000 ! video/x-raw,width=320,height=240,framerate=30/1"
+        " ! x264enc tune=zerolatency ! h264parse ! file."
+    )
+    subprocess.run(["gst-launch-1.0", "-q", *line.split()], check=True, timeout=60)
+    done = model(*CAMERA, *TINY, f"sequence={tmp_path / 'late.mkv'}", f"output={tmp_path}", cache=cache)
+    assert "(4 encoded, 0 known)" in done.stdout, done.stderr
+
+
 def test_a_short_sequence_is_reported(tmp_path, cache):
     path = tmp_path / "short.mkv"
     launch("videotestsrc num-buffers=9 ! video/x-raw,width=320,height=192,framerate=25/1 ! x264enc ! matroskamux", path)
