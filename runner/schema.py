@@ -67,7 +67,7 @@ def findings(document: Any, schema: str) -> list[Finding]:
     """
     odd = list(_unrepresentable(document, ()))
     seen = {f.path for f in odd}
-    errors = sorted(_errors(f"{schema}.schema.json", document), key=lambda e: [str(part) for part in e.absolute_path])
+    errors = _errors_in_order(f"{schema}.schema.json", document, may_fail=bool(odd))
     found = [f for f in _explained(errors) if not any(f.path[: len(path)] == path for path in seen)]
     return odd + found
 
@@ -249,8 +249,46 @@ def _registry() -> Any:
     return Registry().with_resources((f"{name}.schema.json", resource(name)) for name in schema_names())
 
 
+def _errors_in_order(reference: str, document: Any, *, may_fail: bool) -> list[ValidationError]:
+    try:
+        return sorted(_errors(reference, document), key=lambda error: [str(part) for part in error.absolute_path])
+    except TypeError:  # jsonschema matches a key that is not text with a pattern
+        if not may_fail:
+            raise
+        return []
+
+
+@cache
+def _whole_numbers() -> frozenset[str]:
+    """Names of the properties that are whole numbers, or lists of them, wherever they occur."""
+    whole, other = set[str](), set[str]()
+
+    def collect(schema: Any) -> None:
+        if isinstance(schema, list):
+            for part in schema:
+                collect(part)
+        if not isinstance(schema, dict):
+            return
+        properties = schema.get("properties")
+        for name, its in properties.items() if isinstance(properties, dict) else ():
+            types = str([its.get("type"), (its.get("items") or {}).get("type")] if isinstance(its, dict) else "")
+            if "integer" in types:
+                whole.add(name)
+            elif "number" in types:
+                other.add(name)
+        for part in schema.values():
+            collect(part)
+
+    for name in schema_names():
+        collect(schema_document(name))
+    return frozenset(whole - other)
+
+
 def _unrepresentable(value: Any, path: Path) -> Iterator[Finding]:
-    """Problems that YAML allows but JSON Schema cannot check: keys that are not text, numbers that are not finite."""
+    """Problems that YAML allows but JSON Schema does not see.
+
+    Keys that are not text, numbers that are not finite, and 1920.0 in place of a whole number.
+    """
     if isinstance(value, dict):
         for key, inner in value.items():
             if isinstance(key, str):
@@ -262,8 +300,15 @@ def _unrepresentable(value: Any, path: Path) -> Iterator[Finding]:
             yield from _unrepresentable(inner, (*path, index))
     elif isinstance(value, float) and not math.isfinite(value):
         yield Finding(path, f"{value}", "must be a finite number")
+    elif isinstance(value, float) and value.is_integer() and _name(path) in _whole_numbers():
+        yield Finding(path, f"{value}", "must be written without a decimal point")
     elif isinstance(value, int) and abs(value) >= 10**LONGEST_WHOLE:
         yield Finding(path, None, f"must have at most {LONGEST_WHOLE} digits")
+
+
+def _name(path: Path) -> str:
+    """The key of a value, or of the list that contains it."""
+    return next((part for part in reversed(path) if isinstance(part, str)), "")
 
 
 def _in_one_line(reference: str, document: Any) -> str | None:

@@ -204,6 +204,15 @@ def test_an_entry_of_a_list_is_named_by_its_number(tod: Command, key: str) -> No
     assert "name an entry of a list by its number, from 0 on" in found.err
 
 
+def test_whole_numbers_have_no_decimal_point(tod: Command) -> None:
+    """JSON Schema considers 1920.0 whole; caps and sockets do not."""
+    words = ("cameras.front_left.width_px=1920.0", "media.rtp_ports=[5000,5100.0]", "cameras.front_left.fps=40.0")
+    assert sorted(tod("print", *words).problems) == [
+        "command line: cameras.front_left.width_px: 1920.0: must be written without a decimal point",
+        "command line: media.rtp_ports[1]: 5100.0: must be written without a decimal point",
+    ]
+
+
 def test_a_graph_without_efforts_has_the_usual_one(tod: Command) -> None:
     (problem,) = tod("print", "graph.efforts=null").problems
     assert "nothing fills {preset}" in problem
