@@ -27,6 +27,7 @@ DEEPEST_JSON = 32  # levels; a composed configuration has ten
 MAX_ERRORS = 50  # explained per message or line; each takes time
 LONGEST_SHOWN = 80  # characters of a value in a message
 _BASE = "json-schema:///"
+NOT_CONFIGURATION = ("control", "drive", "event", "layout", "rate_quality", "report")  # schemas of other documents
 LONGEST_WHOLE = 300  # digits; the number must fit into a float
 
 _TYPES = {
@@ -260,28 +261,33 @@ def _errors_in_order(reference: str, document: Any, *, may_fail: bool) -> list[V
 
 @cache
 def _whole_numbers() -> frozenset[str]:
-    """Names of the properties that are whole numbers, or lists of them, wherever they occur."""
-    whole, other = set[str](), set[str]()
+    """Names of the keys of a configuration whose values are whole numbers, or lists of them."""
+    return _keys_of("integer", "items") - _keys_of("number", "items")
+
+
+@cache
+def _mappings_to_whole() -> frozenset[str]:
+    return _keys_of("integer", "additionalProperties") - _whole_numbers()
+
+
+def _keys_of(kind: str, inside: str) -> frozenset[str]:
+    """Names of the keys of a configuration with values of a type, or with such values inside."""
+    names = set[str]()
 
     def collect(schema: Any) -> None:
-        if isinstance(schema, list):
-            for part in schema:
-                collect(part)
-        if not isinstance(schema, dict):
-            return
-        properties = schema.get("properties")
-        for name, its in properties.items() if isinstance(properties, dict) else ():
-            types = str([its.get("type"), (its.get("items") or {}).get("type")] if isinstance(its, dict) else "")
-            if "integer" in types:
-                whole.add(name)
-            elif "number" in types:
-                other.add(name)
-        for part in schema.values():
+        for part in schema.values() if isinstance(schema, dict) else schema if isinstance(schema, list) else ():
             collect(part)
+        properties = schema.get("properties") if isinstance(schema, dict) else None
+        for name, its in properties.items() if isinstance(properties, dict) else ():
+            inner = its.get(inside) if isinstance(its, dict) else None
+            types = [each.get("type") for each in (its, inner) if isinstance(each, dict)]
+            if any(kind in (found if isinstance(found, list) else [found]) for found in types):
+                names.add(name)
 
     for name in schema_names():
-        collect(schema_document(name))
-    return frozenset(whole - other)
+        if name not in NOT_CONFIGURATION:
+            collect(schema_document(name))
+    return frozenset(names)
 
 
 def _unrepresentable(value: Any, path: Path) -> Iterator[Finding]:
@@ -300,15 +306,16 @@ def _unrepresentable(value: Any, path: Path) -> Iterator[Finding]:
             yield from _unrepresentable(inner, (*path, index))
     elif isinstance(value, float) and not math.isfinite(value):
         yield Finding(path, f"{value}", "must be a finite number")
-    elif isinstance(value, float) and value.is_integer() and _name(path) in _whole_numbers():
+    elif isinstance(value, float) and value.is_integer() and _is_whole(path):
         yield Finding(path, f"{value}", "must be written without a decimal point")
     elif isinstance(value, int) and abs(value) >= 10**LONGEST_WHOLE:
         yield Finding(path, None, f"must have at most {LONGEST_WHOLE} digits")
 
 
-def _name(path: Path) -> str:
-    """The key of a value, or of the list that contains it."""
-    return next((part for part in reversed(path) if isinstance(part, str)), "")
+def _is_whole(path: Path) -> bool:
+    """Whether a value, or the list or mapping that contains it, has the key of whole numbers."""
+    keys = [part for part in path if isinstance(part, str)]
+    return not set(keys[-1:]).isdisjoint(_whole_numbers()) or not set(keys[-2:-1]).isdisjoint(_mappings_to_whole())
 
 
 def _in_one_line(reference: str, document: Any) -> str | None:

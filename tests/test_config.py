@@ -196,21 +196,27 @@ def problems(tod: Command, conf: UserConf, *words: str) -> list[str]:
     return [problem.replace(str(conf.path), "~") for problem in found.problems]
 
 
-@pytest.mark.parametrize("key", ["modes.automatic.cap_by_link.reserve_kbps", "modes.automatic.x"])
-def test_an_entry_of_a_list_is_named_by_its_number(tod: Command, key: str) -> None:
-    found = tod("print", f"{key}=200")
+@pytest.mark.parametrize(
+    "word", ["modes.automatic.cap_by_link.reserve_kbps=200", "modes.automatic.x=1", "~graph.vehicle.0"]
+)
+def test_an_entry_of_a_list_is_named_by_its_number(tod: Command, word: str) -> None:
+    found = tod("print", word)
     assert found.status == 2
-    assert found.err.startswith(f"command line: {key}=200: ")
-    assert "name an entry of a list by its number, from 0 on" in found.err
+    assert found.err.startswith(f"command line: {word}: ")
+    assert "an entry of a list is named by its number, from 0 on" in found.err
 
 
 def test_whole_numbers_have_no_decimal_point(tod: Command) -> None:
     """JSON Schema considers 1920.0 whole; caps and sockets do not."""
-    words = ("cameras.front_left.width_px=1920.0", "media.rtp_ports=[5000,5100.0]", "cameras.front_left.fps=40.0")
-    assert sorted(tod("print", *words).problems) == [
-        "command line: cameras.front_left.width_px: 1920.0: must be written without a decimal point",
-        "command line: media.rtp_ports[1]: 5100.0: must be written without a decimal point",
-    ]
+    places = {
+        "cameras.front_left.width_px=1920.0": "cameras.front_left.width_px: 1920.0",
+        "media.rtp_ports=[5000,5100.0]": "media.rtp_ports[1]: 5100.0",
+        "source.capture.controls={exposure: 100.0}": "source.capture.controls.exposure: 100.0",
+        "source.capture.width=1280.0": "source.capture.width: 1280.0",
+    }
+    problems = tod("print", "source=v4l2", "cameras.front_left.fps=40.0", *places).problems
+    rule = "must be written without a decimal point"
+    assert sorted(problems) == sorted(f"command line: {place}: {rule}" for place in places.values())
 
 
 def test_a_graph_without_efforts_has_the_usual_one(tod: Command) -> None:

@@ -133,3 +133,29 @@ def test_a_request_expires(delays: list[float], delay: float, expired: str | Non
         operators.expired("a", 50.0, 50.0 - earlier)
         operators.expired("b", 50.0, 50.0)  # another operator's path does not matter
     assert operators.expired("a", 100.0, 100.0 - delay) == expired
+
+
+def test_control_outlasts_a_broken_connection_but_not_a_sign_off() -> None:
+    """The broker publishes the last will of a connection that a new one of the same operator replaces."""
+    operators = Operators(1.0)
+    operators.connected("driver", 0.0)
+    operators.connected("onlooker", 0.0)
+    operators.message_received("driver", 0.9)
+    operators.disconnected("driver", 1.0, signed_off=False)
+    operators.message_received("onlooker", 1.1)
+    operators.connected("driver", 1.3)
+    assert operators.in_control == "driver"
+    operators.disconnected("driver", 1.4, signed_off=False)
+    operators.message_received("onlooker", 1.4 + SILENT_S)
+    assert operators.in_control == "onlooker"
+    operators.connected("driver", 4.0)
+    operators.disconnected("onlooker", 4.1)
+    assert operators.in_control == "driver"
+
+
+def test_events_of_the_vehicles_own_program_keep_nobody_out_of_control() -> None:
+    operators = Operators(1.0)
+    for t in range(50):
+        operators.message_received("", t / 10)
+    operators.connected("driver", 5.0)
+    assert operators.in_control == "driver"

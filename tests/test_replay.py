@@ -417,6 +417,7 @@ def test_the_input_is_not_overwritten(tod: Command, drive: Path) -> None:
     [
         (["link=agian"], "link: 'agian': must be one of"),
         (["log={}"], "already contains a drive"),
+        (["log={}/drive.jsonl"], "is not a directory that you may write to"),
         (["positions={}/no.bag", "topic=/fix"], "no such file"),
         (["-m", "log={}/sweep", "cameras.front_left.weight=1,2"], "already contains a drive"),
     ],

@@ -294,6 +294,11 @@ def test_a_file_that_the_command_line_chooses_is_checked(tod: Command, conf: Use
     file = str(conf.path / "vehicle/van.yaml")
     for words in ([], ["vehicle=van"], ["modes=mine", "vehicle=van"]):
         assert [p.split(": ")[0] for p in tod("validate", file, *words).problems] == [file]
+    conf.write("cameras/mine.yaml", "defaults: [compact_480p, _self_]\n")
+    result = tod(
+        "validate", str(conf.path / "cameras/mine.yaml"), "vehicle=delivery_robot", "cameras@cameras.rear=mine"
+    )
+    assert (result.status, result.out.splitlines()[0]) == (0, "valid: 1 file, 2 configurations")
     result = tod("validate", str(conf.path / "modes/mine.yaml"), "modes=mine", "modes.single.0=null")
     assert result.status == 2
 

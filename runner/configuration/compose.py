@@ -159,7 +159,9 @@ def _compose(overrides: Sequence[Override], directories: Sequence[Path]) -> tupl
     except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError([_hydra_problem(error, directories)]) from None
     except (TypeError, ValueError) as error:
-        rule = f"{str(error).lower()}: name an entry of a list by its number, from 0 on"
+        if not re.search(r"is not an int|invalid literal for int|list indices must be integers", str(error)):
+            raise
+        rule = "an entry of a list is named by its number, from 0 on, and cannot be removed: give the whole list"
         raise ConfigError([Problem(COMMAND_LINE, "", " ".join(o.text for o in overrides), rule)]) from None
     except RecursionError:
         rule = "files include each other in a cycle"

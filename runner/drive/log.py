@@ -254,8 +254,11 @@ class _Writer:
 
 
 def check_free(directory: Path, side: str) -> None:
-    """raises UserError if this side of a drive already exists; an empty file does not count"""
+    """raises UserError if this side of a drive already exists, empty files not counting, or cannot be created"""
     path = directory / FILES[side]
+    above = next((each for each in (directory, *directory.absolute().parents) if os.path.lexists(each)), directory)
+    if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
+        raise _refused(directory, f"cannot be created: {above} is not a directory that you may write to")
     try:
         if os.path.lexists(path) and not (path.is_file() and path.stat().st_size == 0):
             raise _refused(directory, f"already contains a drive ({FILES[side]}), choose another directory")

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from gi.repository import GLib, Gst
 
 from runner.graph import Plan
+from runner.gst.aside import set_state_in_thread
 from runner.gst.caps import structure
 from runner.gst.clocks import unix_time
 from runner.gst.credentials import log_in
@@ -139,7 +140,7 @@ class Recorder:
         self._recorded = replace(self._count(), stage=stage, failure=why)
         GLib.source_remove(self._watching)
         self._pipeline.get_bus().remove_signal_watch()
-        self._pipeline.set_state(Gst.State.NULL)
+        set_state_in_thread(self._pipeline, Gst.State.NULL)  # a source that hangs must not keep others from finishing
 
     # --- counting -----------------------------------------------------------------------------------------------------
 

@@ -18,6 +18,7 @@ from runner.system.backoff import pause_s
 CHECK_MS = 100
 FIRST_FRAME_S = 10.0  # a UDP source may take 5 s to fail, and the first keyframe may be late
 IN_FLIGHT = 5  # frames that may still pass after an error that stops the source
+LONGEST_START_S = 300.0  # a start that hangs is abandoned then; its thread remains
 BACKOFF_S = (1.0, 10.0)  # between the starts of two attempts: doubled from the first value up to the second
 
 
@@ -51,6 +52,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         self._child: Gst.Bin | None = None
         self._timer = 0
         self._starting: threading.Thread | None = None  # starts the child
+        self._started = 0.0  # when it began
         self._error: tuple[str, int] | None = None  # the source's own error, and frames before it; set from its threads
         self._progress = (0, 0.0)  # frames at the last change of the counter, and when
         self._attempts = 0  # in this outage
@@ -145,8 +147,10 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
             self._replace(now)
 
     def _replace(self, now: float) -> None:
-        if self._starting and self._starting.is_alive():
-            return  # a device that hangs would hang again
+        starting = self._starting
+        if starting and starting.is_alive() and now - self._started < LONGEST_START_S:
+            self._last_attempt = (self._last_attempt[0], now)  # its first frame is due once it has started
+            return
         self._last_attempt = (self._progress[0], now)
         self._attempts += 1
         with self._lock:
@@ -155,6 +159,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
             self._remove_child()
             self._error = None
             child = self._add_child()
+            self._started = now
             self._starting = change_in_thread(
                 "start", child.sync_state_with_parent, lambda: self._on_report(f"source: {HUNG_STARTING}")
             )

@@ -38,7 +38,8 @@ from runner.records import (
 from runner.schema import message_problem, read_json
 
 OFFLINE = {"online": False}
-OPERATOR_GONE = {"id": "will", "event": "operator_disconnected"}
+OPERATOR_GONE = {"id": "will", "event": "operator_disconnected"}  # by the broker, when the connection has broken
+SIGNED_OFF = {**OPERATOR_GONE, "id": "signed off"}  # by the operator itself
 OPERATOR = re.compile(r"[A-Za-z0-9_-]{1,64}")  # shown to operators and logged
 _SURROGATE = re.compile(rb"\\u[dD]")  # perhaps half of a pair
 OPERATOR_RULE = "topic: an operator's id must be 1 to 64 letters, digits, _ and -"

@@ -12,7 +12,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from math import inf
 from pathlib import Path
@@ -117,9 +117,11 @@ class LiveOperator:
             if thread.ident:
                 thread.join(END_S)
         self.station.close()
-        if self._side:
-            self._side.stop()
-        self._log.close()
+        try:
+            if self._side:
+                self._side.stop()
+        finally:
+            self._log.close()
 
     def problem(self) -> str | None:
         """Why this side does not work; None if it works."""
@@ -254,13 +256,12 @@ def live_operator(
     operator = LiveOperator(vehicle, station, drive, build, requests)
     metrics = metrics_of(vehicle.name, vehicle.metrics.operator_port, log)
     station.listeners.append(_MetricsListener(metrics))
-    try:
+    with ExitStack() as ending:  # in reverse order
+        ending.callback(metrics.close)
+        if pictures:
+            ending.callback(pictures.close)
+        ending.callback(operator.stop)
         if pictures:
             pictures.start()
         metrics.serve(operator.problem)
         yield operator
-    finally:
-        operator.stop()
-        if pictures:
-            pictures.close()
-        metrics.close()

@@ -18,6 +18,7 @@ from runner.mqtt.link import ControlLink
 from runner.mqtt.login import Login
 from runner.mqtt.messages import (
     OPERATOR_GONE,
+    SIGNED_OFF,
     SILENT_S,
     JsonObject,
     MqttMessage,
@@ -157,7 +158,7 @@ class Station:
 
     def close(self) -> None:
         self.state = None  # so that signing off is not reported as a loss
-        self._link.close((self._requests, OPERATOR_GONE))
+        self._link.close((self._requests, SIGNED_OFF))
 
     def ask(self, event: JsonObject, on_reply: OnReply | None = None) -> None:
         """Send a request to the vehicle.

@@ -16,6 +16,7 @@ from runner.mqtt.link import ControlLink
 from runner.mqtt.login import Login
 from runner.mqtt.messages import (
     OPERATOR_GONE,
+    SIGNED_OFF,
     SILENT_S,
     MqttMessage,
     answer_s,
@@ -96,7 +97,7 @@ class Bridge:
         self._link.connect()
 
     def close(self) -> None:
-        self._link.close((self._requests, OPERATOR_GONE))
+        self._link.close((self._requests, SIGNED_OFF))
         self._node.close()
 
     def time_out(self) -> None:

@@ -30,12 +30,14 @@ class Request(NamedTuple):
 
     sender  operator's id from the topic; "" for this process
     as_of   see `runner.vehicle.operators`; None for this process, which need not state it
+    will    whether the broker sent it as the last will of an operator
     """
 
     sender: str
     document: Mapping[str, Any]
     answer: Answer | None = None
     as_of: float | None = None
+    will: bool = False
 
     @property
     def queue(self) -> str:

@@ -30,6 +30,7 @@ from runner.mqtt.link import ControlLink
 from runner.mqtt.login import Login
 from runner.mqtt.messages import (
     OFFLINE,
+    OPERATOR_GONE,
     MqttMessage,
     read_reception,
     read_request,
@@ -257,7 +258,8 @@ class _VehicleControl:
         def answer(outcome: Outcome) -> None:
             self._link.publish(reply, {"id": parsed.identity, **to_json(outcome)})
 
-        request = Request(message.sender, parsed.document, answer, parsed.as_of)
+        will = parsed.identity == OPERATOR_GONE["id"]
+        request = Request(message.sender, parsed.document, answer, parsed.as_of, will)
         if parsed.problem:
             self._live.loop.refuse(request, parsed.problem)
         else:

@@ -118,6 +118,7 @@ class ControlLoop:
     _stopped: bool = False
     _ticks: int = 0
     _pending: list[_PendingReply] = field(default_factory=list)
+    _unconfirmed: dict[tuple[str, str], None] = field(default_factory=dict)  # camera, knob: commanded, not read back
     _published: VehicleState | None = None  # the state as last published
     _publish_again: bool = False
     _cause: str = ""  # the event that the decision in force came from
@@ -276,7 +277,7 @@ class ControlLoop:
         stamped = {**request.document, "t": t}
         problem = event_problem(stamped)
         event = None if problem else parse(stamped)
-        self._update_presence(request.sender, t, event)
+        self._update_presence(request.sender, t, event, signed_off=not request.will)
         if event is None:
             assert problem
             self._refuse(problem, t, request.answer)
@@ -339,13 +340,13 @@ class ControlLoop:
             self._clock_stated[item.sender] = t
             item.state_clock()
 
-    def _update_presence(self, sender: str, t: float, event: Event | None) -> None:
+    def _update_presence(self, sender: str, t: float, event: Event | None, *, signed_off: bool = True) -> None:
         """Any message of an operator shows its presence. The core sees the first to arrive and the last to leave."""
         before = self._operators.present
         if isinstance(event, OperatorConnected):
             self._operators.connected(sender, t)
         elif isinstance(event, OperatorDisconnected):
-            self._operators.disconnected(sender, t)
+            self._operators.disconnected(sender, t, signed_off=signed_off)
         else:
             self._operators.message_received(sender, t)
         self._presence_changed(before, t, "disconnected")
@@ -408,6 +409,7 @@ class ControlLoop:
         except Exception:
             self._run = replace(after, commanded=before.commanded)  # the next event repeats the commands
             raise
+        self._unconfirmed |= {(command.camera, command.knob): None for command in after.commands}
         log_run(self.log, event, before, after)
         if isinstance(event, PositionReported):
             self._position = event
@@ -422,7 +424,9 @@ class ControlLoop:
             self._report_once(f"refused: {after.refused}")
             self._answer(answer, Outcome(event.t, "refused", after.refused))
         elif answer:
-            knobs = [(command.camera, command.knob) for command in after.commands]
+            # A repeated request commands nothing, but what it asks for may still not be applied.
+            camera = getattr(event, "camera", None)
+            knobs = [knob for knob in self._unconfirmed if camera in (None, knob[0])]
             self._pending.append(_PendingReply(answer, knobs, event.t + APPLY_S))
         if after.commands or after.decision != before.decision:
             self._report_decision(before, event)
@@ -447,6 +451,10 @@ class ControlLoop:
         if state and self._is_news(state) and self.publish(state):
             self._publish_again, self._published = False, state
         self._pending = [pending for pending in self._pending if not self._answered(pending, applied)]
+        commanded = self._run.commanded
+        self._unconfirmed = {
+            (name, knob): None for name, knob in self._unconfirmed if applied[name].get(knob) != commanded[name][knob]
+        }
 
     def _is_news(self, state: VehicleState) -> bool:
         """Whether to publish a state. Changed reasons alone, such as one with a running time, are not urgent."""

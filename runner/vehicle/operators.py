@@ -53,7 +53,8 @@ class Operators:
     def _pass_control(self, t: float) -> None:
         """Control stays with an operator while it is present, then passes to the one that has been present longest.
 
-        An operator that falls silent keeps control until another one has been present for SILENT_S since. If all fell
+        An operator that falls silent, or whose connection breaks, keeps control until another one has been present for
+        SILENT_S since; one that signs off does not. If all fell
         silent, the link was down, and the first one to return must not take control from the one that drives. One that
         may no longer be in control, as its keys were revoked, loses it immediately.
         """
@@ -61,7 +62,7 @@ class Operators:
         if not present or self._control in present:
             return
         longest = min(present, key=lambda name: present[name])
-        last = self._known.get(self._control)
+        last = self._known.get(self._control) if self._control else None
         revoked = not self._may_control(self._control)
         if last is None or last.signed_off or revoked or t - max(last.last_message, present[longest]) >= SILENT_S:
             self._control = longest
@@ -82,12 +83,12 @@ class Operators:
         self._pass_control(t)
         return returns
 
-    def disconnected(self, name: str, t: float) -> bool:
-        """An operator disconnected, by itself or through its last will; returns whether it was present."""
+    def disconnected(self, name: str, t: float, *, signed_off: bool = True) -> bool:
+        """An operator signed off, or its connection broke (its last will); returns whether it was present."""
         operator = self._known.get(name)
         was_present = operator is not None and operator.present
         if operator:
-            operator.present, operator.signed_off = False, True
+            operator.present, operator.signed_off = False, signed_off
         self._pass_control(t)
         return was_present
 

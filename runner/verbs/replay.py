@@ -83,7 +83,7 @@ def run(arguments: Arguments) -> int:
         return _sweep(arguments)
     with _input(arguments) as (name, text):
         lines, began = _begin(text, name)
-        one = _prepare(arguments, name, began)
+        one = _prepare(arguments, name, began, _positions(arguments, began))
         _check(arguments)
         with _output(arguments) as output:
             output.writelines(_output_lines(one, lines, name, began))
@@ -97,7 +97,8 @@ def _sweep(arguments: Arguments) -> int:
         raise UserError("command line", "-m", None, "reads the events once for each run: give input=FILE")
     with _input(arguments) as (name, text):
         _, began = _begin(text, name)
-    runs = prepare_all(arguments, lambda own: _prepare(own, name, began))
+    positions = _positions(arguments, began)
+    runs = prepare_all(arguments, lambda own: _prepare(own, name, began, positions))
     logged = [one._replace(arguments=one.arguments.in_directory(str(n), ["log"])) for n, (_, one) in enumerate(runs)]
     for one in logged:
         _check(one.arguments)
@@ -111,11 +112,11 @@ def _sweep(arguments: Arguments) -> int:
     return 0
 
 
-def _prepare(arguments: Arguments, name: str, began: Began | None) -> _Prepared:
+def _prepare(arguments: Arguments, name: str, began: Began | None, positions: RecordedPositions | None) -> _Prepared:
     config = configuration(arguments.overrides, arguments.conf, base=_base(name, began), runnable=False)
     chosen = any(word.lstrip("+").startswith(("pqos=", "pqos.")) for word in arguments.overrides)
     pqos = config.pqos()[0] if chosen else None
-    return _Prepared(arguments, config.document, config.vehicle(), pqos, _positions(arguments, began))
+    return _Prepared(arguments, config.document, config.vehicle(), pqos, positions)
 
 
 def _positions(arguments: Arguments, began: Began | None) -> RecordedPositions | None:

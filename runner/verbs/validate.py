@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -50,7 +50,9 @@ from runner.verbs import Arguments
 FOLDERS = (*GROUPS, LAYOUT)  # of checked files
 DATA = ("maps", "traces")  # folders for data that pqos files name; a bandwidth map may be YAML
 CROSSED = ("vehicle", "graph", "source")  # groups whose files are combined with each other
-STANDALONE = ("experiment", "link")  # packaged ones are never combined with choices of the command line
+# Packaged files of these groups are never combined with choices of the command line, but with these; a link needs
+# predictions whose rates it can follow.
+STANDALONE: Mapping[str, tuple[str, ...]] = {"experiment": (), "link": ("pqos=constant",)}
 ConfigReader = Callable[[Configuration], object]
 READERS: dict[str, ConfigReader] = {  # by group, the reader of its part of the configuration, if not the vehicle
     "pqos": Configuration.pqos,
@@ -253,9 +255,8 @@ class _Tasks:
         self._files = {group: options(group, searched) for group in GROUPS if group not in fixed}
         self._vehicle_fixed = "vehicle" in fixed
         words = (word.lstrip("+").partition("=") for word in overrides)
-        self._given = [
-            (key, name) for key, _, name in words if key in GROUPS and name in options(key, self._directories)
-        ]
+        chosen = ((key.lstrip("/").partition("@")[0], name) for key, _, name in words)
+        self._given = [each for each in chosen if each[0] in GROUPS and each[1] in options(each[0], self._directories)]
         self._tasks = list(dict.fromkeys(filter(self._is_selected, self._all())))
 
     def __iter__(self) -> Iterator[ValidationTask]:
@@ -285,7 +286,7 @@ class _Tasks:
     def _of_one_file(self, group: str, name: str) -> Iterator[ValidationTask]:
         """A file with the choices of the command line; an experiment also with each of its runs."""
         packaged = name not in options(group, self._directories[:-1])
-        overrides = () if packaged and group in STANDALONE else self._overrides
+        overrides = STANDALONE[group] if packaged and group in STANDALONE else self._overrides
         task = ValidationTask(overrides, ((group, name),))
         yield task
         if group == "experiment":

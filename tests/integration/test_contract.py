@@ -95,6 +95,16 @@ def test_a_request_is_answered_once_it_is_read_back(operator, vehicle):
         assert sum(camera["applied"]["bitrate"] for camera in state["cameras"].values()) <= kbps
 
 
+def test_a_request_that_is_not_applied_times_out_when_it_is_repeated_too(operator, vehicle, monkeypatch):
+    vehicle.watch(*CAMERAS)
+    operator.reach(all_fit)
+    monkeypatch.setattr(vehicle.live.side, "turn", lambda commands: None)
+    asked = {"event": "camera_switched", "camera": "front", "on": False}
+    replies = [operator.ask(f"again{number}", **asked) for number in range(2)]
+    assert [reply["result"] for reply in replies] == ["timed out"] * 2
+    assert replies[1]["reason"] == "not applied within 1 s: front sending"
+
+
 def fits(camera):
     """Whether the decision for a camera is applied."""
     size = {"width": camera["width"], "height": camera["height"]}

@@ -421,7 +421,7 @@ export class Stream {
    */
   onComposed(one, isPart, fps) {
     this.composed_fps = fps;
-    if (!this.isOnlyInBirdseye || !one || one.meta.decoded <= this.composed_at) return;
+    if (!this.isOnlyInBirdseye || !this.drawn || !one || one.meta.decoded <= this.composed_at) return;
     this.composed_at = one.meta.decoded;
     this.decoded = now();
     if (!isPart) return;
