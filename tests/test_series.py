@@ -160,6 +160,30 @@ def test_compared_clocks_align_the_sides_and_bound_the_latencies(tmp_path: Path)
     assert any(heading.startswith("arrival, ms ± 0.4") for heading in headings)
 
 
+@pytest.mark.parametrize("set_s", [30, -30, 2])
+def test_setting_the_operators_clock_makes_no_freeze(tmp_path: Path, set_s: int) -> None:
+    """Arrivals are logged by the wall clock, samples by the monotonic one."""
+
+    def is_set(side: str, lines: Lines) -> Lines:
+        for entry in (entry for entry in lines if entry.get("log") == "sample"):
+            after = entry["t"] >= 8
+            known = not 8 <= entry["t"] < 9.3  # until the clocks were compared again
+            entry |= {"clock_ahead_ms": 5 - 1000.0 * set_s * after if known else None, "clock_bound_ms": 0.4}
+            for camera in entry["cameras"].values():
+                camera["arrivals"] = [[at + set_s * after, ms] for at, ms in camera["arrivals"]]
+        return lines
+
+    drive = series(read_drive(write_drive(tmp_path / "drive", seconds=20, change=is_set)))
+    plain = series(read_drive(write_drive(tmp_path / "plain", seconds=20)))
+    for name, camera in drive.cameras.items():
+        received, expected = camera.received, plain.cameras[name].received
+        assert received is not None
+        assert expected is not None
+        gaps, same = np.diff(received.arrival_t), np.diff(expected.arrival_t)
+        assert len(gaps) > 0.9 * len(same)
+        assert gaps == pytest.approx(same[: len(gaps)], abs=0.01)
+
+
 def test_clocks_that_differ_are_reported(tmp_path: Path) -> None:
     def early(side: str, lines: Lines) -> Lines:
         for entry in lines:
