@@ -262,16 +262,11 @@ def _errors_in_order(reference: str, document: Any, *, may_fail: bool) -> list[V
 @cache
 def _whole_numbers() -> frozenset[str]:
     """Names of the keys of a configuration whose values are whole numbers, or lists of them."""
-    return _keys_of("integer", "items") - _keys_of("number", "items")
+    return _keys_of("integer") - _keys_of("number")
 
 
-@cache
-def _mappings_to_whole() -> frozenset[str]:
-    return _keys_of("integer", "additionalProperties") - _whole_numbers()
-
-
-def _keys_of(kind: str, inside: str) -> frozenset[str]:
-    """Names of the keys of a configuration with values of a type, or with such values inside."""
+def _keys_of(kind: str) -> frozenset[str]:
+    """Names of the keys of a configuration with values of a type, or lists of them."""
     names = set[str]()
 
     def collect(schema: Any) -> None:
@@ -279,7 +274,7 @@ def _keys_of(kind: str, inside: str) -> frozenset[str]:
             collect(part)
         properties = schema.get("properties") if isinstance(schema, dict) else None
         for name, its in properties.items() if isinstance(properties, dict) else ():
-            inner = its.get(inside) if isinstance(its, dict) else None
+            inner = its.get("items") if isinstance(its, dict) else None
             types = [each.get("type") for each in (its, inner) if isinstance(each, dict)]
             if any(kind in (found if isinstance(found, list) else [found]) for found in types):
                 names.add(name)
@@ -315,7 +310,7 @@ def _unrepresentable(value: Any, path: Path) -> Iterator[Finding]:
 def _is_whole(path: Path) -> bool:
     """Whether a value, or the list or mapping that contains it, has the key of whole numbers."""
     keys = [part for part in path if isinstance(part, str)]
-    return not set(keys[-1:]).isdisjoint(_whole_numbers()) or not set(keys[-2:-1]).isdisjoint(_mappings_to_whole())
+    return keys[-1:] != [] and (keys[-1] in _whole_numbers() or keys[-3:-1] == ["capture", "controls"])
 
 
 def _in_one_line(reference: str, document: Any) -> str | None:

@@ -65,7 +65,7 @@ class Recorded:
 class Recorder:
     """Records one camera. Everything happens in the thread of GLib's main loop, unless stated otherwise.
 
-    path        file that is written; closed and complete as soon as the stage is FINISHED
+    path        file that is written; complete as soon as the stage is FINISHED, and closed soon after
     duration_s  length of the recording, s; None: until `finish`
     """
 

@@ -142,15 +142,15 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         """After an attempt that has not delivered a frame yet."""
         if self._error:
             self.outage.report_failure(f"source: {self._error[0]}", self._progress[1])
+        starting = self._starting
+        if starting and starting.is_alive() and now - self._started < LONGEST_START_S:
+            self._last_attempt = (self._last_attempt[0], now)  # its first frame is due once it has started
+            return
         pause = pause_s(self._attempts - 1, *BACKOFF_S)
         if now - self._last_attempt[1] > (pause if self._error else max(pause, FIRST_FRAME_S)):
             self._replace(now)
 
     def _replace(self, now: float) -> None:
-        starting = self._starting
-        if starting and starting.is_alive() and now - self._started < LONGEST_START_S:
-            self._last_attempt = (self._last_attempt[0], now)  # its first frame is due once it has started
-            return
         self._last_attempt = (self._progress[0], now)
         self._attempts += 1
         with self._lock:

@@ -52,6 +52,7 @@ class Bridge:
         self.identity = login.user if login else uuid.uuid4().hex[:12]
         self._vehicle_time = (0.0, -math.inf)  # in the newest telemetry, and when it arrived by time.monotonic
         self._answer_s = answer_s(vehicle.expires_s)
+        self._has_keys = login is not None
         self._pending: dict[str, float] = {}  # by id of a request, until when it may be answered
         self._calls: dict[str, str] = {}  # by id of a request, the service call that waits for its answer
         self._numbers = itertools.count(1)  # of requests without an id of their own
@@ -97,7 +98,8 @@ class Bridge:
         self._link.connect()
 
     def close(self) -> None:
-        self._link.close((self._requests, SIGNED_OFF))
+        # With keys an operator's side may have the same name, and goes on.
+        self._link.close(*([] if self._has_keys else [(self._requests, SIGNED_OFF)]))
         self._node.close()
 
     def time_out(self) -> None:

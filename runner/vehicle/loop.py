@@ -81,12 +81,16 @@ class Applier(Protocol):
     def send_key_frames(self, cameras: Iterable[str]) -> None: ...
 
 
+_Kind = tuple[type, str | None]  # of a request: its event, and the camera that it names
+
+
 class _PendingReply(NamedTuple):
     """An accepted request, answered once its commands are read back as applied."""
 
     answer: Answer
     knobs: Sequence[tuple[str, str]]  # camera, knob
     until: float
+    kind: _Kind
 
 
 @dataclass
@@ -118,7 +122,7 @@ class ControlLoop:
     _stopped: bool = False
     _ticks: int = 0
     _pending: list[_PendingReply] = field(default_factory=list)
-    _unconfirmed: dict[tuple[str, str], None] = field(default_factory=dict)  # camera, knob: commanded, not read back
+    _timed_out: dict[_Kind, list[tuple[str, str]]] = field(default_factory=dict)  # knobs of the last request of a kind
     _published: VehicleState | None = None  # the state as last published
     _publish_again: bool = False
     _cause: str = ""  # the event that the decision in force came from
@@ -409,7 +413,6 @@ class ControlLoop:
         except Exception:
             self._run = replace(after, commanded=before.commanded)  # the next event repeats the commands
             raise
-        self._unconfirmed |= {(command.camera, command.knob): None for command in after.commands}
         log_run(self.log, event, before, after)
         if isinstance(event, PositionReported):
             self._position = event
@@ -424,10 +427,11 @@ class ControlLoop:
             self._report_once(f"refused: {after.refused}")
             self._answer(answer, Outcome(event.t, "refused", after.refused))
         elif answer:
-            # A repeated request commands nothing, but what it asks for may still not be applied.
-            camera = getattr(event, "camera", None)
-            knobs = [knob for knob in self._unconfirmed if camera in (None, knob[0])]
-            self._pending.append(_PendingReply(answer, knobs, event.t + APPLY_S))
+            kind = (type(event), getattr(event, "camera", None))
+            commanded = [(command.camera, command.knob) for command in after.commands]
+            # A request that is repeated commands nothing, but what it asks for may still not be applied.
+            knobs = list(dict.fromkeys([*commanded, *self._timed_out.get(kind, ())]))
+            self._pending.append(_PendingReply(answer, knobs, event.t + APPLY_S, kind))
         if after.commands or after.decision != before.decision:
             self._report_decision(before, event)
 
@@ -451,10 +455,6 @@ class ControlLoop:
         if state and self._is_news(state) and self.publish(state):
             self._publish_again, self._published = False, state
         self._pending = [pending for pending in self._pending if not self._answered(pending, applied)]
-        commanded = self._run.commanded
-        self._unconfirmed = {
-            (name, knob): None for name, knob in self._unconfirmed if applied[name].get(knob) != commanded[name][knob]
-        }
 
     def _is_news(self, state: VehicleState) -> bool:
         """Whether to publish a state. Changed reasons alone, such as one with a running time, are not urgent."""
@@ -485,11 +485,14 @@ class ControlLoop:
         """Answer a request if all its knob values are applied or it has timed out; returns whether it is answered."""
         now, commanded = self._now(), self._run.commanded
         watched = [(name, knob) for name, knob in pending.knobs if applied[name]]
-        waiting = [f"{name} {knob}" for name, knob in watched if applied[name].get(knob) != commanded[name][knob]]
+        waiting = [(name, knob) for name, knob in watched if applied[name].get(knob) != commanded[name][knob]]
         if waiting and now < pending.until:
             return False
+        self._timed_out.pop(pending.kind, None)
         if waiting:
-            pending.answer(Outcome(now, "timed out", f"not applied within {APPLY_S:g} s: {', '.join(waiting)}"))
+            self._timed_out[pending.kind] = waiting
+            missing = ", ".join(f"{name} {knob}" for name, knob in waiting)
+            pending.answer(Outcome(now, "timed out", f"not applied within {APPLY_S:g} s: {missing}"))
             return True
         unwatched = dict.fromkeys(name for name, _ in pending.knobs if not applied[name])
         reason = f"nobody watches {', '.join(unwatched)}: kept until somebody does" if unwatched else ""

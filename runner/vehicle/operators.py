@@ -54,9 +54,9 @@ class Operators:
         """Control stays with an operator while it is present, then passes to the one that has been present longest.
 
         An operator that falls silent, or whose connection breaks, keeps control until another one has been present for
-        SILENT_S since; one that signs off does not. If all fell
-        silent, the link was down, and the first one to return must not take control from the one that drives. One that
-        may no longer be in control, as its keys were revoked, loses it immediately.
+        SILENT_S since; one that signs off loses it at once. If all fell silent, the link was down, and the first one to
+        return must not take control from the one that drives. One that may no longer be in control, as its keys were
+        revoked, loses it immediately.
         """
         present = {name: o.since for name, o in self._known.items() if o.present and self._may_control(name)}
         if not present or self._control in present:

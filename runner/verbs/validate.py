@@ -50,7 +50,7 @@ from runner.verbs import Arguments
 FOLDERS = (*GROUPS, LAYOUT)  # of checked files
 DATA = ("maps", "traces")  # folders for data that pqos files name; a bandwidth map may be YAML
 CROSSED = ("vehicle", "graph", "source")  # groups whose files are combined with each other
-# Packaged files of these groups are never combined with choices of the command line, but with these; a link needs
+# Packaged files of these groups are combined only with these choices, not with those of the command line; a link needs
 # predictions whose rates it can follow.
 STANDALONE: Mapping[str, tuple[str, ...]] = {"experiment": (), "link": ("pqos=constant",)}
 ConfigReader = Callable[[Configuration], object]

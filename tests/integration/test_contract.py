@@ -95,14 +95,22 @@ def test_a_request_is_answered_once_it_is_read_back(operator, vehicle):
         assert sum(camera["applied"]["bitrate"] for camera in state["cameras"].values()) <= kbps
 
 
+@pytest.mark.parametrize("vehicle", ["recording"], indirect=True)
 def test_a_request_that_is_not_applied_times_out_when_it_is_repeated_too(operator, vehicle, monkeypatch):
     vehicle.watch(*CAMERAS)
     operator.reach(all_fit)
-    monkeypatch.setattr(vehicle.live.side, "turn", lambda commands: None)
+    turn = vehicle.live.side.turn
+    monkeypatch.setattr(
+        vehicle.live.side, "turn", lambda commands: turn([each for each in commands if each.knob != "sending"])
+    )
     asked = {"event": "camera_switched", "camera": "front", "on": False}
     replies = [operator.ask(f"again{number}", **asked) for number in range(2)]
     assert [reply["result"] for reply in replies] == ["timed out"] * 2
     assert replies[1]["reason"] == "not applied within 1 s: front sending"
+    assert operator.ask("other", event="camera_switched", camera="mast", on=True)["result"] == "applied"
+    assert operator.ask("total", event="mode_selected", mode="collective")["result"] == "applied"
+    monkeypatch.undo()
+    assert operator.ask("back", **asked | {"on": True})["result"] == "applied"
 
 
 def fits(camera):
