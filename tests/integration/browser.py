@@ -70,12 +70,16 @@ def visit(page, url):
     until(visited)
 
 
+# Of a page that loads again, as when an address is added to this machine: while it does, and before its module has run.
+LOADING = ("Execution context was destroyed", "tod is not defined")
+
+
 def has_started(page):
     """Whether the page's main module has run; not if the page loads again meanwhile."""
     try:
         return page.evaluate("window.tod !== undefined")
     except sync_api.Error as error:
-        if "Execution context was destroyed" not in error.message:
+        if LOADING[0] not in error.message:
             raise
         return False
 
@@ -106,7 +110,7 @@ def measure(page):
         try:
             return page.evaluate("tod.measure()")["cameras"]  # empty before hello
         except sync_api.Error as error:
-            if "does not answer" not in error.message:
+            if not any(why in error.message for why in ("does not answer", *LOADING)):
                 raise
 
     return until(measured)
