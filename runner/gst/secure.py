@@ -16,7 +16,7 @@ from gi.repository import Gio, GLib, Gst, GstRtsp, GstRtspServer
 from runner.core.roles import Role
 from runner.errors import RunError, UserError
 from runner.gst.pipeline import encrypt
-from runner.security.keyring import KEY, Holder, Keyring, Watched, rtsp_password, srt_passphrase
+from runner.security.keyring import Holder, Keyring, Watched, rtsp_password, srt_passphrase
 
 USER = "user"  # field of a token of the server library: whose password it stands for
 VIEWER = "viewer"  # role in the server library that may open and watch a camera
@@ -70,7 +70,6 @@ class _Certificate(Gio.TlsInteraction):  # type: ignore[misc]
 def own_certificate(keyring: Keyring) -> Gio.TlsCertificate:
     """raises RunError if certificate and key do not match, or others may read the key"""
     try:
-        keyring.read(KEY)  # nobody else may
         return Gio.TlsCertificate.new_from_files(str(keyring.certificate), str(keyring.key))
     except UserError as error:
         raise RunError(str(error)) from None

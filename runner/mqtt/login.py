@@ -8,7 +8,7 @@ from typing import Any
 
 from runner.core.roles import Role
 from runner.errors import RunError
-from runner.security.keyring import KEY, Keyring, mqtt_password
+from runner.security.keyring import Keyring, mqtt_password
 
 
 class Login:
@@ -35,7 +35,6 @@ class Login:
         raises  OSError, ssl.SSLError, UserError for files that cannot be used
         """
         self._used = self._own.get()
-        self._keyring.read(KEY)  # nobody else may
         self.context.load_cert_chain(self._keyring.certificate, self._keyring.key)
         self.context.load_verify_locations(self._keyring.revocation_list)
         return mqtt_password(self._keyring.secret)

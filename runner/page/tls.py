@@ -6,7 +6,7 @@ import ssl
 from collections.abc import Callable
 
 from runner.errors import RunError, UserError
-from runner.security.keyring import KEY, Keyring
+from runner.security.keyring import Keyring
 
 
 class PageTls:
@@ -31,7 +31,7 @@ class PageTls:
             _context(self._keyring)  # first: one that does not match would leave the context without a certificate
             self.context.load_cert_chain(self._keyring.certificate, self._keyring.key)
             self._used = own
-        except (OSError, RunError) as error:
+        except (OSError, RunError, UserError) as error:
             self._on_report(f"page: the previous certificate stays in force: {error}")
 
 
@@ -40,7 +40,6 @@ def _context(keyring: Keyring) -> ssl.SSLContext:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.minimum_version = ssl.TLSVersion.TLSv1_3
     try:
-        keyring.read(KEY)  # nobody else may
         context.load_cert_chain(keyring.certificate, keyring.key)
     except UserError as error:
         raise RunError(str(error)) from None

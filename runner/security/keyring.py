@@ -160,6 +160,8 @@ class Keyring:
 
     @property
     def key(self) -> Path:
+        """raises UserError if others may read the file"""
+        self.read(KEY)
         return self.directory / KEY
 
     @property
