@@ -23,14 +23,14 @@ demo: $(READY)
 	$(BIN)/tod-runner demo
 
 # Timing-sensitive tests leave the processors idle half of the time; everything else runs in the background meanwhile.
-test: $(TEST_READY) $(NODE_READY)
+test: $(TEST_READY)
 	$(MAKE) --no-print-directory -j 2 --output-sync=line timed untimed
 
 timed: $(TEST_READY)
 	$(BIN)/pytest tests/integration -m "alone and not soak" -n $$(($$(nproc) + 1)) --dist loadgroup --durations=10
 	$(BIN)/pytest tests/integration -m "timed and not soak" -n $$(($$(nproc) + 1)) --dist loadfile --no-loadscope-reorder --durations=30
 
-untimed: $(TEST_READY) $(NODE_READY)
+untimed: $(TEST_READY)
 	scripts/background $(MAKE) --no-print-directory -j 1 lint javascript golden units
 
 golden: $(TEST_READY)

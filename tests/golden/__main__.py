@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import gc
 import io
 import json
 import lzma
@@ -55,7 +56,7 @@ def main(words: list[str]) -> int:
         # Rendered clips of the user's cache would show up in the printed lines.
         os.environ |= {"XDG_CACHE_HOME": empty}
         os.environ.pop("TOD_CONF", None)
-        with ProcessPoolExecutor(os.cpu_count()) as pool:
+        with ProcessPoolExecutor(os.cpu_count(), initializer=gc.freeze) as pool:
             for section in sections:
                 texts = SECTIONS[section](pool)
                 different += _write(section, texts) if update else _compare(section, texts)
