@@ -265,13 +265,32 @@ def test_a_prediction_that_returns_restores_the_total_at_once() -> None:
     assert drive.total >= 2000
 
 
-def test_the_total_fades_from_the_last_measurement_on() -> None:
+def test_the_total_fades_from_the_last_measurement_on_while_the_link_is_known() -> None:
     drive = Drive("vehicle=delivery_robot", "modes=safe")
     drive.accept("bitrate_predicted", t=0, kbps=20000)
     measured_until(drive, 0, 20, kbps=3000)
     drive.accept("control_passed", t=20, operator="another")
     totals = [drive.accept("clock_advanced", t=t).decision.total for t in (20.5, 21.1, 21.5, 23.2)]
-    assert [round(total) for total in totals] == [10000, 5000, 5000, 1250]
+    assert [round(total) for total in totals] == [10000, 5000, 5000, 500]
+
+
+def test_without_new_measurements_no_more_is_sent_than_the_link_carried() -> None:
+    drive = Drive("vehicle=delivery_robot", "modes=safe")
+    drive.accept("bitrate_predicted", t=0, kbps=10000)
+    measured_until(drive, 0, 10, kbps=3000)
+    for t in (10, 10.3, 10.6, 11):
+        known = measured(drive, t, 800, "filling", 200)
+    assert known < 900
+    drive.accept("control_passed", t=11, operator="another")
+    totals = [drive.accept("clock_advanced", t=11 + n / 10).decision.total for n in range(1, 50)]
+    assert max(totals) <= max(known, 500)
+
+
+def test_a_stale_prediction_fades_although_a_link_is_measured_that_does_not_replace_it() -> None:
+    drive = Drive("vehicle=delivery_robot", "modes=safe", "~modes.automatic.2.cap_by_link.alone_after_s")
+    drive.accept("bitrate_predicted", t=0, kbps=8000)
+    measured_until(drive, 0, 20, kbps=3000)
+    assert drive.total == 500
 
 
 @pytest.mark.parametrize("kbps", [0, 2])
@@ -289,6 +308,21 @@ def test_without_a_prediction_and_a_measurement_the_total_fades() -> None:
     for t in (1, 2.5, 3.6, 10):
         drive.accept("clock_advanced", t=t)
     assert drive.total == 500
+
+
+def test_an_operator_who_asks_for_more_does_not_make_the_link_wider() -> None:
+    """Only a prediction that rises says that."""
+    drive = Drive("vehicle=delivery_robot", "modes=safe")
+    drive.accept("mode_selected", mode="collective")
+    drive.accept("total_set", kbps=3000)
+    total = measured_until(drive, 0, 10, kbps=3000)
+    for t in (10, 10.3, 10.6, 11):
+        total = measured(drive, t, 1500, "filling", 100)
+    drive.accept("total_set", t=12, kbps=6000)
+    totals = []
+    for n in range(25):
+        totals.append(total := measured(drive, 12 + n / 25, min(float(total), 1500)))
+    assert 1300 < totals[-1] <= max(totals) < 1600, "careful steps beyond what the link carried"
 
 
 # --- mode S -----------------------------------------------------------------------------------------------------------

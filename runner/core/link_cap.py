@@ -132,8 +132,10 @@ class LinkCap:
     stall       None: something arrives
     changed     t of the last change
     measured    t of the last measurement
+    replaced    t at which the measurement last replaced a stale prediction
     idle        t at which there was last nothing to send
     alone       whether nothing else limits the total
+    predicted   whether the limit is a prediction, not what an operator has set
     reserve     kbit/s of the cap that are left to other traffic
     trust       how far the limit is trusted
     most        the most that arrived
@@ -156,8 +158,10 @@ class LinkCap:
     stall: Stall | None = None
     changed: float = -float("inf")
     measured: float = -float("inf")
+    replaced: float = -float("inf")
     idle: float = -float("inf")
     alone: bool = False
+    predicted: bool = False
     reserve: Kbps = Fraction(0)
     trust: Trust = UNDOUBTED
     most: Most = NOTHING
@@ -244,7 +248,8 @@ def start_cap(cap: LinkCap, link: LinkMeasured | None, since: float | None, limi
 
 def _reset(cap: LinkCap) -> LinkCap:
     """A new cap that keeps only the places where limits proved too high, and when the link was last measured."""
-    return LinkCap(trust=Trust(places=cap.trust.places), connected=cap.connected, measured=cap.measured)
+    trust = Trust(places=cap.trust.places)
+    return LinkCap(trust=trust, connected=cap.connected, measured=cap.measured, predicted=cap.predicted)
 
 
 def believed_limit(cap: LinkCap, limit: Kbps, least_trust: Fraction) -> Kbps:
@@ -284,6 +289,12 @@ def end_probe(cap: LinkCap, limit: Kbps) -> LinkCap:
     if not cap.alone:
         return cap
     return replace(cap, alone=False, overuse=cap.overuse and cap.overuse._replace(limit=limit))
+
+
+def follow(cap: LinkCap, limit: Kbps, is_prediction: bool) -> LinkCap:
+    """The cap under a limit of this kind. Only a prediction that rises means that the link carries more than it did."""
+    known = cap.overuse if cap.predicted and is_prediction else cap.overuse and cap.overuse._replace(limit=limit)
+    return replace(cap, predicted=is_prediction, overuse=known)
 
 
 def mark_idle(cap: LinkCap, t: float) -> LinkCap:

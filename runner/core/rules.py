@@ -25,6 +25,7 @@ from runner.core.link_cap import (
     LinkCap,
     believed_limit,
     end_probe,
+    follow,
     is_fresh,
     mark_idle,
     probe,
@@ -319,15 +320,15 @@ def fade_when_stale(
     Once it is older than its own `valid_s`, otherwise `after_s`, the total is halved, and again every `halve_every_s`,
     down to `floor_kbps`; never above the prediction. If that was to send nothing, `floor_kbps` is sent, since otherwise
     the link could never be measured. Before the first prediction, the age counts from the start of the run; the
-    halvings count from the last measurement, if there was one since.
+    halvings count from when the link last replaced the prediction, if it did since.
     """
     age, limit = _age(state, after_s)
     assert draft.total is not None
     if age <= limit or draft.measured:
         return draft, memory
     overdue, cap = age - limit, memory.get("cap_by_link", UNCAPPED)
-    if isfinite(cap.measured):
-        overdue = min(overdue, max(allocation.ZERO, exact(state.t) - exact(cap.measured)))
+    if isfinite(cap.replaced):
+        overdue = min(overdue, max(allocation.ZERO, exact(state.t) - exact(cap.replaced)))
     halvings = int(overdue / halve_every_s) + 1
     # 64 halvings are below any floor; more would only produce long fractions.
     least = floor_kbps if draft.total < max(1, sum(state.on.values())) else min(floor_kbps, draft.total)
@@ -378,9 +379,10 @@ def cap_by_link(
         if alone:
             most = sum((camera.rate_quality.b_full for camera in cameras), allocation.ZERO)
             draft, asked, limit = draft.replaced(measured=True, total=most), limit, wire_kbps(cameras, most)
-            cap = probe(cap, state.t, asked, limit)
+            cap = replace(probe(cap, state.t, asked, limit), replaced=state.t)
         else:
             cap = end_probe(cap, limit)
+        cap = follow(cap, limit, state.mode is Mode.AUTOMATIC and not alone)
         cap = start_cap(cap, link, state.operator_since, limit, start)
         cap = update_cap(replace(cap, reserve=reserve_kbps), link, state.t, limit, least_trust, state.position)
         cap = raise_cap(cap, least)  # with less, some cameras would not be sent, and so not measured
