@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from runner.redact import redacted
+from runner.redact import printable
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,7 +21,7 @@ class Problem:
     rule: str
 
     def __str__(self) -> str:
-        return redacted(": ".join(part for part in (self.file, self.path, self.found, self.rule) if part))
+        return printable(": ".join(part for part in (self.file, self.path, self.found, self.rule) if part))
 
 
 class UserError(Exception):
@@ -45,7 +45,7 @@ class RunError(Exception):
     """A run failed on this machine: exit status 1. The text includes the remedy."""
 
     def __init__(self, text: str) -> None:
-        super().__init__(redacted(text))
+        super().__init__(printable(text))
 
 
 class MissingBindings(ImportError):

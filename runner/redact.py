@@ -1,4 +1,4 @@
-"""Removes passwords from addresses in everything that is shown, logged or stored."""
+"""Removes passwords from addresses in everything that is shown, logged or stored, and escapes control characters."""
 
 from __future__ import annotations
 
@@ -11,9 +11,18 @@ _USER = re.compile(r"(?<=://)[^/?#\s]*@")  # userinfo of RFC 3986, section 3.2.1
 _NAMED = re.compile(r"(?i)((?<=[?&])(?:password|passwd|pwd)|\buser-pw)=[^&\s\"']+")  # in a query; property of rtspsrc
 
 
+# Control characters but newline and tab, and those that reorder text: a terminal obeys them, whoever sent them.
+_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
+
+
 def has_password(address: str) -> bool:
     """Whether an address contains a user name or a password."""
     return bool(_USER.search(address) or _NAMED.search(address))
+
+
+def printable(text: str) -> str:
+    """A message that may be printed: without passwords, control characters escaped as in Python."""
+    return _CONTROL.sub(lambda found: found.group().encode("unicode_escape").decode(), redacted(text))
 
 
 def redacted(value: T) -> T:

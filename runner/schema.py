@@ -314,13 +314,19 @@ def _is_whole(path: Path) -> bool:
 
 
 def _in_one_line(reference: str, document: Any) -> str | None:
-    """The problems of a document, at most MAX_ERRORS since it may be hostile; None if it is valid."""
-    found = _explained(islice(_errors(reference, document), MAX_ERRORS))
-    return None if not found else "; ".join(": ".join(filter(None, (dotted(f.path), f.found, f.rule))) for f in found)
+    """The problems of a document, of limited number and length since it may be hostile; None if it is valid."""
+    findings = (finding for error in _errors(reference, document) for finding in _explain(error))
+    found = _without_misspelt(islice(findings, MAX_ERRORS))
+    texts = (": ".join(filter(None, (shortened(dotted(f.path)), f.found, f.rule))) for f in found)
+    return "; ".join(texts) if found else None
 
 
 def _explained(errors: Iterable[Any]) -> list[Finding]:
-    found = list(dict.fromkeys(finding for error in errors for finding in _explain(error)))
+    return _without_misspelt(finding for error in errors for finding in _explain(error))
+
+
+def _without_misspelt(findings: Iterable[Finding]) -> list[Finding]:
+    found = list(dict.fromkeys(findings))
     # A misspelt key is one mistake, not an unknown key and a missing one.
     meant = {f.meant for f in found if f.found != "missing"}
     return [f for f in found if not (f.found == "missing" and f.path in meant)]

@@ -107,6 +107,10 @@ def test_a_picture_without_stamp_has_the_time_of_its_recording(tmp_path):
         (image(STORE, 1, PIXELS, "32FC1"), "encoding '32FC1' is not supported; expected one of mono8, mono16, "),
         (compressed(STORE, 1, b"xyz", "tiff"), "format 'tiff' is not supported; expected JPEG or PNG"),
         (compressed(STORE, 1, b"\xff\xd8\xff\xd9", "jpeg"), "a JPEG picture without frame header"),
+        (
+            compressed(STORE, 1, b"\x89PNG\r\n\x1a\n" + bytes(8) + b"\0\0\xea\x60" * 2, "png"),
+            "a picture of 60000x60000, must have at most 100000000 pixels",
+        ),
         (image(STORE, 1, PIXELS[:, :1], "rgb8"), "a picture of 1x2 with rows of 1 bytes, must be at least 3"),
     ],
 )

@@ -5,11 +5,15 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from textwrap import dedent
+from typing import Any
 
 import pytest
 
-from runner.mqtt.messages import MAX_REQUEST_BYTES, read_message
+from runner.mqtt.messages import MAX_ID, MAX_REQUEST_BYTES, MqttMessage, is_online, read_message, read_request
+from runner.schema import event_problem, message_problem
 
 
 def padded(size: int) -> bytes:
@@ -30,6 +34,52 @@ def test_a_request_has_a_limited_size() -> None:
 def test_an_invalid_message_is_refused(payload: bytes, problem: str) -> None:
     with pytest.raises(ValueError, match=problem):
         read_message(payload)
+
+
+def test_of_other_vehicles_states_only_whether_they_are_online_is_read() -> None:
+    """One that is hostile could otherwise occupy every operator of the fleet."""
+    hostile = json.dumps({"online": False, **{f"k{n}": n for n in range(100_000)}}).encode()
+    began = time.process_time()
+    states = (b'{"online": false}', b'{"online": true}', hostile)
+    assert list(map(is_online, states)) == [False, True, True]
+    assert time.process_time() - began < 0.01
+    with pytest.raises(ValueError, match="not JSON"):
+        is_online(b"")
+
+
+HOSTILE_KEYS = {f"key{n}": 0 for n in range(5000)} | {"x" * 10_000: 0, "a\x1b[2Jb": 0}
+
+
+@pytest.mark.parametrize("problem", [event_problem, lambda document: message_problem("reception", document)])
+def test_a_hostile_document_is_explained_quickly_and_briefly(problem: Callable[[Any], str | None]) -> None:
+    began = time.process_time()
+    text = problem({"event": "operator_connected", "t": 0, **HOSTILE_KEYS})
+    assert time.process_time() - began < 0.5  # 20 times what it takes
+    assert text
+    assert len(text) < 5000
+
+
+def test_an_id_that_its_reply_would_repeat_has_a_limited_length() -> None:
+    def problem(identity: str) -> str | None:
+        payload = json.dumps({"id": identity, "event": "total_set", "kbps": 1, "as_of": 0}).encode()
+        return read_request(MqttMessage("tod/car/request/alice", payload, False)).problem
+
+    assert problem("x" * MAX_ID) is None
+    assert problem("x" * (MAX_ID + 1)) == problem("") == "id: must be given, as text of 1 to 128 characters"
+
+
+@pytest.mark.parametrize(
+    ("event", "rule"),
+    [
+        ({"event": "bitrate_predicted", "kbps": 1e305}, "kbps: 1e+305: must be at most 1000000000"),
+        ({"event": "bitrate_predicted", "kbps": 1, "lower_kbps": 1e10}, "lower_kbps: 10000000000.0: must be at most "),
+        ({"event": "bitrate_predicted", "kbps": 0, "valid_s": 1e300}, "valid_s: 1e+300: must be at most 3600"),
+        ({"event": "total_set", "kbps": 1e305}, "kbps: 1e+305: must be at most 1000000000"),
+        ({"event": "weights_set", "weights": {"front": 1e305}}, "weights.front: 1e+305: must be at most 1000000"),
+    ],
+)
+def test_numbers_that_no_operator_could_read_again_are_refused(event: dict[str, Any], rule: str) -> None:
+    assert (event_problem({"t": 0, **event}) or "").startswith(rule)
 
 
 def test_records_can_be_parsed_by_several_threads_at_first_use() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import hmac
 
-from runner.page.login import CHALLENGE_S, MAX_CHALLENGES, SESSION_S, PageLogin
+from runner.page.login import CHALLENGE_S, SESSION_S, PageLogin
 
 
 def answer(challenge: str, token: bytes = b"token") -> str:
@@ -30,10 +30,12 @@ def test_an_answer_is_accepted_once_in_time_and_with_the_token() -> None:
     assert login.open(challenge, answer(challenge), 0) is None  # replayed
     challenge = login.challenge(0)
     assert login.open(challenge, answer(challenge, b"another"), 0) is None
-    assert login.open(challenge, answer(challenge), 0) is None  # the challenge is used up
+    assert login.open(challenge, answer(challenge), 0)
     challenge = login.challenge(0)
     assert login.open(challenge, answer(challenge), CHALLENGE_S + 0.1) is None
-    assert login.open("made up", answer("made up"), 0) is None
+    for made_up in ("made up", "60000.made up", "", challenge.replace("60000", "90000"), "60000.ä.\ud800"):
+        assert login.open(made_up, answer("made up"), 0) is None
+    assert PageLogin(lambda: b"token").open(challenge, answer(challenge), 0) is None  # of another process
     challenge = login.challenge(0)
     assert login.open(challenge, "ä\ud800", 0) is None
 
@@ -48,9 +50,14 @@ def test_a_new_token_ends_all_sessions() -> None:
     assert not login.accepts(session, 1)
 
 
-def test_pending_challenges_are_bounded() -> None:
+def test_strangers_who_ask_for_challenges_neither_evict_one_nor_fill_the_memory() -> None:
     login = PageLogin(lambda: b"token")
-    challenges = [login.challenge(n / 1000) for n in range(3 * MAX_CHALLENGES)]
-    assert len(login._challenges) == MAX_CHALLENGES
-    assert login.open(challenges[0], answer(challenges[0]), 1) is None
-    assert login.open(challenges[-1], answer(challenges[-1]), 1)
+    challenge = login.challenge(0)
+    before = vars(login).copy()
+    for n in range(1000):
+        login.challenge(n / 1000)
+    assert vars(login) == before
+    assert login.open(challenge, answer(challenge), 1)
+    other = login.challenge(CHALLENGE_S + 2)
+    assert login.open(other, answer(other), CHALLENGE_S + 2)
+    assert login._answered.keys() == {other}, "expired ones are forgotten"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import gc
+import hmac
 import http.client
 import inspect
 import json
@@ -11,7 +12,8 @@ import math
 import shutil
 import socket
 import ssl
-from contextlib import AsyncExitStack, closing, contextmanager, suppress
+import time
+from contextlib import AsyncExitStack, ExitStack, closing, contextmanager, suppress
 from types import SimpleNamespace
 from urllib.parse import urlencode
 
@@ -29,7 +31,7 @@ from runner.core.events import Attention
 from runner.core.roles import Role
 from runner.page.control import GRACE_S, Control, combined_attention, page_of
 from runner.page.history import MAX_SAMPLES, History
-from runner.page.login import PageLogin
+from runner.page.login import COOKIE, PageLogin
 from runner.page.server import POLICY, PageServer, hosts
 from runner.page.viewer import CATCH_UP, HEADER, KEY, MAX_UNITS, RESTART, PageViewer
 from runner.records import CameraSample, Outcome, Position, Sample
@@ -96,6 +98,34 @@ def test_a_login_whose_body_never_comes_is_closed(monkeypatch):
         assert line.recv(1) == b""
 
 
+def test_connections_without_access_replace_each_other_and_close_none_with_access(monkeypatch):
+    """Otherwise a stranger could take all descriptors of the process that shows the pictures."""
+    monkeypatch.setattr("runner.page.server.MAX_STRANGERS", 5)
+    login = PageLogin(lambda: b"token")
+    challenge = login.challenge(time.monotonic())
+    session = login.open(challenge, hmac.new(b"token", challenge.encode(), "sha256").hexdigest(), time.monotonic())
+    with served(login=login) as (port, _), ExitStack() as stack:
+
+        def connected(path, cookie=""):
+            line = stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=5))
+            line.sendall(f"GET {path} HTTP/1.1\r\nHost: localhost:{port}\r\n{cookie}\r\n".encode())
+            assert line.recv(65536).startswith(b"HTTP/1.1 200")
+            return line
+
+        driver = connected("/", f"Cookie: {COOKIE}={session}\r\n")
+        strangers = [connected("/login") for _ in range(8)]
+        for line in strangers[:3]:
+            while line.recv(65536):
+                pass
+        driver.sendall(f"GET / HTTP/1.1\r\nHost: localhost:{port}\r\nCookie: {COOKIE}={session}\r\n\r\n".encode())
+        assert driver.recv(1)
+        strangers[-1].settimeout(0.1)
+        with suppress(TimeoutError):
+            while strangers[-1].recv(65536):
+                pass
+            raise AssertionError("the newest connection was closed")
+
+
 @pytest.fixture
 def keys(tmp_path):
     """An authority with the keys of alice, whose page is at 127.0.0.1."""
@@ -148,7 +178,7 @@ def test_every_refusal_is_reported_once_without_secrets_and_carries_the_policy(k
         own = {"Origin": f"https://127.0.0.1:{port}"}
         upgrade = dict(line.split(": ") for line in UPGRADE.split("\r\n"))
         refused = [
-            ("/login", {"host": "evil.example:8090"}, 403, "Host 'evil.example:8090' is none of this page's"),
+            ("/login", {"host": "evil.example:8090"}, 403, "Host 'evil.example:8090' is not an address of this page"),
             ("/", {"Origin": "https://evil.example"}, 403, "Origin 'https://evil.example' is another site"),
             ("/login", {"method": "POST"}, 403, "a POST without Origin"),
             (f"/live?viewer={secret}", upgrade, 401, "not logged in"),

@@ -20,6 +20,7 @@ FORMATS = {
     "yuyv": ("YUY2", 2),
 }
 ALIGNED = 4  # bytes: rows begin at multiples in GStreamer
+MOST_PIXELS = 100_000_000  # of a compressed picture
 JPEG, PNG = b"\xff\xd8", b"\x89PNG\r\n\x1a\n"
 # Markers of JPEG (ITU-T T.81, table B.1): the frame headers, which contain the size, and standalone markers.
 FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
@@ -101,10 +102,14 @@ def compressed_form(data: bytes, stated: str) -> tuple[str, int, int]:
     raises  ValueError with the rule that it breaks
     """
     if data.startswith(JPEG):
-        return ("jpeg", *_jpeg_size(data))
-    if data.startswith(PNG) and len(data) >= 24:
-        return "png", int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
-    raise ValueError(f"format {stated!r} is not supported; expected JPEG or PNG")
+        form, (width, height) = "jpeg", _jpeg_size(data)
+    elif data.startswith(PNG) and len(data) >= 24:
+        form, width, height = "png", int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
+    else:
+        raise ValueError(f"format {stated!r} is not supported; expected JPEG or PNG")
+    if width * height > MOST_PIXELS:  # a few bytes may state a picture that fills the memory
+        raise ValueError(f"a picture of {width}x{height}, must have at most {MOST_PIXELS} pixels")
+    return form, width, height
 
 
 def stamp_ns(message: Any) -> int:

@@ -37,10 +37,10 @@ def denial(role: Role | None, event: str) -> str | None:
     event  its name in schemas/event.schema.json
     """
     if role is None:
-        return "this operator is not among those that the vehicle's keys name"
+        return "unknown operator: not listed in the vehicle's keys"
     if event in MAY_REQUEST[role]:
         return None
     takers = [other.value for other in PEOPLE if event in MAY_REQUEST[other]]
-    return f"a {role} may not request {event}; " + (
-        f"only {' or '.join(takers)} may" if takers else "nobody may: the vehicle makes it itself"
-    )
+    if not takers:
+        return f"a {role} may not request this event; only the vehicle generates it"
+    return f"a {role} may not request {event}; only {' or '.join(takers)} may"

@@ -43,7 +43,9 @@ SIGNED_OFF = {**OPERATOR_GONE, "id": "signed off"}  # by the operator itself
 OPERATOR = re.compile(r"[A-Za-z0-9_-]{1,64}")  # shown to operators and logged
 _SURROGATE = re.compile(rb"\\u[dD]")  # perhaps half of a pair
 OPERATOR_RULE = "topic: an operator's id must be 1 to 64 letters, digits, _ and -"
+MAX_ID = 128  # characters of a request's id, which its reply repeats
 MAX_REQUEST_BYTES = 65_536  # the longest event is a hundredth of it
+MAX_OFFLINE_BYTES = 64  # a longer state is of a vehicle that is online
 MAX_MESSAGE_BYTES = 1_048_576  # state and configuration grow with the number of cameras
 APPLY_S = 1.0  # a request whose commands are not read back from the elements by then has timed out
 SILENT_S = 0.7  # a vehicle that sends nothing for this long is offline; it sends telemetry five times a second
@@ -101,6 +103,14 @@ def read_message(payload: bytes, limit: int = MAX_REQUEST_BYTES) -> dict[str, An
         except UnicodeEncodeError:  # it could not be printed
             raise ValueError("contains half of a surrogate pair") from None
     return document
+
+
+def is_online(payload: bytes) -> bool:
+    """Whether a vehicle's state says that it is online. Nothing else of it is read: the vehicle may be hostile.
+
+    raises  ValueError with the problem
+    """
+    return len(payload) > MAX_OFFLINE_BYTES or read_message(payload) != OFFLINE
 
 
 def read_state(payload: bytes) -> VehicleState | None:
@@ -170,8 +180,8 @@ def read_request(message: MqttMessage) -> ParsedRequest:
     if not OPERATOR.fullmatch(message.sender):
         return ParsedRequest({}, problem=OPERATOR_RULE)
     identity, as_of = document.pop("id", None), document.pop("as_of", None)
-    if not isinstance(identity, str) or not identity:
-        return ParsedRequest(document, problem="id: must be given, as text")
+    if not isinstance(identity, str) or not 0 < len(identity) <= MAX_ID:
+        return ParsedRequest(document, problem=f"id: must be given, as text of 1 to {MAX_ID} characters")
     problem: str | None = None
     if message.retained:
         problem = "must not be retained: a request is for now"

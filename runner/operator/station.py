@@ -23,6 +23,7 @@ from runner.mqtt.messages import (
     JsonObject,
     MqttMessage,
     answer_s,
+    is_online,
     read_clock,
     read_reply,
     read_settings,
@@ -377,10 +378,12 @@ class Station:
 
     def _on_any_state(self, message: MqttMessage) -> None:
         """The state of any vehicle at the broker; of other vehicles only the name is used."""
-        name, state = message.topic.split("/")[1], read_state(message.payload)
+        name = message.topic.split("/")[1]
+        is_own = name == self._vehicle.name
+        state = read_state(message.payload) if is_own else None
         if len(self._vehicles) < MAX_VEHICLES or name in self._vehicles:
-            self._vehicles[name] = state is not None
-        if name != self._vehicle.name:
+            self._vehicles[name] = state is not None if is_own else is_online(message.payload)
+        if not is_own:
             return
         if state and (missing := self._vehicle.cameras.keys() - state.cameras.keys()):
             raise ValueError(f"cameras: {', '.join(sorted(missing))}: missing: the vehicle has another configuration")

@@ -1,7 +1,8 @@
 """Login to the page from another machine, by proof of having its token. Times are passed in, s.
 
 The browser answers a challenge with the HMAC-SHA256 of a random text, keyed with the token. The token itself is never
-sent, and a recorded answer cannot be replayed: each challenge accepts a single answer.
+sent, and a recorded answer cannot be replayed: each challenge opens a single session. A challenge states when it
+expires and is signed, so that nothing is stored for those who only ask for one.
 """
 
 from __future__ import annotations
@@ -11,15 +12,16 @@ import hmac
 import secrets
 from collections.abc import Callable
 
+from runner.security.keyring import derived
+
 CHALLENGE_S = 60.0  # until an unanswered challenge expires
-MAX_CHALLENGES = 100  # pending; a new one evicts the oldest
 SESSION_S = 43_200.0  # twelve hours; then the browser must log in again
 MAX_SESSIONS = 100
 COOKIE = "tod_session"
 
 
 class PageLogin:
-    """Pending challenges and open sessions.
+    """Challenges and open sessions.
 
     token  returns the page's current token; a new token ends all sessions
     """
@@ -27,21 +29,28 @@ class PageLogin:
     def __init__(self, token: Callable[[], bytes]) -> None:
         self._token = token
         self._session_token = token()
-        self._challenges: dict[str, float] = {}  # values: when they expire
+        self._signing = secrets.token_bytes(32)  # key of this process
+        self._answered: dict[str, float] = {}  # challenges that opened a session; values: when they expire
         self._sessions: dict[str, float] = {}
 
     def challenge(self, now: float) -> str:
-        """A new challenge."""
-        return _add(self._challenges, now, CHALLENGE_S, MAX_CHALLENGES)
+        """A new challenge: when it expires, ms, a random text, and a signature, separated by dots."""
+        text = f"{round(1000 * (now + CHALLENGE_S))}.{secrets.token_urlsafe(32)}"
+        return f"{text}.{derived(self._signing, text)}"
 
     def open(self, challenge: str, answer: str, now: float) -> str | None:
-        """Open a session for a correct answer; None if it is wrong, or the challenge expired or was answered before."""
-        if self._challenges.pop(challenge, -1.0) < now:
+        """Open a session for a correct answer; None if it is wrong, or the challenge expired or opened one before."""
+        text, _, signature = challenge.encode(errors="replace").decode().rpartition(".")
+        if not hmac.compare_digest(derived(self._signing, text).encode(), signature.encode()):
+            return None
+        expires = int(text.partition(".")[0]) / 1000
+        if expires < now or challenge in self._answered:
             return None
         expected = hmac.new(self._token(), challenge.encode(), hashlib.sha256).hexdigest()
         if not hmac.compare_digest(expected.encode(), answer.encode(errors="replace")):
             return None
-        return _add(self._sessions, now, SESSION_S, MAX_SESSIONS)
+        self._answered = {it: until for it, until in self._answered.items() if until >= now} | {challenge: expires}
+        return _open(self._sessions, now)
 
     def accepts(self, session: str | None, now: float) -> bool:
         """Whether a session is open."""
@@ -51,12 +60,12 @@ class PageLogin:
         return session is not None and self._sessions.get(session, -1.0) >= now
 
 
-def _add(entries: dict[str, float], now: float, lifetime_s: float, limit: int) -> str:
-    """Add a random name with an expiry time; returns it."""
-    for expired in [name for name, expires in entries.items() if expires < now]:
-        del entries[expired]
-    if len(entries) >= limit:
-        del entries[min(entries, key=lambda name: entries[name])]
+def _open(sessions: dict[str, float], now: float) -> str:
+    """Add a session with a random name, in place of the oldest if there are too many; returns the name."""
+    for expired in [name for name, expires in sessions.items() if expires < now]:
+        del sessions[expired]
+    if len(sessions) >= MAX_SESSIONS:
+        del sessions[min(sessions, key=lambda name: sessions[name])]
     name = secrets.token_urlsafe(32)
-    entries[name] = now + lifetime_s
+    sessions[name] = now + SESSION_S
     return name

@@ -51,6 +51,8 @@ START_S = 10.0  # the port is known to be free: only a stalled machine takes lon
 STOP_S = 0.5  # how long open connections may take to close
 LOOPBACK = ("127.0.0.1", "localhost")  # names of the page without keys
 DEFAULT_PORTS = {"http": 80, "https": 443}
+MAX_STRANGERS = 100  # connections without access; a new one replaces the oldest
+MAX_BODY = 4096  # bytes of a request
 REQUEST_S = 10.0  # a connection without a complete request for this long is closed
 PING_S = 0.5
 SILENT_S = 2.0  # a viewer that has not answered a ping for this long is dropped, and reconnects if it is alive
@@ -110,6 +112,7 @@ class PageServer(Listener):
         self._viewers: list[PageViewer] = []  # the newest last
         self._control = Control()
         self._awaiting_request: set[RequestHandler] = set()  # new connections without a complete request
+        self._strangers: dict[RequestHandler, float] = {}  # connections that have shown no access, and when they came
         self._loop = asyncio.new_event_loop()
         self._stopped = asyncio.Event()
         self._thread = threading.Thread(target=self._run, name="page", daemon=True)
@@ -167,7 +170,8 @@ class PageServer(Listener):
     # --- in the page's thread -----------------------------------------------------------------------------------------
 
     async def _start(self) -> None:
-        app = web.Application(middlewares=[self._on_request_complete, self._add_headers, self._check_access])
+        middlewares = [self._on_request_complete, self._add_headers, self._check_access]
+        app = web.Application(middlewares=middlewares, client_max_size=MAX_BODY)
         app.router.add_get("/live", self._on_viewer)
         app.router.add_get("/plotly.js", lambda _: _send_file(self._plotly))
         app.router.add_get("/", _static_handler(STATIC / "index.html"))
@@ -195,12 +199,17 @@ class PageServer(Listener):
         return logger
 
     def _new_connection(self) -> asyncio.Protocol:
-        """A new connection, closed unless its first request completes in time."""
+        """A new connection, closed unless its first request completes in time.
+
+        raises  ConnectionRefusedError, for which asyncio closes the socket, if too many handshakes are pending
+        """
         assert self._runner.server
+        self._limit_strangers()
         if self._tls:
             self._tls.refresh()
         connection = self._runner.server()
         self._awaiting_request.add(connection)
+        self._strangers[connection] = self._loop.time()
         self._loop.call_later(REQUEST_S, self._expire, connection)
         return connection
 
@@ -208,6 +217,18 @@ class PageServer(Listener):
         if connection in self._awaiting_request:
             self._awaiting_request.remove(connection)
             connection.force_close()
+
+    def _limit_strangers(self) -> None:
+        """Make room for a new connection: without a limit, strangers would take all of the process's descriptors."""
+        shaken = self._loop.time() - REQUEST_S  # handshakes that began before have ended
+        self._strangers = {it: came for it, came in self._strangers.items() if it.transport or came > shaken}
+        if len(self._strangers) < MAX_STRANGERS:
+            return
+        oldest = next((it for it in self._strangers if it.transport), None)
+        if oldest is None:
+            raise ConnectionRefusedError("too many connections")
+        del self._strangers[oldest]
+        oldest.force_close()
 
     async def _close(self) -> None:
         self._server.close()
@@ -248,6 +269,8 @@ class PageServer(Listener):
             if request.path not in UNPROTECTED:
                 self._report_refusal(request, "not logged in")
                 raise web.HTTPUnauthorized(text="login required: see /login\n")
+        else:
+            self._strangers.pop(request.protocol, None)
         try:
             response: web.StreamResponse = await handler(request)
         except (web.HTTPNotFound, web.HTTPMethodNotAllowed) as refused:
@@ -262,7 +285,7 @@ class PageServer(Listener):
         allowed = hosts(self._names, sockname[1], scheme)
         host = request.headers.get("Host", "")
         if host.lower() not in allowed:
-            return f"Host {shortened(repr(host))} is none of this page's"
+            return f"Host {shortened(repr(host))} is not an address of this page"
         if origin is None:
             return "a POST without Origin" if request.method == "POST" else None
         own = {f"{scheme}://{name}" for name in allowed}
@@ -393,11 +416,12 @@ class PageServer(Listener):
         return [other for other in self._viewers if other is not viewer and self._page_of(other) == page]
 
     def _broadcast_control(self) -> None:
-        """Send each viewer the holder of control, and whether keys reach another window of its page."""
+        """Send each viewer the holder of control, and whether another window of its page has the focus or is hidden."""
         for viewer in self._viewers:
-            elsewhere = any(other.attention is Attention.WATCHING for other in self._others(viewer))
+            others = {other.attention for other in self._others(viewer)}
+            elsewhere, covered = Attention.WATCHING in others, Attention.HIDDEN in others
             holder = self._control.holder_for(self._page_of(viewer))
-            viewer.post("control", {"holder": holder, "elsewhere": elsewhere})
+            viewer.post("control", {"holder": holder, "elsewhere": elsewhere, "covered": covered})
         self._report_attention()
 
     def _report_attention(self) -> None:

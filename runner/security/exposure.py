@@ -25,7 +25,8 @@ def keyring_of(vehicle: Vehicle, *needed: str) -> Keyring | None:
     reached = {"media.host": vehicle.media.host, "control.host": vehicle.control.host}
     exposed = [f"{key} {host}" for key, host in reached.items() if not is_loopback(host)]
     if exposed and not vehicle.insecure:
-        rule = "are reached over a network: give keys=DIR, made by `tod-runner keys`, or insecure=true"
+        found = "is not a loopback address" if len(exposed) == 1 else "are not loopback addresses"
+        rule = f"{found}: give keys=DIR, created by `tod-runner keys`, or insecure=true"
         raise UserError("command line", "keys", None, f"{' and '.join(exposed)} {rule}")
     return None
 
@@ -51,9 +52,10 @@ class KeysOfAll(NamedTuple):
     def of(vehicle: Vehicle) -> KeysOfAll | None:
         """For a process that runs both sides: `keys` names the directory with everyone's keys; None: it is not set.
 
-        raises  UserError
+        raises  UserError, also if keys are missing although video or control leave this machine
         """
         if vehicle.keys is None:
+            keyring_of(vehicle)
             return None
         directory = Path(vehicle.keys)
         holders = {path.parent: Keyring(path.parent).holder for path in sorted(directory.glob(f"*/{HOLDER}"))}
@@ -97,7 +99,9 @@ def page_keyring(vehicle: Vehicle) -> Keyring | None:
     if is_loopback(vehicle.page.host):
         return None
     if vehicle.keys is None:
-        rule = "is reached over a network: give keys=DIR, made by `tod-runner keys`; browsers play video by HTTPS only"
+        rule = (
+            "is not a loopback address: give keys=DIR, created by `tod-runner keys`; browsers play video by HTTPS only"
+        )
         raise UserError("command line", "page.host", vehicle.page.host, rule)
     keyring = Keyring.of(Path(vehicle.keys), TOKEN)
     if not keyring.holder.hosts:

@@ -30,7 +30,7 @@ from runner.core.model import Camera, Vehicle, suggest
 from runner.errors import UserError
 from runner.operator.station import Listener
 from runner.records import Note
-from runner.security.exposure import KeysOfAll
+from runner.security.exposure import KeysOfAll, page_keyring
 from runner.system.signals import stopping
 from runner.verbs import Arguments
 from runner.verbs.screen import SWITCH_S, progress_bar, say, streaming
@@ -66,6 +66,8 @@ def run(arguments: Arguments) -> int:
     vehicle = configuration(arguments.overrides, arguments.conf, runnable=False).vehicle()
     camera = _camera(vehicle, arguments.values.get("camera"))
     keys = KeysOfAll.of(vehicle) if looped else None
+    own = [*arguments.overrides, *([f"keys={keys.controller}"] if keys else [])]
+    page_keys = page_keyring(configuration(own, arguments.conf, runnable=False).vehicle())
     sys.setswitchinterval(SWITCH_S)
     readings: deque[CounterReading] = deque(maxlen=MOST_READINGS)
 
@@ -77,9 +79,8 @@ def run(arguments: Arguments) -> int:
         if looped:
             stack.enter_context(private_broker(vehicle.control, keys.broker if keys else None, say))
             stack.enter_context(_looped_vehicle(arguments, camera, [f"keys={keys.vehicle}"] if keys else []))
-        own = [*arguments.overrides, *([f"keys={keys.controller}"] if keys else [])]
         operator = stack.enter_context(live_operator(own, arguments.conf))
-        page = PageServer(operator.vehicle, operator.station, on_counter)
+        page = PageServer(operator.vehicle, operator.station, on_counter, keyring=page_keys)
         stack.callback(page.stop)
         page.start()
         operator.station.listeners += [page, _Notes()]

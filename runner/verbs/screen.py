@@ -10,7 +10,7 @@ from types import ModuleType
 
 from runner.core.model import Progress
 from runner.errors import MissingBindings, RunError
-from runner.redact import redacted
+from runner.redact import printable
 from runner.system import signals
 
 SWITCH_S = 0.0005  # the longest that a thread with a frame or a message to pass on waits for one that computes
@@ -34,7 +34,7 @@ def say(what: str) -> None:
     """Print one line to standard error, with the time of day."""
     now = time.time()
     clock = time.strftime("%H:%M:%S", time.localtime(now))
-    print(f"{clock}.{int(now * 1000) % 1000:03d} {redacted(what)}", file=sys.stderr, flush=True)
+    print(f"{clock}.{int(now * 1000) % 1000:03d} {printable(what)}", file=sys.stderr, flush=True)
 
 
 @contextmanager

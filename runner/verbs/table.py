@@ -21,6 +21,7 @@ from rich.text import Text
 from runner.operator.meter import ReceptionMeter, middle, percentile
 from runner.operator.station import CameraRow, Listener
 from runner.records import Note
+from runner.redact import printable
 from runner.system.signals import urgent
 
 PLAIN_EVERY_S = 5.0
@@ -50,7 +51,7 @@ class LiveTable(Listener):
 
     def on_note(self, note: Note) -> None:
         """Add one line below the table, shown with its next update. May be called from any thread."""
-        self._pending.append(f"{time.strftime('%H:%M:%S', time.localtime(note.t))} {note.text}")
+        self._pending.append(f"{time.strftime('%H:%M:%S', time.localtime(note.t))} {printable(note.text)}")
 
     def show(self, rows: Sequence[CameraRow], headline: str) -> None:
         while self._pending:

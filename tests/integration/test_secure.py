@@ -650,13 +650,30 @@ def refusal(verb, *words):
     return child.returncode, output.strip()
 
 
-@pytest.mark.parametrize("verb", ["vehicle", "operator"])
+NEEDS_KEYS = "give keys=DIR, created by `tod-runner keys`, or insecure=true"
+
+
+@pytest.mark.parametrize("verb", ["vehicle", "operator", "demo", "latency", "latency loop=true", "ros"])
 def test_a_network_needs_keys(verb):
-    words = (*WORDS, "media.host=192.0.2.1", "control.host=192.0.2.2")
-    assert refusal(verb, *words) == (
+    """Refused before anything listens, whichever of the addresses is beyond this machine."""
+    verb, *more = [*verb.split(), *(["camera=front"] if "latency" in verb else [])]
+    media, control = "media.host=192.0.2.1", "control.host=192.0.2.2"
+    for hosts, found in (
+        ((media, control), "media.host 192.0.2.1 and control.host 192.0.2.2 are not loopback addresses"),
+        ((media,), "media.host 192.0.2.1 is not a loopback address"),
+        ((control,), "control.host 192.0.2.2 is not a loopback address"),
+    ):
+        assert refusal(verb, *WORDS, *more, *hosts) == (2, f"command line: keys: {found}: {NEEDS_KEYS}")
+
+
+@pytest.mark.parametrize("verb", ["operator", "latency"])
+def test_a_page_on_a_network_needs_keys(verb):
+    words = (*WORDS, *(["camera=front"] if verb == "latency" else []), "page.serve=true", "page.host=0.0.0.0")
+    rule = "give keys=DIR, created by `tod-runner keys`; browsers play video by HTTPS only"
+    status, output = refusal(verb, *words)
+    assert (status, output.splitlines()[-1]) == (
         2,
-        "command line: keys: media.host 192.0.2.1 and control.host 192.0.2.2 are reached over a network: "
-        "give keys=DIR, made by `tod-runner keys`, or insecure=true",
+        f"command line: page.host: 0.0.0.0: is not a loopback address: {rule}",
     )
 
 
