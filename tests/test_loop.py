@@ -21,13 +21,13 @@ from runner.core.roles import SETTINGS, Role, denial
 from runner.core.step import step
 from runner.drive.log import Log
 from runner.plans import compile_plans
-from runner.records import Outcome, SteeringAngle, Telemetry, VehicleState
+from runner.records import Outcome, ReceptionReport, SteeringAngle, Telemetry, VehicleState
 from runner.security import keyring
 from runner.security.keyring import Person
 from runner.system.reports import MOST
 from runner.vehicle.access import Access
-from runner.vehicle.inbox import Request
-from runner.vehicle.loop import ControlLoop
+from runner.vehicle.inbox import QueuedReport, Request
+from runner.vehicle.loop import REFUSALS, ControlLoop
 from runner.vehicle.operators import SILENT_S
 from stand_in import RecordingVehicle
 
@@ -291,3 +291,83 @@ def test_attention_of_the_operator_in_control_is_published_until_control_passes(
     reported = [report for report in watched.reports if report.startswith("operator driver is ")]
     expected = ["present", "watching", "slow", "no longer stating its attention", "hidden"]
     assert reported == [f"operator driver is {what}" for what in expected]
+
+
+def test_a_repeated_request_is_not_answered_before_what_it_asks_for_is_applied(monkeypatch: pytest.MonkeyPatch) -> None:
+    watched = Watched()
+    watched.side.watch("front", "rear", "mast")
+    turn = watched.side.turn
+    stuck = ("front", "bitrate")
+
+    def turn_others(commands: Any) -> None:
+        turn([each for each in commands if (each.camera, each.knob) != stuck])
+
+    def ask(**document: Any) -> list[Outcome]:
+        outcomes: list[Outcome] = []
+        watched.loop.take(Request("driver", document, outcomes.append))
+        return outcomes
+
+    with watched.running():
+        mode = ask(event="mode_selected", mode="collective")
+        until(lambda: mode)
+        until(lambda: watched.side.applied()["front"])
+        monkeypatch.setattr(watched.side, "turn", turn_others)
+        first = ask(event="total_set", kbps=900)
+        time.sleep(0.3)
+        again = ask(event="total_set", kbps=900)
+        until(lambda: first and again)
+        assert [each[0].result for each in (first, again)] == ["timed out"] * 2
+        assert again[0].reason == "not applied within 1 s: front bitrate"
+        off = ask(event="camera_switched", camera="front", on=False)
+        until(lambda: off)
+        total = ask(event="total_set", kbps=950)
+        until(lambda: total)
+        assert (off[0].result, total[0].result) == ("applied", "applied"), "what is not sent needs no bitrate"
+
+
+def test_a_speed_is_published_for_a_shorter_time_than_its_position(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The vehicle may have braked since."""
+    monkeypatch.setattr("runner.vehicle.loop.SPEED_S", 0.5)
+    monkeypatch.setattr("runner.vehicle.loop.POSITION_S", 1.0)
+    watched = Watched()
+
+    def newest() -> Any:
+        return watched.of(Telemetry)[-1].position if watched.of(Telemetry) else None
+
+    with watched.running():
+        watched.loop.post(
+            {"event": "position_reported", "lat": 48.26, "lon": 11.66, "speed_mps": 3.0, "heading_deg": 9}
+        )
+        until(lambda: newest() and newest().speed_mps == 3)
+        until(lambda: newest().speed_mps is UNSET)
+        assert (newest().lat, newest().heading_deg) == (48.26, 9)
+        until(lambda: newest() is None)
+
+
+def test_a_sender_whose_requests_are_refused_is_answered_a_few_times_between_two_ticks() -> None:
+    watched = Watched()
+    outcomes: list[Outcome] = []
+    for _ in range(50):
+        watched.loop.take(Request("flood", {"event": "total_set", "kbps": -1}, outcomes.append))
+    with watched.running():
+        until(lambda: watched.loop.refused >= 50)
+        time.sleep(0.3)
+    assert REFUSALS <= len(outcomes) < 4 * REFUSALS
+    assert {outcome.reason for outcome in outcomes} == {"kbps: -1: must be at least 0"}
+
+
+def test_reports_of_a_revoked_operator_keep_nobody_present(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The broker disconnects it only once it has reread its files."""
+    monkeypatch.setattr(keyring, "CHECK_S", 0)
+    requests = Requests(tmp_path, monkeypatch)
+    watched, report = requests.watched, ReceptionReport(at=1.0, as_of=0.0, units=(), packets=0, lost=0)
+    with watched.running():
+        requests.ask("driver", {"event": "operator_connected"})
+        until(lambda: "operator driver is present" in watched.reports)
+        (tmp_path / keyring.PEOPLE).write_bytes(b"{}")
+        refused = watched.loop.refused
+        for _ in range(round(2 * SILENT_S / 0.05)):
+            watched.loop.take(QueuedReport("driver", report))
+            time.sleep(0.05)
+        assert any(line.startswith("operator driver has been silent") for line in watched.reports)
+        assert watched.loop.refused > refused

@@ -62,6 +62,7 @@ KEY_FRAME_S = 1.0  # between two key frames that repair a camera's pictures: eac
 STEERING_S = 0.05  # between two published steering angles: each costs the video 0.2 kB of the link
 ADVICE_S = 0.2  # how long a reported latency, and the advice based on it, is valid
 POSITION_S = 5.0  # an older position is stale
+SPEED_S = 2.0  # an older speed is stale; receivers of GNSS report once a second or more often
 REPEAT_S = 10.0  # the same fault is reported no more often than this
 REFUSALS = 10  # refusals answered per sender between two ticks; further ones are only counted
 
@@ -176,7 +177,7 @@ class ControlLoop:
         self._refusals[sender] = self._refusals.get(sender, 0) + 1
 
     def refuse(self, request: Request, problem: str) -> None:
-        """Refuse a request that is not queued, from any thread; answers between two ticks are limited."""
+        """Refuse a request, from any thread; answers between two ticks are limited."""
         self.refused += 1
         answers = self._refusals[request.sender] = self._refusals.get(request.sender, 0) + 1
         if request.answer and answers <= REFUSALS:
@@ -276,7 +277,7 @@ class ControlLoop:
         name = str(request.document.get("event"))
         if request.sender and (denied := self.access.denial(request.sender, name, self._operators.in_control)):
             self._report_denial(f"refused {shortened(name)} of {request.sender}: {denied}")
-            self._refuse(denied, t, request.answer)
+            self.refuse(request, denied)
             return
         stamped = {**request.document, "t": t}
         problem = event_problem(stamped)
@@ -284,9 +285,9 @@ class ControlLoop:
         self._update_presence(request.sender, t, event, signed_off=not request.will)
         if event is None:
             assert problem
-            self._refuse(problem, t, request.answer)
+            self.refuse(request, problem)
         elif request.sender and isinstance(event, OWN):
-            self._refuse(f"{NAMES[type(event)]}: only the vehicle itself makes this event", t, request.answer)
+            self.refuse(request, f"{NAMES[type(event)]}: only the vehicle itself makes this event")
         elif request.as_of is not None and (expired := self._operators.expired(request.sender, t, request.as_of)):
             self.refused += 1
             self._answer(request.answer, Outcome(t, "expired", expired))
@@ -297,6 +298,9 @@ class ControlLoop:
 
     def _take_report(self, item: QueuedReport) -> None:
         t = self._now()
+        if self.access.denial(item.sender, NAMES[OperatorConnected], ""):
+            self.reject(item.sender)  # for example revoked since it connected
+            return
         self._update_presence(item.sender, t, None)
         if item.sender not in self._operators.present:
             return
@@ -389,10 +393,6 @@ class ControlLoop:
         self.applier.give_control(operator)
         self._take(ControlPassed(t=t, operator=operator))
 
-    def _refuse(self, problem: str, t: float, answer: Answer | None) -> None:
-        self.refused += 1
-        self._answer(answer, Outcome(t, "refused", problem))
-
     def _answer(self, answer: Answer | None, outcome: Outcome) -> None:
         if answer:
             answer(outcome)
@@ -430,7 +430,8 @@ class ControlLoop:
             kind = (type(event), getattr(event, "camera", None))
             commanded = [(command.camera, command.knob) for command in after.commands]
             # A request that is repeated commands nothing, but what it asks for may still not be applied.
-            knobs = list(dict.fromkeys([*commanded, *self._timed_out.get(kind, ())]))
+            waited = [knob for pending in self._pending if pending.kind == kind for knob in pending.knobs]
+            knobs = list(dict.fromkeys([*commanded, *waited, *self._timed_out.get(kind, ())]))
             self._pending.append(_PendingReply(answer, knobs, event.t + APPLY_S, kind))
         if after.commands or after.decision != before.decision:
             self._report_decision(before, event)
@@ -484,7 +485,9 @@ class ControlLoop:
     def _answered(self, pending: _PendingReply, applied: Mapping[str, KnobValues]) -> bool:
         """Answer a request if all its knob values are applied or it has timed out; returns whether it is answered."""
         now, commanded = self._now(), self._run.commanded
-        watched = [(name, knob) for name, knob in pending.knobs if applied[name]]
+        settings = self._run.decision.settings  # what is not sent keeps the other values
+        relevant = [(name, knob) for name, knob in pending.knobs if knob == "sending" or settings[name].sending]
+        watched = [(name, knob) for name, knob in relevant if applied[name]]
         waiting = [(name, knob) for name, knob in watched if applied[name].get(knob) != commanded[name][knob]]
         if waiting and now < pending.until:
             return False
@@ -510,12 +513,17 @@ class ControlLoop:
         }
         prediction = self._run.state.prediction
         predicted = plain(prediction.kbps) if prediction else None
-        is_known = self._position is not None and t - self._position.t <= POSITION_S
-        position = Position.of(self._position) if self._position and is_known else None
+        position = self._current_position(t)
         factor = self._speed_factor(t)
         telemetry = Telemetry(t, predicted, position, cameras, self.refused, self.errors, factor)
         self.log.record(telemetry)
         self.publish(telemetry)
+
+    def _current_position(self, t: float) -> Position | None:
+        """The position, while it is not stale; its speed becomes stale earlier."""
+        if self._position is None or (age_s := t - self._position.t) > POSITION_S:
+            return None
+        return Position.of(self._position if age_s <= SPEED_S else replace(self._position, speed_mps=None))
 
 
 def _without_reasons(state: VehicleState) -> VehicleState:
