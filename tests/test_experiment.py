@@ -39,7 +39,9 @@ def test_every_packaged_experiment_and_each_of_its_runs_can_be_driven(name: str)
         run.pqos()
 
 
-@pytest.mark.parametrize("words", [["pqos=live"], ["pqos=map", "pqos.position={kind: live}"]])
+@pytest.mark.parametrize(
+    "words", [["pqos=live"], ["pqos=map", "pqos.position={kind: live}"], ["pqos=map", "~pqos.position"]]
+)
 def test_a_link_without_a_rate_is_a_problem(words: list[str]) -> None:
     """It would pass nothing, without a word."""
     with pytest.raises(ConfigError, match="file: must be given: predictions from outside state no rates"):

@@ -151,7 +151,8 @@ def true_rates(pqos: Mapping[str, Any], bases: Sequence[Path]) -> RateAtTime:
     returns  `no_rates` if predictions, or the positions that they depend on, come from outside
     raises   ModelError with the key, the value found and the rule
     """
-    if pqos["kind"] == "live" or (pqos["kind"] == "map" and pqos["position"]["kind"] == "live"):
+    position = pqos.get("position") or {"kind": "live"}  # as in build_track
+    if pqos["kind"] == "live" or (pqos["kind"] == "map" and position["kind"] == "live"):
         return no_rates
     return _recorded_rates(build_pqos({**pqos, "look_ahead_s": 0, "wrong": None}, bases), build_track(pqos, bases))
 

@@ -274,7 +274,8 @@ def colour_at(page, camera, across, down):
     return shown.getpixel((round(across * shown.width), round(down * shown.height)))
 
 
-def test_a_driver_is_warned_in_either_view(chromium, picture):
+@pytest.mark.parametrize("pressed", ["Space", "b"])
+def test_a_driver_is_warned_in_either_view(chromium, picture, pressed):
     """Out of focus, a picture that was lost before, another page that takes control."""
     with served(picture, None) as (server, _), opened(chromium, server.url, script=SOUND_BLOCKED) as page:
         all_live(page)
@@ -283,8 +284,9 @@ def test_a_driver_is_warned_in_either_view(chromium, picture):
         page.evaluate(f"void (OscillatorNode = class extends OscillatorNode {{ {count} }})")
         assert page.inner_text("#sound-configure") == "✕ Sound blocked"
         shot(page, "sound-blocked")
-        page.focus("#sound-configure")
-        page.keyboard.press("Space")  # which allows sound, and must not mute it at once
+        if pressed == "Space":
+            page.focus("#sound-configure")
+        page.keyboard.press(pressed)  # which allows sound, and must not mute it at once
         until(page.locator("#sound-configure").is_hidden)
         assert page.evaluate("localStorage.getItem('tod-muted')") is None
         page.evaluate("dispatchEvent(new Event('blur'))")
@@ -298,6 +300,11 @@ def test_a_driver_is_warned_in_either_view(chromium, picture):
             """Four for a lost picture; on a busy machine there may be others."""
             return page.evaluate("globalThis.tones ?? 0")
 
+        before = tones()
+        page.evaluate("Object.defineProperty(document, 'hidden', {get: () => true, configurable: true})")
+        page.evaluate("document.dispatchEvent(new Event('visibilitychange'))")
+        until(lambda: tones() >= before + 4)
+        page.evaluate("delete document.hidden; document.dispatchEvent(new Event('visibilitychange'))")
         page.keyboard.press("t")
         until(lambda: page.evaluate("tod.control") == "nobody")
         server.silent.add("rear")
@@ -339,14 +346,22 @@ def test_keys_act_on_the_cameras_after_a_button_was_clicked(chromium, picture):
         page.keyboard.press("ArrowDown")
         assert page.evaluate("tod.selected") == "rear"
         page.click("#drawer")
+        page.click("#mode-collective")
+        page.keyboard.press("ArrowUp")
+        assert page.evaluate("tod.selected") == "front", "no other mode has the focus"
+        page.keyboard.press("ArrowDown")
         page.click("#drawer")
         page.keyboard.press("Enter")
         until(lambda: edges(page)["rear"]["width"] == usual["front"]["width"])
         page.click("#drive-control")
         until(lambda: page.evaluate("tod.control") == "nobody")
         page.focus("#drive-control")
-        page.keyboard.press("Enter")  # a focused button is pressed
+        page.evaluate("void (globalThis.clicks = 0, addEventListener('click', () => clicks++))")
+        for _ in range(3):
+            page.keyboard.down("Enter")  # a focused button is pressed, once however long the key is held
+        page.keyboard.up("Enter")
         until(lambda: page.evaluate("tod.control") == "you")
+        assert page.evaluate("clicks") == 1
         spoken = """() => {
           let spoken = 0;
           const observer = new MutationObserver((all) => (spoken += all.length));
@@ -517,6 +532,7 @@ def test_monitors_share_selection_control_and_attention_with_their_page(chromium
         monitor.evaluate("Object.defineProperty(document, 'hidden', {get: () => true, configurable: true})")
         monitor.evaluate("document.dispatchEvent(new Event('visibilitychange'))")
         until(lambda: station.attention == "hidden")
+        until(lambda: page.inner_text("#attention") == "HIDDEN: another window of this page cannot be seen")
         with opened(chromium, server.url) as other:
             take_control(other)
             until(lambda: monitor.evaluate("tod.control") == "another")

@@ -61,6 +61,17 @@ test("late and damaged pictures move, frozen and lost ones have no latency", () 
   assert.deepEqual(worstOf(ages, { ...statuses, front: "off", rear: "synchronising" }, 200), { camera: null, age_ms: null, bound_ms: null, level: "none" });
 });
 
+test("a late picture is shown and marked, although the median is below the limit", () => {
+  const ages = { front: age(90), rear: age(30) };
+  assert.deepEqual(worstOf(ages, { front: "live", rear: "late" }, 200), { camera: "rear", age_ms: 30, bound_ms: 5, level: "late" });
+});
+
+test("an age follows within half a second, whatever the frame rate", () => {
+  const drawn = (time, age_ms) => picture(time - age_ms, 0, 0, 0, time);
+  const steps = (interval) => [...Array.from({ length: 40 }, (_, n) => drawn(n * interval, 30)), ...Array.from({ length: 1 + Math.floor(250 / interval) }, (_, n) => drawn((40 + n) * interval, 280))];
+  for (const interval of [25, 66, 100, 200]) assert.equal(ageOf(steps(interval)).age_ms, 280, `${interval} ms`);
+});
+
 test("one unknown age makes the worst one unknown", () => {
   for (const unknown of [age(null), age(50, NaN), age(50, Infinity)])
     assert.deepEqual(worstOf({ front: age(10), rear: unknown }, live("front", "rear"), 200), { camera: "rear", age_ms: null, bound_ms: null, level: "unknown" });

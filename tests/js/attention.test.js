@@ -59,6 +59,8 @@ const STATES = [
   [{ hidden: false, focused: false }, "unfocused", /OUT OF FOCUS/],
   [{ hidden: false, focused: true, slow: true }, "slow", /SLOW/],
   [{ hidden: false, focused: false, slow: true }, "slow", /SLOW/],
+  [{ hidden: false, focused: true, covered: true }, "watching", /HIDDEN: another window/],
+  [{ hidden: true, focused: true, covered: true }, "hidden", null],
   [{ hidden: true, focused: true }, "hidden", null],
   [{ hidden: true, focused: false, slow: true }, "hidden", null],
 ];

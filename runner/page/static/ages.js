@@ -2,27 +2,28 @@
 
 import { MOVING } from "./status.js";
 
-const LAST = 15; // pictures, for a median
+const RECENT_MS = 500; // of pictures drawn, for a median
 const NEAR = 0.75; // of the limit
 
 /** @typedef {[captured: number, arrived: number, received: number, decoded: number, drawn: number]} Times */
 
 /**
- * The median age of the last pictures drawn, and of its parts on this page: from the station to the page, through the
- * decoder, and until drawn. null: unknown.
+ * The median age of the pictures drawn in the last half second, and of its parts on this page: from the station to the
+ * page, through the decoder, and until drawn. null: unknown.
  * @param {Times[]} pictures
  */
 export function ageOf(pictures) {
-  const last = pictures.slice(-LAST);
+  const newest = pictures.at(-1)?.[4] ?? 0;
+  const last = pictures.slice(pictures.findLastIndex(([, , , , drawn]) => newest - drawn > RECENT_MS) + 1);
   const age_ms = Number.isFinite(last.at(-1)?.[0]) ? median(last.map(([captured, , , , drawn]) => drawn - captured)) : null;
   const part = (from, to) => median(last.map((times) => times[to] - times[from]));
   return { age_ms: age_ms === null ? null : Math.max(0, age_ms), parts_ms: { page: part(1, 2), decode: part(2, 3), draw: part(3, 4) } };
 }
 
 /**
- * The camera whose moving picture may be oldest: its age plus the error bound is the largest. `level` is "late" where
- * that exceeds the limit, "near" where it exceeds 75 % of it; "unknown" if the age of any moving picture is unknown;
- * "none" if no picture moves.
+ * The camera whose moving picture may be oldest: a late one if there is any, then the one whose age plus error bound is
+ * the largest. `level` is "late" if its status is, or where that exceeds the limit, "near" where it exceeds 75 % of it;
+ * "unknown" if the age of any moving picture is unknown; "none" if no picture moves.
  * @param {Record<string, {age_ms: number|null, bound_ms: number}>} ages by camera
  * @param {Record<string, string>} statuses by camera
  * @param {number} late_ms
@@ -33,8 +34,9 @@ export function worstOf(ages, statuses, late_ms) {
   const unknown = moving.find(([, { age_ms, bound_ms }]) => !Number.isFinite(age_ms) || !Number.isFinite(bound_ms));
   if (unknown || !moving.length) return { camera: unknown?.[0] ?? null, age_ms: null, bound_ms: null, level: unknown ? "unknown" : "none" };
   const upperBound = ({ age_ms, bound_ms }) => (age_ms ?? 0) + bound_ms;
-  const [camera, worst] = moving.reduce((a, b) => (upperBound(b[1]) > upperBound(a[1]) ? b : a));
-  const level = upperBound(worst) > late_ms ? "late" : upperBound(worst) > NEAR * late_ms ? "near" : "fine";
+  const late = moving.filter(([name]) => statuses[name] === "late"); // its median may be below the limit
+  const [camera, worst] = (late.length ? late : moving).reduce((a, b) => (upperBound(b[1]) > upperBound(a[1]) ? b : a));
+  const level = late.length || upperBound(worst) > late_ms ? "late" : upperBound(worst) > NEAR * late_ms ? "near" : "fine";
   return { camera, age_ms: worst.age_ms, bound_ms: worst.bound_ms, level };
 }
 

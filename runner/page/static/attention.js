@@ -7,19 +7,21 @@ export class Attention {
   hidden = false;
   focused = true;
   elsewhere = false; // whether another window of this page has the keyboard focus
+  covered = false; // whether another window of this page is hidden
   /** @type {number|null} since when the page is hidden or out of focus */
   away_since = null;
   was_visible = true; // whether the page was visible all that time
   slow = false; // whether too few pictures are drawn
 
   /**
-   * Update the state: the page is hidden, focused, has its focus in another window (elsewhere), or draws too few pictures.
-   * @param {{hidden: boolean, focused: boolean, elsewhere?: boolean, slow?: boolean}} page
+   * Update the state: the page is hidden, focused, has its focus in another window (elsewhere), has a hidden window
+   * (covered), or draws too few pictures.
+   * @param {{hidden: boolean, focused: boolean, elsewhere?: boolean, covered?: boolean, slow?: boolean}} page
    * @param {number} now
    * @returns {string|null} message for an operator who has just returned
    */
-  update({ hidden, focused, elsewhere = false, slow = false }, now) {
-    Object.assign(this, { hidden, focused, elsewhere, slow });
+  update({ hidden, focused, elsewhere = false, covered = false, slow = false }, now) {
+    Object.assign(this, { hidden, focused, elsewhere, covered, slow });
     if (hidden || !(focused || elsewhere)) {
       if (this.away_since === null) Object.assign(this, { away_since: now, was_visible: true });
       this.was_visible &&= !hidden;
@@ -45,6 +47,7 @@ export class Attention {
   /** Warning for an operator who may still see the page; null: none. */
   get warning() {
     if (this.state === "slow") return "SLOW: this page draws fewer than 10 pictures a second";
-    return this.state === "unfocused" && !this.elsewhere ? "OUT OF FOCUS: keys do not reach this page; click it" : null;
+    if (this.state === "unfocused" && !this.elsewhere) return "OUT OF FOCUS: keys do not reach this page; click it";
+    return this.covered && !this.hidden ? "HIDDEN: another window of this page cannot be seen" : null;
   }
 }

@@ -57,7 +57,8 @@ function refreshSpeed() {
   const factor = isOnline() ? store.sample?.speed_factor : undefined;
   setText(byId("driven"), `${whole(KMH * (speed_mps ?? NaN))} km/h`);
   setText(byId("advised"), Number.isFinite(factor) ? `advised: ${whole(100 * (factor ?? 0))} % of full speed` : "no speed advised");
-  setAttribute(byId("speed-now"), "data-level", factor === 0 ? "late" : Number.isFinite(factor) && (factor ?? 1) < 1 ? "near" : "fine");
+  const level = (factor ?? 1) < 1 ? "near" : Number.isFinite(speed_mps) ? "fine" : "unknown";
+  setAttribute(byId("speed-now"), "data-level", factor === 0 ? "late" : level);
 }
 
 function totalWords() {
@@ -122,9 +123,12 @@ function refreshGuides() {
 // --- the driver's attention -------------------------------------------------------------------------------------------
 
 function updateAttention() {
-  if (document.hidden) hiddenAt = performance.now();
+  const { hidden } = document;
+  if (hidden) hiddenAt = performance.now();
   const slow = store.slow && performance.now() - hiddenAt > SETTLED_MS;
-  const message = attention.update({ hidden: document.hidden, focused: isFocused, elsewhere: store.elsewhere, slow }, performance.now());
+  if (hidden && !attention.hidden && inControl()) publish("unseen");
+  const { elsewhere, covered } = store;
+  const message = attention.update({ hidden, focused: isFocused, elsewhere, covered, slow }, performance.now());
   const warning = inControl() ? attention.warning : holding.isLost ? withKey("CONTROL LOST: this page only watches; take control", "control") : null;
   byId("attention").hidden = warning === null;
   setText(byId("attention"), warning ?? "");

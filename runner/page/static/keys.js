@@ -29,6 +29,7 @@ const isTyping = ({ target }) =>
   target.matches?.("textarea, select, input:not([type=range]):not([type=checkbox]):not([type=radio])");
 
 function onKeyDown(event) {
+  if (event.repeat && event.key === "Enter" && event.target.closest?.("button")) event.preventDefault(); // it would press it again
   if (event.ctrlKey || event.altKey || event.metaKey || event.repeat) return;
   if (document.querySelector("dialog[open]") || isTyping(event)) return leaveField(event);
   const key = keyOf(event);
@@ -54,11 +55,11 @@ function leaveField({ key, target }) {
 
 /**
  * Give the focus of a clicked button back to the cameras: Enter would press it again, and arrow keys would select no camera.
- * A button pressed by a key keeps it, as does one whose arrow keys have a meaning of their own.
+ * A button pressed by a key keeps it, as does one that moves a picture of the layout by arrow keys.
  */
 function onClick({ detail, target }) {
   const button = detail > 0 && target instanceof Element ? target.closest("button") : null;
-  if (button === document.activeElement && !button?.closest("dialog, [role=tablist], [role=radiogroup], .mover")) button?.blur();
+  if (button === document.activeElement && !button?.closest("dialog, .mover")) button?.blur();
 }
 
 function onFixedKey(key) {

@@ -33,7 +33,7 @@ function unlock() {
   if (context.state !== "running") context.resume().catch(() => refresh());
 }
 
-/** The press that resumes the sound must not mute it as well. @param {Event} event */
+/** @param {Event} event */
 function onPress(event) {
   if (event instanceof KeyboardEvent && event.repeat) return;
   wasBlocked = context?.state !== "running";
@@ -80,7 +80,9 @@ function onControl() {
   refresh();
 }
 
+/** Mute or unmute; a press that resumes blocked sound does not mute it as well. */
 export function toggleSound() {
+  if (isDriving && !isMuted() && context?.state !== "running") return;
   localStorage.setItem(KEY, isMuted() ? "no" : "yes");
   refresh();
 }
@@ -99,12 +101,12 @@ function refresh() {
 }
 
 export function startSound() {
-  for (const button of buttons) button.addEventListener("click", () => (!wasBlocked || isMuted()) && toggleSound());
+  for (const button of buttons) button.addEventListener("click", () => (!wasBlocked || isMuted()) && toggleSound()); // resumed since the press began
   for (const kind of ["pointerup", "keydown"]) addEventListener(kind, onPress, true);
   listen("control", onControl);
   listen("hello", refresh);
   listen("status", onStatus);
-  listen("deposed", () => sound("lost"));
+  listen("deposed unseen", () => sound("lost"));
   addEventListener("storage", refresh); // muted in another window
   setInterval(() => {
     const kind = alarm.overdue(performance.now());

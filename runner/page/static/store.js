@@ -74,6 +74,7 @@ const listeners = new Map();
  * @property {Sample|null} sample
  * @property {string} holder
  * @property {boolean} elsewhere
+ * @property {boolean} covered
  * @property {boolean} connected
  * @property {Note[]} notes
  * @property {ReturnType<typeof emptySeries>} series
@@ -94,6 +95,7 @@ export const store = {
   sample: null,
   holder: "nobody",
   elsewhere: false, // whether another window of this page has the keyboard focus
+  covered: false, // whether another window of this page is hidden
   connected: false,
   notes: [],
   series: emptySeries([]),
@@ -121,7 +123,7 @@ export function onStationMessage(message) {
   const { kind } = message;
   if (kind === "hello") onHello(message);
   else if (kind === "state" || kind === "sample") store[kind] = message;
-  else if (kind === "control") Object.assign(store, { holder: message.holder, elsewhere: message.elsewhere });
+  else if (kind === "control") Object.assign(store, { holder: message.holder, elsewhere: message.elsewhere, covered: message.covered });
   else if (kind === "layout" && store.hello) store.hello.layout = message;
   else if (kind === "selection") return setSelected(message.camera);
   else if (kind === "history") onHistory(message);

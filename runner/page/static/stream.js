@@ -422,8 +422,8 @@ export class Stream {
   onComposed(one, isPart, fps) {
     this.composed_fps = fps;
     if (!this.isOnlyInBirdseye || !this.drawn || !one || one.meta.decoded <= this.composed_at) return;
+    this.decoded = this.composed_at === -Infinity ? one.meta.decoded : now(); // to show an old picture makes it no newer
     this.composed_at = one.meta.decoded;
-    this.decoded = now();
     if (!isPart) return;
     this.checkAge(one.meta, now());
     this.recordStages(one.meta, now());
