@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from runner.core.events import ClockAdvanced, Event
 from runner.core.model import Kbps, ModelError, exact
-from runner.link.limit import Limit, Reverse, TcpFlows
 from runner.pqos import Pqos, build_pqos, build_track, trace
 from runner.pqos.settings import find_file, within
 from runner.schema import event_problem
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # a side that drives loads no evaluation tool
+    from runner.link.limit import Limit, Reverse, TcpFlows
     from runner.pqos.track import Track
 
 RateAtTime = Callable[[float], Kbps]  # rate in force at a time of the drive (s), kbit/s
@@ -78,6 +78,8 @@ def read_link(data: Mapping[str, Any], predicted: RateAtTime, bases: Sequence[Pa
     bases      directories in which a relative file is looked up
     raises     ModelError with the key, the value found and the rule
     """
+    from runner.link.limit import Limit
+
     if predicted is no_rates and not data["file"]:
         raise ModelError(
             "file", None, "must be given: predictions from outside state no rates that the link could follow"
@@ -101,6 +103,8 @@ def _recorded(data: Mapping[str, Any], loop: bool, bases: Sequence[Path]) -> Rat
 
 def _reverse(data: Mapping[str, Any], loop: bool, bases: Sequence[Path]) -> Reverse:
     """The reverse direction: its rate is a file's, or constant."""
+    from runner.link.limit import Reverse
+
     kbps, file = data.get("kbps"), data.get("file")
     if (kbps is None) == (file is None):
         raise ModelError("reverse", dict(data), "must give either kbps or file")
@@ -126,6 +130,8 @@ def _delays(data: Mapping[str, Any], loop: bool, bases: Sequence[Path]) -> Calla
 
 
 def _tcp(data: Mapping[str, Any]) -> TcpFlows:
+    from runner.link.limit import TcpFlows
+
     sizes = data.get("bytes")
     if sizes and sizes[0] > sizes[1]:
         raise ModelError("tcp.bytes", sizes, "must be [smallest, largest]")

@@ -120,6 +120,10 @@ FAULTS = [
 def main(words: list[str]) -> int:
     chosen = [fault for fault in FAULTS if not words or fault.package in words]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
+        tests = list(dict.fromkeys(fault.tests for fault in chosen))
+        if failed := [failure for failure in pool.map(_failure, tests) if failure]:
+            print(f"fails without any fault: {', '.join(failed)}")
+            return 2
         missed = 0
         for fault, caught in zip(chosen, pool.map(_caught, chosen), strict=True):
             print("caught" if caught else "MISSED", fault.file, "->", caught or fault.tests, flush=True)
@@ -129,27 +133,37 @@ def main(words: list[str]) -> int:
 
 
 def _caught(fault: Fault) -> str:
-    """The first test that fails with the fault; "" if none does."""
+    """The first test that fails with the fault; "" if none does, or they did not end."""
+    return _failure(fault.tests, fault)
+
+
+def _failure(tests: str, fault: Fault | None = None) -> str:
+    """The first test of a file that fails with a fault, or without; "" if none does, or they did not end."""
     with tempfile.TemporaryDirectory() as directory:
         copy = Path(directory, "checkout")
         left_out = shutil.ignore_patterns(".*", "node_modules", "__pycache__", "bench", "docs")
         shutil.copytree(CHECKOUT, copy, symlinks=True, ignore=left_out)
-        file = copy / "runner" / fault.file
-        text = file.read_text()
-        assert text.count(fault.right) == 1, f"{fault.file}: {fault.right!r} occurs {text.count(fault.right)} times"
-        file.write_text(text.replace(fault.right, fault.wrong))
+        if fault:
+            file = copy / "runner" / fault.file
+            text = file.read_text()
+            assert text.count(fault.right) == 1, f"{fault.file}: {fault.right!r} occurs {text.count(fault.right)} times"
+            file.write_text(text.replace(fault.right, fault.wrong))
         environment = {
             **os.environ,
             "PYTHONPATH": str(copy),
             "TOD_SHARED_DATA": str(CHECKOUT.parent / "shared" / "data"),
         }
-        command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", f"tests/{fault.tests}.py"]
+        command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", f"tests/{tests}.py"]
         options: dict[str, Any] = {"cwd": copy, "env": environment, "capture_output": True, "text": True}
         try:
             done = subprocess.run(command, check=False, timeout=LIMIT_S, **options)
         except subprocess.TimeoutExpired:
-            return f"{fault.tests}: not done after {LIMIT_S} s"
-        failed = [line for line in done.stdout.splitlines() if line.startswith(("FAILED ", "ERROR "))]
+            print(f"{tests}: not done after {LIMIT_S} s", flush=True)
+            return "" if fault else tests
+        failed = [line for line in done.stdout.splitlines() if line.startswith("FAILED ")]
+        if done.returncode > 1 or (done.returncode and not failed):
+            print(f"{tests}: {done.stdout}{done.stderr}", flush=True)
+            return "" if fault else tests
         return failed[0].split(" ")[1] if failed else ""
 
 

@@ -6,6 +6,8 @@ import json
 import os
 import signal
 import socket
+import subprocess
+import sys
 import time
 
 import pytest
@@ -354,3 +356,29 @@ def test_a_broker_that_cannot_start_is_reported(tmp_path, monkeypatch):
         private_broker(Endpoint("127.0.0.1", free_port())),
     ):
         pass
+
+
+BOTH_SIDES = """
+import json, sys, time
+from runner.operator.live import live_operator
+from runner.vehicle.live import live_vehicle
+with live_vehicle(sys.argv[2:], log=sys.argv[1], say=lambda line: None) as vehicle:
+    vehicle.start()
+    with live_operator(sys.argv[2:], log=sys.argv[1]) as operator:
+        operator.start(lambda camera, unit: None)
+        end = time.monotonic() + 60
+        while not operator.station.state and time.monotonic() < end:
+            time.sleep(0.1)
+        assert operator.station.state
+tools = ("runner.drive", "runner.link", "runner.rate_quality", "runner.synthetic")
+print(json.dumps(sorted(name for name in sys.modules if name.startswith(tools))))
+"""
+
+
+def test_a_side_that_drives_loads_no_evaluation_tool_but_the_log_writer(broker, tmp_path):
+    words = (*ROBOT, f"control.port={broker.port}", f"media.port={free_port()}", "link=relay")
+    program = BOTH_SIDES.replace("sys.argv[1]", "__import__('pathlib').Path(sys.argv[1])")
+    command = [sys.executable, "-c", program, str(tmp_path / "drive"), *words]
+    done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout.splitlines()[-1]) == ["runner.drive", "runner.drive.log"]
