@@ -1,4 +1,4 @@
-"""What a camera of 1920x1040 costs the vehicle by each way in: processor time, and how many of them two cores carry.
+"""What a camera of 1920x1040 costs the vehicle, by source: processor time, and cameras per two cores.
 
   python bench/sources.py CLIP.mp4
   python bench/sources.py CLIP.mp4 --fps 15 --only file bag ros2

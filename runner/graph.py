@@ -399,14 +399,14 @@ def _fill_value(value: Value, values: Mapping[str, Value | None], where: str) ->
         return value
     for name in PLACEHOLDER.findall(value):
         if name not in values:
-            raise ModelError(where, repr(value), f"nothing fills {{{name}}}{suggest(name, values)}")
+            raise ModelError(where, repr(value), f"unknown placeholder {{{name}}}{suggest(name, values)}")
     whole = PLACEHOLDER.fullmatch(value)
     if whole:
         return values[whole[1]]  # keeps its type
     parts: dict[str, Value] = {}
     for name in PLACEHOLDER.findall(value):
         if (part := values[name]) is None:
-            raise ModelError(where, repr(value), f"{{{name}}} must stand alone: it may be empty")
+            raise ModelError(where, repr(value), f"{{{name}}} may be unset, so it must be the whole value")
         parts[name] = part
     return PLACEHOLDER.sub(lambda match: text(parts[match[1]]), value)
 

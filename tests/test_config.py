@@ -203,7 +203,7 @@ def test_an_entry_of_a_list_is_named_by_its_number(tod: Command, word: str) -> N
     found = tod("print", word)
     assert found.status == 2
     assert found.err.startswith(f"command line: {word}: ")
-    assert "an entry of a list is named by its number, from 0 on" in found.err
+    assert "list entries are addressed by index, from 0" in found.err
 
 
 def test_whole_numbers_have_no_decimal_point(tod: Command) -> None:
@@ -221,7 +221,7 @@ def test_whole_numbers_have_no_decimal_point(tod: Command) -> None:
 
 def test_a_graph_without_efforts_has_the_usual_one(tod: Command) -> None:
     (problem,) = tod("print", "graph.efforts=null").problems
-    assert "nothing fills {preset}" in problem
+    assert "unknown placeholder {preset}" in problem
 
 
 def test_the_three_messages_of_the_style_guide(
@@ -304,7 +304,7 @@ REAR, GRAPH, PAPER, ROBOT = (
         (
             GRAPH,
             {"{mtu_bytes}": "{mtu_byte}"},
-            "sender[1].properties.mtu: '{mtu_byte}': nothing fills {mtu_byte}, did you mean mtu_bytes?",
+            "sender[1].properties.mtu: '{mtu_byte}': unknown placeholder {mtu_byte}, did you mean mtu_bytes?",
         ),
         (GRAPH, {"name: scaler": "name: crop"}, "vehicle[2].name: 'crop': is already the name of another element"),
         (

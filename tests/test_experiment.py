@@ -44,7 +44,7 @@ def test_every_packaged_experiment_and_each_of_its_runs_can_be_driven(name: str)
 )
 def test_a_link_without_a_rate_is_a_problem(words: list[str]) -> None:
     """It would pass nothing, without a word."""
-    with pytest.raises(ConfigError, match="file: must be given: predictions from outside state no rates"):
+    with pytest.raises(ConfigError, match="file: must be given: live predictions give no rate"):
         configuration([*words, "link=relay"], runnable=False).link()
 
 

@@ -169,7 +169,7 @@ def test_a_whole_placeholder_keeps_its_type_and_a_part_becomes_text() -> None:
 def test_nothing_fills_an_unknown_placeholder() -> None:
     with pytest.raises(ModelError) as refused:
         plan(graph=graph(mtu="{mtuu}"))
-    rule = "nothing fills {mtuu}, did you mean mtu?"
+    rule = "unknown placeholder {mtuu}, did you mean mtu?"
     assert str(refused.value) == f"graph.vehicle[0].properties.mtu: '{{mtuu}}': {rule}"
 
 

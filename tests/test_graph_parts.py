@@ -13,7 +13,7 @@ BASED = sorted(path.stem for path in (CONF / "graph").glob("*.yaml") if path.ste
 OPEN = "defaults: [h264_rtsp, _self_]\nencoder:\n"
 ENCODER = "  - {name: encoder, element: openh264enc, properties: {complexity: low}}\n"
 WHOLE = "[{name: gate, element: valve}, {name: crop, element: videocrop}, {name: size, element: capsfilter}, "
-UNUSED = "encoder: is not used, the list vehicle must refer to it as ${..encoder}"
+UNUSED = "encoder: is unused; include it in vehicle as ${..encoder}"
 
 
 def graph(conf: UserConf, *words: str, camera: str = "front_left") -> Graph:

@@ -184,11 +184,11 @@ def test_version_1_refuses_all_keys_of_ros_2_together():
     with pytest.raises(ConfigError) as failed:
         configuration([*WORDS, *TOPICS, *words, "ros.version=1"]).vehicle()
     assert str(failed.value).splitlines() == [
-        "command line: ros.use_sim_time: is of ROS 2, and ros.version is 1: "
+        "command line: ros.use_sim_time: has no effect with ros.version=1: "
         "a node follows the parameter /use_sim_time of its master",
-        "command line: ros.discovery: is of ROS 2, and ros.version is 1: "
+        "command line: ros.discovery: has no effect with ros.version=1: "
         "ROS_MASTER_URI names the master, which knows all nodes",
-        "command line: ros.qos: is of ROS 2, and ros.version is 1: subscribers ask for nothing",
+        "command line: ros.qos: has no effect with ros.version=1: subscribers cannot request QoS",
         "3 problems, nothing was started",
     ]
 

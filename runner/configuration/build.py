@@ -302,7 +302,7 @@ class Builder:
             rule = f"needs all cameras on RTSP or none: the graph of {dialling[0]} has its own transport"
             self._refuse_link("kind", link.kind, rule)
         if link.limit.tcp and link.kind == "relay":
-            self._refuse_link("tcp", None, "needs packets of any protocol: choose link=netns")
+            self._refuse_link("tcp", None, "is not supported by link=relay; choose link=netns")
 
     def _refuse_link(self, key: str, found: str | None, rule: str) -> None:
         self.problems.append(self.composed.problem(("link", key), found, rule))
@@ -468,7 +468,7 @@ def _effort(data: Mapping[str, Any]) -> dict[str, Any]:
 def _graph(data: Mapping[str, Any]) -> Graph:
     for key, side in GRAPH_PARTS.items():
         if key in data:
-            raise ModelError(key, None, f"is not used, the list {side} must refer to it as ${{..{key}}}")
+            raise ModelError(key, None, f"is unused; include it in {side} as ${{..{key}}}")
     wire = data.get("wire") or {}
     settings: dict[str, Value] = {key: value for key, value in data.items() if key not in GRAPH_STRUCTURE}
     return Graph(

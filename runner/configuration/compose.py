@@ -161,7 +161,7 @@ def _compose(overrides: Sequence[Override], directories: Sequence[Path]) -> tupl
     except (TypeError, ValueError) as error:
         if not re.search(r"is not an int|invalid literal for int|list indices must be integers", str(error)):
             raise
-        rule = "an entry of a list is named by its number, from 0 on, and cannot be removed: give the whole list"
+        rule = "list entries are addressed by index, from 0, and cannot be removed; override the whole list"
         raise ConfigError([Problem(COMMAND_LINE, "", " ".join(o.text for o in overrides), rule)]) from None
     except RecursionError:
         rule = "files include each other in a cycle"

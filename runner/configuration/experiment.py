@@ -81,9 +81,7 @@ def read_link(data: Mapping[str, Any], predicted: RateAtTime, bases: Sequence[Pa
     from runner.link.limit import Limit
 
     if predicted is no_rates and not data["file"]:
-        raise ModelError(
-            "file", None, "must be given: predictions from outside state no rates that the link could follow"
-        )
+        raise ModelError("file", None, "must be given: live predictions give no rate for the link to follow")
     rates = _recorded(data, data["loop"], bases) if data["file"] else predicted
     share = float(data["share"])
 

@@ -43,14 +43,14 @@ YIELDED = Fraction(1, 3)
 # never more than TRIED of it: then the link itself is narrower. Otherwise the encoders may have used less than the cap.
 NARROW = ((0.0, Fraction(1, 2)), (1.0, Fraction(4, 5)))
 TRIED_S, TRIED = 2.0, Fraction(19, 20)
-# A shorter queue, ms, may be jitter of the radio link or of a busy machine, unless packets are lost: if more is sent
-# than the link carries, it soon grows longer.
+# A shorter queue, ms, may be jitter of the radio link or of a busy machine, unless packets are lost: a real overload
+# soon makes it longer.
 JITTER_MS = 40
 # A longer one is real once it has lasted this long, s: delays on a busy machine are shorter.
 LASTED_S = 0.3
 SEEN_S = 0.4  # beyond the round trip, until a measured rate no longer includes the time before a change of cap or limit
-# Without predictions, this often within this many s means that competing flows start again and again: each fills the
-# queue and drops packets just as a link does that becomes narrow. From then on, the share above falls by a third over
+# Without predictions, this often within this many s means that short competing flows keep restarting: each fills the
+# queue and drops packets, like a link whose capacity falls. From then on, the share above falls by a third over
 # BURST_S while the queue is long, and only after that the link is considered narrow.
 OFTEN, OFTEN_S, BURST_S, CONTESTED = 3, 30.0, 2.0, Fraction(2, 3)
 PROVEN = 2  # then the most that arrived is limited to this multiple of the capacity
@@ -285,7 +285,7 @@ def probe(cap: LinkCap, t: float, asked: Kbps, limit: Kbps) -> LinkCap:
 
 
 def end_probe(cap: LinkCap, limit: Kbps) -> LinkCap:
-    """The cap once the limit counts again: what the link carried was measured under another one."""
+    """The cap when the limit applies again; the known capacity was measured under a different limit."""
     if not cap.alone:
         return cap
     return replace(cap, alone=False, overuse=cap.overuse and cap.overuse._replace(limit=limit))

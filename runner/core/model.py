@@ -546,7 +546,7 @@ ROS_PYTHON = {1: "/usr/bin/python3", 2: ".venv-ros2/bin/python"}  # by version
 OF_ROS_2 = {  # keys without effect in ROS 1, and why
     "use_sim_time": "a node follows the parameter /use_sim_time of its master",
     "discovery": "ROS_MASTER_URI names the master, which knows all nodes",
-    "qos": "subscribers ask for nothing",
+    "qos": "subscribers cannot request QoS",
 }
 
 
@@ -589,7 +589,7 @@ class RosSettings:
             unset = RosSettings()
             for key, rule in OF_ROS_2.items():
                 if getattr(self, key) != getattr(unset, key):
-                    yield ModelError(key, None, f"is of ROS 2, and ros.version is 1: {rule}")
+                    yield ModelError(key, None, f"has no effect with ros.version=1: {rule}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

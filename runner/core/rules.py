@@ -159,7 +159,7 @@ def share_by_demand(vehicle: Vehicle, state: State, draft: Draft, memory: Memory
 
 @rule(needs=["total", "demand"], gives=["bitrate"], reads=["copies", "weights"])
 def share_above_floors(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
-    """As `share_by_demand`, but each camera first gets its `floor_kbps`; `shed` says which ones go without a picture.
+    """As `share_by_demand`, but each camera first gets its `floor_kbps`; those with `shed` are given up first.
 
     Memory: the cameras given up.
     """
@@ -204,7 +204,7 @@ def _give_up(
 
 
 def _without(given_up: Collection[str], wanted: Mapping[str, Kbps]) -> Mapping[str, Kbps]:
-    """What the cameras want, nothing for those given up."""
+    """Demand by camera; 0 for those given up."""
     return {name: allocation.ZERO if name in given_up else own for name, own in wanted.items()} if given_up else wanted
 
 
@@ -267,7 +267,7 @@ def fit_to_total(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -
     """Mode S under a cap: Eq. (2) in proportion to what the operator has set, with floors as in `share_above_floors`.
 
     Where the bitrate falls into a lower range of Eq. (4), the factor falls with it, never above the operator's own.
-    What the operator has set stays stored, and returns with the total.
+    The operator's settings are kept, and apply again once the total allows.
 
     Memory: the cameras given up.
     """
@@ -318,8 +318,8 @@ def fade_when_stale(
     """A stale prediction is trusted less and less, unless the measured link replaces it (`cap_by_link`).
 
     Once it is older than its own `valid_s`, otherwise `after_s`, the total is halved, and again every `halve_every_s`,
-    down to `floor_kbps`; never above the prediction. If that was to send nothing, `floor_kbps` is sent, since otherwise
-    the link could never be measured. Before the first prediction, the age counts from the start of the run; the
+    down to `floor_kbps`; never above the prediction. After a prediction of 0 it is `floor_kbps`: with nothing sent, the
+    link could never be measured. Before the first prediction, the age counts from the start of the run; the
     halvings count from when the link last replaced the prediction, if it did since.
     """
     age, limit = _age(state, after_s)

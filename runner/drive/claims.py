@@ -18,7 +18,7 @@ NEAR_S = 5.0
 SEVERAL_S = 3.0
 DEEP_KBPS = 3300.0  # below it every camera but front center takes a lower factor (Table I)
 SHALLOW_S = (70.0, 90.0)
-TOO_SHORT = "the drive is not so long"
+TOO_SHORT = "the drive is too short"
 RANGE_KBPS = (3000.0, 8000.0)
 SIDES, CENTER = ("front_left", "front_right"), "front_center"
 

@@ -68,7 +68,7 @@ def measure(
 ) -> dict[str, DeliveredQuality]:
     """Measure all cameras whose video both sides recorded, on all processors.
 
-    clips       by camera, the clip that its source played; cameras without one are left out
+    clips       by camera, the clip that its source played; cameras not listed are compared with the stream as sent
     progress    called a few times a second, from this thread, with the share of the cameras done
     on_warning  called with a line about each camera that is left out: nothing was received, or files cannot be read
     """

@@ -35,7 +35,7 @@ class RtspConnection:
     last_request monotonic time of its last complete request, s; before the first, of its start
     peer         its IP address and port
     closed       whether it was told to close
-    refusal      why it may not watch, so far as it has shown; "" if it may
+    refusal      reason for refusing it, as far as known; "" if it may
     """
 
     def __init__(self, client: GstRtspServer.RTSPClient, silent_s: int) -> None:

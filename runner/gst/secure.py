@@ -192,7 +192,7 @@ class ViewerCheck:
         name, user = self.viewer(client), token.get_string(USER) if token else None
         if name is None:
             return "its keys are no longer accepted"
-        return None if name == user else f"its certificate is of {name}, its password of {user}"
+        return None if name == user else f"certificate belongs to {name}, password to {user}"
 
     def _accept(self, _auth: object, connection: Gio.TlsConnection, certificate: Gio.TlsCertificate, _: object) -> bool:
         holder = self._check.verify(certificate)

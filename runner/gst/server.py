@@ -63,7 +63,7 @@ OK, FORBIDDEN, REFUSED, UNAVAILABLE, MOVED = (
     GstRtsp.RTSPStatusCode.MOVED_PERMANENTLY,
 )
 
-# Why a client of a vehicle with keys may not watch, as long as it has shown nothing more specific.
+# Default reasons for refusing a client that has not authenticated.
 NO_CERTIFICATE, NO_PASSWORD, WRONG_PASSWORD = (
     "it has not completed a TLS handshake with a certificate",
     "it has given no password",

@@ -47,7 +47,7 @@ class Login:
         certificate: dict[str, Any] = dict(connection.getpeercert() or {})
         subject = dict(pair for entry in certificate.get("subject", ()) for pair in entry)
         if subject.get("organizationalUnitName") != Role.BROKER:
-            raise RunError("the peer is not the broker: its certificate is of another role")
+            raise RunError("the peer is not the broker: its certificate has a different role")
         self._broker = int(certificate["serialNumber"], 16)
 
     def has_changed(self) -> bool:

@@ -14,7 +14,7 @@ LONGEST = 1000  # characters of a text
 class LimitedReports:
     """Passes on each text once in a period, and MOST of them. May be called from any thread.
 
-    What goes on stays visible: the first text of a later period comes with the number of those left out before it.
+    An ongoing problem stays visible: the first text of a later period comes with the number left out before it.
 
     on_report  called with a text
     clock      returns the time, s

@@ -384,7 +384,6 @@ def live_vehicle(
         metrics.serve(live.problem)
         control.connect(live)
         for plan in plans:
-            console.say(
-                f"{plan.camera.name}: {rtsp_url(vehicle.media, plan.camera.name) if plan.serves else 'dials out'}"
-            )
+            address = rtsp_url(vehicle.media, plan.camera.name) if plan.serves else "connects to the operator"
+            console.say(f"{plan.camera.name}: {address}")
         yield live

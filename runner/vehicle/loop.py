@@ -498,7 +498,7 @@ class ControlLoop:
             pending.answer(Outcome(now, "timed out", f"not applied within {APPLY_S:g} s: {missing}"))
             return True
         unwatched = dict.fromkeys(name for name, _ in pending.knobs if not applied[name])
-        reason = f"nobody watches {', '.join(unwatched)}: kept until somebody does" if unwatched else ""
+        reason = f"no viewer for {', '.join(unwatched)}: applied when one connects" if unwatched else ""
         pending.answer(Outcome(now, "applied", reason))
         return True
 

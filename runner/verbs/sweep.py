@@ -1,4 +1,4 @@
-"""The runs of a sweep, prepare_all before the first one starts."""
+"""Prepares all runs of a sweep before the first one starts."""
 
 from __future__ import annotations
 

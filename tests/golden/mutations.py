@@ -105,7 +105,7 @@ def _number(chance: random.Random, document: Any, steps: Steps) -> Changed | Non
 
 
 def _text(key: str) -> Callable[[random.Random, Any, Steps], Changed | None]:
-    """A letter less in what stands below a key."""
+    """Drop one letter of a key's value."""
 
     def change(_chance: random.Random, document: Any, steps: Steps) -> Changed | None:
         value = _value(document, steps)

@@ -78,7 +78,7 @@ def test_settings_of_unwatched_cameras_are_kept_until_somebody_watches(operator,
     operator.ask("1", event="mode_selected", mode="collective")
     reply = operator.ask("2", event="total_set", kbps=1200)
     assert reply["result"] == "applied"
-    assert reply["reason"] == "nobody watches front, rear, mast: kept until somebody does"
+    assert reply["reason"] == "no viewer for front, rear, mast: applied when one connects"
     vehicle.watch("rear")
     cameras = operator.reach(lambda state: fits(state["cameras"]["rear"]))["cameras"]
     assert not cameras["front"]["applied"]

@@ -84,7 +84,7 @@ def test_the_state_holds_what_is_applied_and_late_subscribers_receive_it(broker,
     reply = operator.ask("1", event="mode_selected", mode="collective")
     assert (reply["result"], reply["reason"]) == ("applied", "")
     reply = operator.ask("2", event="total_set", kbps=1200)
-    assert reply["reason"] == "nobody watches front, rear, mast: kept until somebody does"
+    assert reply["reason"] == "no viewer for front, rear, mast: applied when one connects"
 
     media = f"media.port={vehicle.args[-2].partition('=')[2]}"
     with live_frames([*ROBOT, media], cameras=["rear"]) as frames:
@@ -94,7 +94,7 @@ def test_the_state_holds_what_is_applied_and_late_subscribers_receive_it(broker,
         assert rear["applied"]["size"] == {"width": rear["width"], "height": rear["height"]}
         assert (
             operator.ask("3", event="total_set", kbps=900)["reason"]
-            == "nobody watches front, mast: kept until somebody does"
+            == "no viewer for front, mast: applied when one connects"
         )
         rear = operator.state(lambda state: state["total_kbps"] == 900)["cameras"]["rear"]
         late = Operator(broker).state(lambda state: state["online"])

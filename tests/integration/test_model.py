@@ -422,7 +422,7 @@ def test_a_short_sequence_is_reported(tmp_path, cache):
         (["metric=brisque"], "brisque"),
         (["plan=fast"], "study.plan: 'fast': must be one of adaptive, full"),
         (["pool={all: [front_center, rear]}"], "pool.all: 'rear': no such camera is measured"),
-        (["scheduler=tcp://127.0.0.1:1"], "is for workers=dask"),
+        (["scheduler=tcp://127.0.0.1:1"], "requires workers=dask"),
     ],
 )
 def test_a_wrong_argument_is_reported(tod, clip, tmp_path, cache, monkeypatch, words, expected):

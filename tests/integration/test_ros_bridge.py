@@ -97,7 +97,7 @@ def test_operator_inputs_are_topics_and_services(ros, lines):
         assert operator.set("camera/front/roi", region=[0, 0, 0, 0])["result"] == "applied"
         until(lambda: with_roi(operator, {"x": 0, "y": 0, "width": 320, "height": 180}))
         switched = operator.call("camera/rear/switch", False)
-        assert switched == [True, "applied: nobody watches rear: kept until somebody does"]
+        assert switched == [True, "applied: no viewer for rear: applied when one connects"]
         until(lambda: not operator.newest("state")["cameras"]["rear"]["on"])
 
         for number, reason in ((float("nan"), "nan: must be a number"), (-1.0, "kbps: -1")):

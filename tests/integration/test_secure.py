@@ -493,7 +493,7 @@ def test_a_peer_that_is_not_the_broker_is_left_until_the_broker_is_back(keys):
     with private_broker(endpoint, keys / "broker"):
         assert connected.wait(20), notes
     link.close()
-    refused = "the peer is not the broker: its certificate is of another role; retrying"
+    refused = "the peer is not the broker: its certificate has a different role; retrying"
     assert len([note for note in notes if note.endswith(refused)]) == 1
 
 
@@ -541,7 +541,7 @@ def test_neither_plain_rtsp_nor_the_password_of_another_is_accepted(keys, tmp_pa
             assert {*seen().values(), *mixed_seen().values()} == {0}
     assert sorted(what for what in reports if "refused" in what) == [
         "keys: refused an RTSP client at 127.0.0.1: it has not completed a TLS handshake with a certificate",
-        "keys: refused an RTSP client at 127.0.0.1: its certificate is of bob, its password of alice",
+        "keys: refused an RTSP client at 127.0.0.1: certificate belongs to bob, password to alice",
     ]
 
 

@@ -6,9 +6,9 @@ import { test } from "node:test";
 import { Pace } from "../../runner/page/static/pace.js";
 
 /** The pace after so many seconds with these rates of due and drawn pictures, reported four times a second. */
-function after(seconds, due, drawn, pace = new Pace(), from = 0) {
+function after(seconds, due, drawn, pace = new Pace(30), from = 0, moves = true) {
   const before = pace.counts.at(-1) ?? { due: 0, drawn: 0 };
-  for (let t = 0.25; t <= seconds; t += 0.25) pace.add(1000 * (from + t), before.due + due * t, before.drawn + drawn * t);
+  for (let t = 0.25; t <= seconds; t += 0.25) pace.add(1000 * (from + t), before.due + due * t, before.drawn + drawn * t, moves);
   return pace;
 }
 
@@ -22,10 +22,19 @@ const TABLE = [
   ["fewer than 80 % of 5", 5, 3.9, true],
   ["none are due", 0, 0, false],
 ];
-for (const [what, due, drawn, slow] of TABLE) test(`${what}: ${slow ? "slow" : "fine"}`, () => assert.equal(after(3, due, drawn).isSlow, slow));
+for (const [what, due, drawn, slow] of TABLE) test(`${what}: ${slow ? "slow" : "fine"}`, () => assert.equal(after(3, due, drawn, new Pace(due)).isSlow, slow));
+
+test("fewer than ten a second are slow although no more arrive, unless the camera was paused meanwhile", () => {
+  assert.equal(after(3, 9, 9, new Pace(30)).isSlow, true);
+  assert.equal(after(3, 9, 9, new Pace(10)).isSlow, false);
+  const pace = after(3, 30, 30);
+  after(1, 0, 0, pace, 3, false);
+  after(1, 9, 9, pace, 4);
+  assert.equal(pace.isSlow, false);
+});
 
 test("a page that has just been opened is not judged", () => {
-  assert.equal(new Pace().isSlow, false);
+  assert.equal(new Pace(30).isSlow, false);
   assert.equal(after(2, 30, 0).isSlow, false, "less than two seconds between the first count and the last");
   assert.equal(after(2.25, 30, 0).isSlow, true);
 });

@@ -70,7 +70,7 @@ export class Stream {
     this.shown = null; // picture last drawn, kept for alarms and for tests
     this.meta = new Map(); // by timestamp: metadata of a unit in the decoder
     this.timestamp = 0;
-    this.pace = new Pace();
+    this.pace = new Pace(camera.fps);
     this.counts = { received: 0, due: 0, decoded: 0, drawn: 0, errors: 0, resyncs: 0 };
     this.error = ""; // the decoder's last one
     this.lasting = !station.video ? NO_VIDEO : isKnown(camera.codec) ? "" : `This page cannot show ${nameOf(camera.codec)}.`; // why there will never be a picture
@@ -467,9 +467,9 @@ export class Stream {
     return { connected, online, on, sending, refused, drawn, stood_since, damaged, faulty, arrived, decoded, late_until, fps };
   }
 
-  /** Whether too few of the received pictures are drawn; to be called a few times a second. */
+  /** Whether too few pictures are drawn; to be called a few times a second. */
   isSlow() {
-    this.pace.add(now(), this.counts.due, this.counts.drawn);
+    this.pace.add(now(), this.counts.due, this.counts.drawn, MOVING.includes(this.status));
     return this.pace.isSlow;
   }
 
