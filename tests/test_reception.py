@@ -535,3 +535,41 @@ def test_the_number_of_explained_mistakes_is_limited() -> None:
     with pytest.raises(ValueError) as raised:
         read_reception(message(to_json(REPORT) | {"units": [[]] * 1900}))
     assert str(raised.value).count("must have at least 4 entries") == MAX_ERRORS
+
+
+# --- silence ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("rtt_ms", "silent_s"), [(30, 0.3), (90, 0.3), (200, 0.52), (400, 0.92)])
+def test_without_reports_the_total_is_halved_once_per_silent_period_and_recovers_quickly(
+    rtt_ms: float, silent_s: float
+) -> None:
+    """max(300 ms, 2 RTT + 3 report intervals); then half of what arrived before, and x1.5 per RTT + 100 ms."""
+    drive = Drive("vehicle=delivery_robot", "modes=safe")
+    drive.accept("bitrate_predicted", t=0, kbps=4000, valid_s=60)
+
+    def reported(t: float, kbps: float) -> float:
+        drive.accept("link_measured", t=t, kbps=kbps, queue_ms=0, state="clear", rtt_ms=rtt_ms)
+        return float(drive.total)
+
+    for number in range(100):
+        assert reported(last := number / 25, 4100) == 4000
+    totals = {}
+    for number in range(1, 200):
+        drive.accept("clock_advanced", t=last + number / 100)
+        totals[number / 100] = float(drive.total)
+    changes = [at for (_, before), (at, after) in pairwise(totals.items()) if after != before]
+    assert changes[0] == pytest.approx(silent_s, abs=0.011)
+    assert all(b - a >= silent_s - 0.011 for a, b in pairwise(changes)), "once per silent period"
+    levels = [4000.0, *(totals[at] for at in changes)]
+    assert all(0.42 < after / before < 0.5 for before, after in pairwise(levels[:3])), "headers are not halved"
+
+    began = last + 2.0
+    first = reported(began, levels[-1])
+    assert 0.42 < first / 4000 <= 0.5
+    step_s = 0.1 + rtt_ms / 1000
+    times = [began + number / 25 for number in range(1, 100)]
+    grown = [(t, total) for t in times if (total := reported(t, float(drive.total))) != first]
+    assert grown[0][0] - began <= step_s + 0.05
+    assert 1.4 < grown[0][1] / first < 1.6
+    assert reported(began + 4, 4100) == 4000

@@ -1,23 +1,38 @@
-"""Random sequences of reception reports: the cap stays a finite rate, and returns to the limit once all is well."""
+"""Random sequences of reception reports and other events, through all rules of modes=safe.
+
+Whatever is reported, the total never exceeds what prediction or operator allow, what the cameras send never exceeds the
+total, and the total returns to the prediction once all is well.
+"""
 
 from __future__ import annotations
 
 import math
 import random
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from fractions import Fraction
+from functools import cache
+from typing import Any
 
-from runner.core.events import LinkMeasured, PositionReported
-from runner.core.link_cap import LEAST, REPORT_S, LinkCap, believed_limit, update_cap
-from runner.core.model import exact
-from runner.core.uplink import LinkReport, ReceivedUnit, UplinkMemory, estimate
+from runner.configuration.config import configuration
+from runner.core import events
+from runner.core.events import LinkMeasured
+from runner.core.link_cap import REPORT_S
+from runner.core.model import Mode, Vehicle, exact
+from runner.core.step import Run, start, step
+from runner.core.uplink import LinkEstimate, LinkReport, ReceivedUnit, UplinkMemory, estimate
 
 SEQUENCES, BATCH = 200_000, 500
-RECOVERED = 100  # one sequence in this many is followed until the link is clear again
-RECOVERY_S = 60.0
-CAMERAS = ("front", "left", "right")
+RECOVERED = 100  # one sequence in this many is followed until all is well again
+RECOVERY_S, PREDICTED = 60.0, 3000
+SLOWER_S = 0.1  # between two reports then
 PLACES = tuple((48 + north / 2000, 11.5) for north in range(4))  # 56 m apart
-LIMIT, LEAST_TRUST = Fraction(4000), Fraction(1, 2)
+START_KBPS = 3000  # of modes/safe.yaml
+VALID_S = 2
+
+
+@cache
+def vehicle() -> Vehicle:
+    return configuration(["vehicle=delivery_robot", "modes=safe", "pqos=live"], runnable=False).vehicle()
 
 
 def soak(seed: int, scale: float) -> list[str]:
@@ -36,29 +51,133 @@ def _batch(first: int) -> list[str]:
 def sequence(seed: int) -> str:
     """One random sequence; returns the problem, "" if there is none."""
     rng = random.Random(seed)
-    uplink, cap, t, at = UplinkMemory(), LinkCap(), 0.0, rng.uniform(-1e6, 1e6)
+    drive = Drive(rng.uniform(-1e6, 1e6))
     for _ in range(rng.randrange(1, 40)):
-        passed = rng.choice((REPORT_S, REPORT_S, rng.expovariate(5), 0.0))
-        t, at = t + passed, at + passed
-        if rng.random() < 0.02:  # another operator, with another clock
-            uplink, at = UplinkMemory(), rng.uniform(-1e6, 1e6)
-        uplink, cap, problem = _step(uplink, cap, t, _report(rng, at), rng.choice(PLACES))
-        if problem:
-            return problem
-    until = t + (0 if seed % RECOVERED else RECOVERY_S)
-    while t < until and (cap.kbps is not None or cap.trust.share < 1):
-        t, at = t + REPORT_S, at + REPORT_S
-        size = int(float(min(LIMIT, cap.kbps or LIMIT)) * REPORT_S * 125 / len(CAMERAS))
-        units = tuple(ReceivedUnit(name, at - 0.03, at - 0.01, size) for name in CAMERAS)
-        uplink, cap, problem = _step(uplink, cap, t, LinkReport(at, units, 9, 0), PLACES[0])
-        if problem:
-            return problem
-    return f"not recovered within {RECOVERY_S:g} s: {cap}" if seed % RECOVERED == 0 and t >= until else ""
+        drive.pass_time(rng.choice((REPORT_S, REPORT_S, rng.expovariate(5), 0.0)))
+        if rng.random() < 0.7:
+            drive.report(_report(rng, drive.at))
+        else:
+            drive.take(**_event(rng))
+        if drive.problem:
+            return f"{drive.problem} at t={drive.run.state.t}"
+    return _recovers(drive) if seed % RECOVERED == 0 else ""
+
+
+class Drive:
+    """A run of the rules, fed with an operator's reports.
+
+    at       the operator's clock, s
+    problem  the first one found
+    """
+
+    def __init__(self, at: float) -> None:
+        self.run, self.at, self.problem = start(vehicle()), at, ""
+        self._t, self._uplink = 0.0, UplinkMemory()
+
+    def pass_time(self, seconds: float) -> None:
+        self._t, self.at = self._t + seconds, self.at + seconds
+
+    def take(self, event: str, **values: Any) -> None:
+        """One event; a new operator has a clock of its own."""
+        if event == "control_passed":
+            self._uplink = UplinkMemory()
+        self._step(events.parse({"t": self._t, "event": event, **values}))
+
+    def report(self, report: LinkReport) -> None:
+        self._uplink, link = estimate(self._uplink, report)
+        if link is None:
+            return
+        if not _is_possible(link):
+            self.problem = self.problem or f"estimate {link}"
+        kbps = None if link.kbps is None else exact(round(link.kbps, 1))
+        self._step(
+            LinkMeasured(t=self._t, kbps=kbps, queue_ms=link.queue_ms, loss=link.loss, state=link.state, rtt_ms=30.0)
+        )
+
+    def _step(self, event: events.Event) -> None:
+        self.run = step(vehicle(), self.run, event)
+        self.problem = self.problem or next(_problems(self.run), "")
+
+
+def _is_possible(link: LinkEstimate) -> bool:
+    known = [value for value in (link.kbps, link.queue_ms, link.loss) if value is not None]
+    return all(math.isfinite(value) and value >= 0 for value in known) and link.loss <= 1
+
+
+def _problems(run: Run) -> Iterator[str]:
+    """What must never be decided."""
+    if run.fault:
+        yield run.fault
+    total, copies, settings = run.decision.total, run.state.copies, run.decision.settings
+    sent = sum(setting.kbps * copies.get(name, 1) for name, setting in settings.items())
+    allowed = _allowed(run)
+    if not 0 <= total <= allowed:
+        yield f"total {float(total)} where {float(allowed)} are allowed"
+    if sent > total:
+        yield f"{sent} kbit/s are sent of {float(total)}"
+
+
+def _allowed(run: Run) -> Any:
+    """The largest total, kbit/s: what prediction or operator give; what the cameras need where the link alone decides."""
+    state = run.state
+    copies = {name: state.copies.get(name, 1) for name in vehicle().cameras}
+    if state.mode is Mode.SINGLE:
+        return sum(state.manual[name].kbps * copies[name] for name, on in state.on.items() if on)
+    if state.mode is Mode.COLLECTIVE:
+        return START_KBPS if state.collective_total is None else state.collective_total
+    made = state.prediction
+    given = START_KBPS if made is None else made.kbps
+    if state.t - (made.t if made else 0) <= VALID_S:
+        return given
+    return max(given, sum(camera.rate_quality.b_full * copies[name] for name, camera in vehicle().cameras.items()))
+
+
+def _recovers(drive: Drive) -> str:
+    """The problem if the total does not return to the prediction on a link that carries everything, "" if it does."""
+    for event in (
+        {"event": "operator_connected"},
+        {"event": "mode_selected", "mode": "automatic"},
+        {"event": "copies_counted", "copies": {}},
+        *({"event": "camera_switched", "camera": name, "on": True} for name in vehicle().cameras),
+    ):
+        drive.take(**event)
+    for number in range(round(RECOVERY_S / SLOWER_S)):
+        drive.pass_time(SLOWER_S)
+        if number % 10 == 0:
+            drive.take("bitrate_predicted", kbps=PREDICTED)
+        sizes = {name: setting.kbps for name, setting in drive.run.decision.settings.items() if setting.kbps}
+        units = [
+            ReceivedUnit(name, drive.at - 0.03, drive.at - 0.01, round(size * SLOWER_S * 125)) for name, size in sizes.items()
+        ]
+        drive.report(LinkReport(drive.at, tuple(units), 9, 0))
+        if drive.problem or (number and drive.run.decision.total == PREDICTED):
+            return drive.problem
+    return f"after {RECOVERY_S:g} s the total is {float(drive.run.decision.total)}: {drive.run.memory}"
+
+
+def _event(rng: random.Random) -> dict[str, Any]:
+    lat, lon = rng.choice(PLACES)
+    name = rng.choice(tuple(vehicle().cameras))
+    return rng.choice(
+        (
+            {"event": "clock_advanced"},
+            {"event": "bitrate_predicted", "kbps": rng.choice((0, 2, 300, 3000, rng.uniform(0, 20_000)))},
+            {"event": "position_reported", "lat": lat, "lon": lon},
+            {"event": "operator_connected"},
+            {"event": "operator_disconnected"},
+            {"event": "control_passed", "operator": "another"},
+            {"event": "copies_counted", "copies": {name: rng.randrange(1, 4)}},
+            {"event": "camera_switched", "camera": name, "on": rng.random() < 0.7},
+            {"event": "mode_selected", "mode": rng.choice(("single", "automatic", "automatic", "collective"))},
+            {"event": "total_set", "kbps": rng.choice((0, 100, 3000, 12_000))},
+        )
+    )
 
 
 def _report(rng: random.Random, at: float) -> LinkReport:
+    cameras = tuple(vehicle().cameras)
     units = sorted(
-        (at - rng.expovariate(20), rng.choice(CAMERAS), rng.uniform(-10, 10) ** rng.choice((1, 3)))
+        (at - rng.expovariate(20), rng.choice(cameras), rng.uniform(-10, 10) ** rng.choice((1, 3)))
         for _ in range(rng.choice((0, 1, 3, 8)))
     )
     return LinkReport(
@@ -70,23 +189,3 @@ def _report(rng: random.Random, at: float) -> LinkReport:
         rng.randrange(100),
         rng.choice((0, 0, 1, 100)),
     )
-
-
-def _step(
-    uplink: UplinkMemory, cap: LinkCap, t: float, report: LinkReport, place: tuple[float, float]
-) -> tuple[UplinkMemory, LinkCap, str]:
-    """The next estimate and cap, and a problem with them."""
-    uplink, link = estimate(uplink, report)
-    if link is None:
-        return uplink, cap, ""
-    known = [value for value in (link.kbps, link.queue_ms, link.loss) if value is not None]
-    if not all(math.isfinite(value) and value >= 0 for value in known) or link.loss > 1:
-        return uplink, cap, f"estimate {link}"
-    kbps = None if link.kbps is None else exact(round(link.kbps, 1))
-    measured = LinkMeasured(t=t, kbps=kbps, queue_ms=link.queue_ms, loss=link.loss, state=link.state, rtt_ms=30.0)
-    position = PositionReported(t=t, lat=place[0], lon=place[1])
-    cap = update_cap(cap, measured, t, LIMIT, LEAST_TRUST, position)
-    total = min(believed_limit(cap, LIMIT, LEAST_TRUST), cap.kbps or LIMIT)
-    if not LEAST <= total <= LIMIT or (cap.kbps is not None and cap.kbps < LEAST):
-        return uplink, cap, f"total {float(total)} under {cap}"
-    return uplink, cap, ""
