@@ -147,7 +147,8 @@ def _recovers(drive: Drive) -> str:
             drive.take("bitrate_predicted", kbps=PREDICTED)
         sizes = {name: setting.kbps for name, setting in drive.run.decision.settings.items() if setting.kbps}
         units = [
-            ReceivedUnit(name, drive.at - 0.03, drive.at - 0.01, round(size * SLOWER_S * 125)) for name, size in sizes.items()
+            ReceivedUnit(name, drive.at - 0.03, drive.at - 0.01, round(size * SLOWER_S * 125))
+            for name, size in sizes.items()
         ]
         drive.report(LinkReport(drive.at, tuple(units), 9, 0))
         if drive.problem or (number and drive.run.decision.total == PREDICTED):
