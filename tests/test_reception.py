@@ -552,8 +552,9 @@ def test_without_reports_the_total_is_halved_once_per_silent_period_and_recovers
         drive.accept("link_measured", t=t, kbps=kbps, queue_ms=0, state="clear", rtt_ms=rtt_ms)
         return float(drive.total)
 
-    for number in range(100):
-        assert reported(last := number / 25, 4100) == 4000
+    last = 4.0
+    for number in range(101):
+        assert reported(number / 25, 4100) == 4000
     totals = {}
     for number in range(1, 200):
         drive.accept("clock_advanced", t=last + number / 100)

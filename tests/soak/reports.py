@@ -118,7 +118,7 @@ def _problems(run: Run) -> Iterator[str]:
 
 
 def _allowed(run: Run) -> Any:
-    """The largest total, kbit/s: what prediction or operator give; what the cameras need where the link alone decides."""
+    """The largest total, kbit/s: of prediction or operator; where the link alone decides, what the cameras need."""
     state = run.state
     copies = {name: state.copies.get(name, 1) for name in vehicle().cameras}
     if state.mode is Mode.SINGLE:
