@@ -32,7 +32,7 @@ from runner.core.roles import Role
 from runner.page.control import GRACE_S, Control, combined_attention, page_of
 from runner.page.history import MAX_SAMPLES, History
 from runner.page.login import COOKIE, PageLogin
-from runner.page.server import POLICY, PageServer, hosts
+from runner.page.server import LOGIN_POLICY, POLICY, PageServer, hosts
 from runner.page.viewer import CATCH_UP, HEADER, KEY, MAX_UNITS, RESTART, PageViewer
 from runner.records import CameraSample, Outcome, Position, Sample
 from runner.security import keyring
@@ -187,7 +187,8 @@ def test_every_refusal_is_reported_once_without_secrets_and_carries_the_policy(k
         ]
         for path, headers, status, _ in refused * 3:
             answer = answered(port, keys, path, **headers)[1]
-            assert (answer.status, answer.headers["Content-Security-Policy"]) == (status, POLICY), path
+            policy = LOGIN_POLICY if path.startswith("/login") else POLICY
+            assert (answer.status, answer.headers["Content-Security-Policy"]) == (status, policy), path
         redirect = answered(port, keys, "/?view=drive", **own)[1]
         assert (redirect.status, redirect.headers["Location"]) == (303, "/login?view=drive")
         assert redirect.headers["Content-Security-Policy"] == POLICY

@@ -63,6 +63,7 @@ POLICY = (
     "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; worker-src 'self'; "
     "frame-ancestors 'none'; base-uri 'none'; form-action 'self'; object-src 'none'"
 )
+LOGIN_POLICY = POLICY.replace(" 'unsafe-inline'", "")
 HEADERS = {
     "Content-Security-Policy": POLICY,
     "Cache-Control": "no-cache",
@@ -244,13 +245,14 @@ class PageServer(Listener):
     @web.middleware
     async def _add_headers(self, request: web.Request, handler: Any) -> web.StreamResponse:
         """Add HEADERS to every response, also to one that is raised."""
+        headers = HEADERS | ({"Content-Security-Policy": LOGIN_POLICY} if request.path in UNPROTECTED else {})
         try:
             response: web.StreamResponse = await handler(request)
         except web.HTTPException as raised:
-            raised.headers.update(HEADERS)
+            raised.headers.update(headers)
             raise
         if not response.prepared:
-            response.headers.update(HEADERS)
+            response.headers.update(headers)
         return response
 
     @web.middleware

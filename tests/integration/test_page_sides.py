@@ -336,6 +336,8 @@ def test_other_sites_and_host_names_are_refused(remote_page):
     assert status("/login/challenge", "POST", Origin="https://evil.example") == 403
     assert status("/live?viewer=x", **upgrade) == 401
     assert status("/live?viewer=x", **upgrade, Cookie="tod_session=guessed") == 401
+    assert status("/live?viewer=x", **upgrade, Origin="https://evil.example") == 403
+    assert status("/login/challenge") == 405, "a GET changes nothing"
     assert status("/static/main.js") == 401
     assert status("/static/../../../../etc/passwd") in (401, 404)
     assert status("/static/%2e%2e/%2e%2e/server.py") in (401, 404)

@@ -251,6 +251,21 @@ def _intrude(keys, broker, tmp_path):
     assert published(broker, keys / "alice", topic) == (0, "")
 
 
+def test_the_broker_refuses_a_revoked_certificate_although_the_password_is_right(keys, tmp_path):
+    old, mixed, broker, reports = tmp_path / "old", tmp_path / "mixed", Endpoint("127.0.0.1", free_port()), []
+    shutil.copytree(keys / "alice", old)
+    changed(keys, "rotate", "alice")
+    shutil.copytree(keys / "alice", mixed)
+    for name in (keyring.CERTIFICATE, keyring.KEY):
+        shutil.copy(old / name, mixed)
+    topic = f"tod/{NAME}/request/alice"
+    with private_broker(broker, keys / "broker", reports.append):
+        assert published(broker, keys / "alice", topic) == (0, "")
+        assert published(broker, mixed, topic)[0] != 0
+        until(lambda: reports)
+    assert "verify failed" in reports[0], reports
+
+
 def test_revoked_holders_are_disconnected_and_stay_out(keys):
     old = keys.parent / "old"
     shutil.copytree(keys / "alice", old)
