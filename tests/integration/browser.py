@@ -159,6 +159,7 @@ BOXES = """() => {
   const isLow = ({ scrollHeight, clientHeight }) => scrollHeight > clientHeight + 1;
   const named = ({ id, className, tagName, textContent }) => `${id || className || tagName}: ${textContent}`;
   const seen = ".tile, .picture, #header > *, #side, #drive *";
+  const panels = "#side > [role=tabpanel]:not(#news-panel), dialog[open]";
   const inputs = "#side :is(input, button, label)";
   const texts = `#drive *, .tile .head, .tile .head *, .tile .caption, #header *, ${inputs}`;
   const leavesPanel = (element) => {
@@ -172,8 +173,8 @@ BOXES = """() => {
       {
         outside: [...find(seen).filter((each) => isOutside(box(each))), ...find(inputs).filter(leavesPanel)].map(named),
         cut: find(texts).filter(isCut).map(named),
-        low: find("#drive > *, .tile .head").filter(isLow).map(named),
-        scrolls: scrollWidth > innerWidth || scrollHeight > innerHeight,
+        low: find(`#drive > *, .tile .head, .tile .caption, ${panels}`).filter(isLow).map(named),
+        scrolls: scrollWidth > innerWidth + 1 || scrollHeight > innerHeight + 1,
       },
     ];
   };

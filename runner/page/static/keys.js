@@ -69,14 +69,18 @@ function onFixedKey(key) {
   publish("toast", { text: "mode: s Single, a Automatic, c Collective", level: "hint" });
 }
 
-function keyTable() {
+/** Two tables beside each other, so that the list fits on small screens. */
+function keyTables() {
   const buttons = store.hello?.inputs.buttons ?? {};
   /** @type {[string, string, string][]} */
   const rows = Object.entries(ACTIONS).map(([name, { description }]) => [labelOf(keys()[name]), `${buttons[name] ?? ""}`, description]);
   /** @param {[string, string, string]} cells */
   const row = ([key, button, description]) => make("tr", {}, make("th", { scope: "row" }, key), make("td", {}, button), make("td", {}, description));
-  const heads = ["Key", "Button", "Action"].map((head) => make("th", { scope: "col" }, head));
-  return make("table", {}, make("thead", {}, make("tr", {}, ...heads)), make("tbody", {}, ...[...rows, ...FIXED].filter(([key, button]) => key || button).map(row)));
+  const heads = () => ["Key", "Button", "Action"].map((head) => make("th", { scope: "col" }, head));
+  const used = [...rows, ...FIXED].filter(([key, button]) => key || button).map(row);
+  const half = Math.ceil(used.length / 2);
+  const tables = [used.slice(0, half), used.slice(half)].map((part) => make("table", {}, make("thead", {}, make("tr", {}, ...heads())), make("tbody", {}, ...part)));
+  return make("div", { class: "columns" }, ...tables);
 }
 
 export function startKeys() {
@@ -84,7 +88,7 @@ export function startKeys() {
   const close = make("form", { method: "dialog" }, make("button", { autofocus: true }, "Close"));
   listen("help", () => {
     if (help.open) return;
-    help.replaceChildren(make("h2", { id: "help-title" }, "Keys and buttons"), keyTable(), close);
+    help.replaceChildren(make("h2", { id: "help-title" }, "Keys and buttons"), keyTables(), close);
     help.showModal();
   });
   addEventListener("keydown", onKeyDown);

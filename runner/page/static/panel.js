@@ -15,8 +15,8 @@ import { byId, factor, latency, make, region, setAttribute, setText, size, tenth
 
 const SIDES = ["x", "y", "width", "height"];
 const WHY = {
-  automatic: "Set by the prediction in mode A; choose S to set it by hand.",
-  collective: "Shared from the total in mode C; choose S to set it by hand.",
+  automatic: "Set by the prediction; choose S to set it.",
+  collective: "Shared from the total; choose S to set it.",
 };
 
 /** The selected camera; "" before the first hello, when nothing is shown here. */
@@ -90,7 +90,7 @@ function comparison() {
   return make("table", { class: "facts" }, make("caption", { class: "unseen" }, "decided and applied values"), make("thead", {}, head), body);
 }
 
-/** Two stages in each row, which leaves space for the charts. */
+/** Two stages in each row, which leaves space for the charts beside it on a large screen. */
 function stageTable() {
   const cells = Object.entries(STAGES).map(([stage, [label, what]]) => {
     latencies.set(stage, make("td"));
@@ -257,12 +257,12 @@ export function startPanel() {
     field("Bitrate", bitrate.element),
     field("Factor", choices, free),
     field("ROI", make("div", { class: "sides" }, ...numbers)),
-    make("div", { class: "beside" },
-      make("div", {}, field("", apply, full, locked), field("Weight", weight, weightNote)),
-      frame.element),
+    make("div", { class: "field" }, apply, full, locked),
+    make("div", { class: "beside" }, field("Weight", weight, weightNote), frame.element),
   );
   const head = make("div", { class: "head" }, swatch, title, status, straight, on);
-  byId("camera-panel").append(head, reason, controls, comparison(), differing, stageTable());
+  byId("camera-panel").append(head, reason, controls, comparison(), differing);
+  byId("latency-panel").append(stageTable());
   listen("hello state sample control requests socket status theme straight aspect", refresh);
   listen("selected", onSelected);
 }

@@ -6,8 +6,8 @@ import { makeSlider } from "./slider.js";
 import { byId, make, setText, whole } from "./format.js";
 
 const WHY = {
-  single: "sum of the bitrates set in mode S; choose C to set it",
-  automatic: "set by the prediction in mode A; choose C to set it",
+  single: "sum of the cameras; choose C to set it",
+  automatic: "set by the prediction; choose C to set it",
 };
 
 const figure = make("b", { class: "large" });
