@@ -329,13 +329,16 @@ def test_a_driver_is_warned_in_either_view(chromium, picture, pressed):
 
 
 def test_keys_act_on_the_cameras_after_a_button_was_clicked(chromium, picture):
-    remapped = ("inputs.keys.view=x", "inputs.keys.theme=null")
+    remapped = ("inputs.keys.view=x", "inputs.keys.theme=null", "inputs.keys.camera_3=k")
     with served(picture, None, *remapped) as (server, _), opened(chromium, server.url) as page:
         all_live(page)
         controlling(page)
         assert page.inner_text("#offer-drive") == "Drive view (x)"
         titles = [page.get_attribute(f"#{name}", "title") for name in ("to-drive", "theme", "take-control")]
         assert titles == ["Drive view: pictures first (x)", "Day or night", "take or release control (t)"]
+        for key, camera in (("k", "mast"), ("ArrowDown", "rear"), ("1", "front"), ("3", "front")):
+            page.keyboard.press(key)
+            assert page.evaluate("tod.selected") == camera, key
         page.dblclick("[data-camera=mast] .picture")
         page.keyboard.press("x")
         usual = edges(page)
@@ -501,7 +504,7 @@ def test_a_monitor_passes_on_keys_for_what_only_the_page_shows(chromium, picture
         page.keyboard.press("1")
         until(lambda: monitor.evaluate("tod.selected") == "front")
         monitor.keyboard.press("2")  # it does not show the rear camera
-        until(lambda: page.evaluate("tod.selected") == "rear")
+        until(lambda: [each.evaluate("tod.selected") for each in (page, monitor)] == ["rear", "rear"])
         monitor.keyboard.press("Enter")
         until(lambda: edges(page)["rear"]["width"] == usual["front"]["width"])
         monitor.keyboard.press("Escape")

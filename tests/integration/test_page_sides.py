@@ -228,7 +228,7 @@ def h265(tmp_path):
 def test_h265_is_played_or_refused_with_the_reason(chromium, h265):
     with sides(h265, "+graph@cameras.rear.graph=h265") as (url, vehicle, _), vehicle(), opened(chromium, url) as page:
         until(lambda: {"live", "unsupported"} >= {camera["status"] for camera in measure(page).values()})
-        until(lambda: page.evaluate("tod.sample").get("cameras", {}).get("rear", {}).get("fps", 0) > 5)
+        until(lambda: page.evaluate("tod.sample?.cameras?.rear?.fps ?? 0") > 5)
         supported = "VideoDecoder.isConfigSupported({codec: 'hev1.1.6.L90.90'}).then(({supported}) => supported)"
         if page.evaluate(supported):
             all_live(page)

@@ -22,13 +22,17 @@ import { isEditing } from "./edit.js";
  * @property {() => unknown} run
  * @property {boolean} [onCameras] a key triggers it only while no control has the focus: Enter on a button presses the button
  */
+/** @type {[string, Action][]} */
+const BY_NUMBER = Array.from({ length: 9 }, (_, i) => [`camera_${i + 1}`, { description: `select camera ${i + 1}`, run: () => selectNumber(i + 1) }]);
+
 /** @type {Record<string, Action>} */
 export const ACTIONS = {
-  camera_left: { description: "Drive view: select the left camera", run: () => selectRole("left"), onCameras: true },
-  camera_front: { description: "Drive view: select the front camera", run: () => selectRole("front"), onCameras: true },
-  camera_right: { description: "Drive view: select the right camera", run: () => selectRole("right"), onCameras: true },
-  camera_rear: { description: "Drive view: select the rear camera", run: () => selectRole("rear"), onCameras: true },
-  reverse: { description: "Drive view: the rear camera large, in the front camera's place, and back", run: reverse },
+  camera_left: { description: "select the left camera", run: () => selectRole("left"), onCameras: true },
+  camera_front: { description: "select the front camera", run: () => selectRole("front"), onCameras: true },
+  camera_right: { description: "select the right camera", run: () => selectRole("right"), onCameras: true },
+  camera_rear: { description: "select the rear camera", run: () => selectRole("rear"), onCameras: true },
+  ...Object.fromEntries(BY_NUMBER),
+  reverse: { description: "Drive view: swap the rear and front cameras; press again to undo", run: reverse },
   enlarge: { description: "enlarge the selected camera (double click); in the Drive view it changes places with the front camera", run: enlargeSelected, onCameras: true },
   back: { description: "back from the enlarged picture", run: () => store.enlarged && enlarge(null) },
   mode_single: { description: "mode Single", run: () => selectMode("single") },
@@ -42,7 +46,7 @@ export const ACTIONS = {
   straighten: { description: "straighten the picture of the selected fisheye, or show the original", run: () => toggleStraight() },
   drawer: { description: "Drive view: open or close the drawer", run: toggleDrawer },
   map: { description: "the map; in the Drive view opens or closes the drawer with it", run: () => toggleTab("map") },
-  sound: { description: "Drive view: tones for lost, frozen and late pictures, or none", run: toggleSound },
+  sound: { description: "Drive view: alarm tones on or off", run: toggleSound },
   full_screen: { description: "full screen", run: toggleFullScreen },
   monitors: { description: "pictures in additional windows, for other monitors", run: listMonitors },
   switch: { description: "switch the selected camera on or off", run: () => store.selected && switchCamera(store.selected) },
@@ -82,7 +86,7 @@ export function selectNumber(number) {
 
 /** @param {"left"|"front"|"right"|"rear"} role */
 function selectRole(role) {
-  if (store.view === "drive") selectCamera(rolesOf(store.hello?.cameras ?? [])[role]?.name);
+  selectCamera(rolesOf(store.hello?.cameras ?? [])[role]?.name);
 }
 
 /** Switch between driving forwards and backwards. */

@@ -1,7 +1,7 @@
 /** The keyboard, and the dialog that lists its keys and the buttons of gamepads. */
 
 import { listen, publish, store } from "./store.js";
-import { ACTIONS, selectNumber } from "./actions.js";
+import { ACTIONS } from "./actions.js";
 import { labelOf } from "./hints.js";
 import { selectMode } from "./header.js";
 import { actionOf, keyOf } from "./presses.js";
@@ -9,9 +9,10 @@ import { byId, make } from "./format.js";
 
 const MODES = { s: "single", a: "automatic", c: "collective" };
 const CHORD_MS = 2500;
+const NUMBERED = /^camera_\d$/; // actions that select a camera by its number, listed in one row
+const ROLES = 4; // actions before them
 /** @type {[string, string, string][]} key, button, action */
 const FIXED = [
-  ["1 … 9", "", "select a camera"],
   ["m, then s, a or c", "", "mode Single, Automatic, Collective"],
   ["drag on a picture", "", "choose the ROI (mode S)"],
   ["wheel or pinch on a picture", "", "zoom the ROI (mode S); drag with the middle button or two fingers to move it"],
@@ -63,7 +64,6 @@ function onClick({ detail, target }) {
 }
 
 function onFixedKey(key) {
-  if (/^[1-9]$/.test(key)) return selectNumber(+key);
   if (key !== "m") return;
   chordAt = performance.now();
   publish("toast", { text: "mode: s Single, a Automatic, c Collective", level: "hint" });
@@ -72,8 +72,11 @@ function onFixedKey(key) {
 /** Two tables beside each other, so that the list fits on small screens. */
 function keyTables() {
   const buttons = store.hello?.inputs.buttons ?? {};
-  /** @type {[string, string, string][]} */
-  const rows = Object.entries(ACTIONS).map(([name, { description }]) => [labelOf(keys()[name]), `${buttons[name] ?? ""}`, description]);
+  /** @type {(names: string[], description: string) => [string, string, string]} */
+  const cells = (names, description) => [names.map((name) => labelOf(keys()[name])).join(" "), names.map((name) => buttons[name] ?? "").join(" ").trim(), description];
+  const numbered = Object.keys(ACTIONS).filter((name) => NUMBERED.test(name));
+  const rows = Object.entries(ACTIONS).filter(([name]) => !NUMBERED.test(name)).map(([name, { description }]) => cells([name], description));
+  rows.splice(ROLES, 0, cells(numbered.slice(0, store.hello?.cameras.length), "select a camera by its number"));
   /** @param {[string, string, string]} cells */
   const row = ([key, button, description]) => make("tr", {}, make("th", { scope: "row" }, key), make("td", {}, button), make("td", {}, description));
   const heads = () => ["Key", "Button", "Action"].map((head) => make("th", { scope: "col" }, head));

@@ -90,7 +90,7 @@ export function toggleSound() {
 function refresh() {
   const isBlocked = context?.state !== "running";
   const words = isMuted() ? "✕ Muted" : isBlocked ? "✕ Sound blocked" : "Sound on";
-  const title = isMuted() || !isBlocked ? withKey("tones for lost, frozen and late pictures, or none", "sound") : "the browser blocks sound until a click or key press";
+  const title = isMuted() || !isBlocked ? withKey("alarm tones on or off", "sound") : "the browser blocks sound until a click or key press";
   for (const button of buttons) {
     setText(button, words);
     setAttribute(button, "data-level", isMuted() || isBlocked ? "near" : "fine");
