@@ -1,9 +1,1 @@
-"""Declarative multi-camera streaming for teleoperated vehicles.
-
-Two lines run through this package:
-
-    conf/*.yaml -> config -> model -> graph -> Plan ------------> apply -> running pipelines
-    event -> state -> rules (allocation, scaling) -> Decision -> commands -> apply
-
-Everything left of `apply` is pure: no clock, no log, no GStreamer.
-"""
+"""Declarative multi-camera streaming for teleoperated vehicles; ARCHITECTURE.md shows how its parts fit together."""

@@ -1,5 +1,6 @@
-"""Public: a streaming vehicle, for programs, see docs/sources.md."""
+"""Public: a streaming vehicle and an operator's side, for programs, see docs/sources.md and docs/operator.md."""
 
+from runner.operator.live import LiveOperator, live_operator
 from runner.vehicle.live import LiveVehicle, live_vehicle
 
-__all__ = ["LiveVehicle", "live_vehicle"]
+__all__ = ["LiveOperator", "LiveVehicle", "live_operator", "live_vehicle"]

@@ -89,12 +89,13 @@ def test_the_package_is_well_typed(tmp_path: Path) -> None:
 
 def test_the_documented_names_exist() -> None:
     from runner.frames import Frame, live_frames
-    from runner.live import LiveVehicle, live_vehicle
+    from runner.live import LiveOperator, LiveVehicle, live_operator, live_vehicle
     from runner.model import Camera, Kbps, Mode, RateQualityModel, Roi, Vehicle
     from runner.rules import Draft, Memory, Step, rule
     from runner.state import State
 
     named = (CHECKOUT / "docs" / "api.md").read_text()
-    for name in (Frame, live_frames, LiveVehicle, live_vehicle, Camera, Mode, RateQualityModel, Roi, Vehicle, Draft):
+    sides = (LiveOperator, LiveVehicle, live_operator, live_vehicle)
+    for name in (Frame, live_frames, *sides, Camera, Mode, RateQualityModel, Roi, Vehicle, Draft):
         assert name.__name__ in named
     assert all((rule, State, Kbps, Memory, Step))

@@ -60,9 +60,6 @@ class Layouts:
         saved = self._vehicles.get(vehicle.name)
         return own_places(vehicle) if saved is None else {name: saved.get(name) for name in vehicle.cameras}
 
-    def is_saved(self, vehicle: Vehicle) -> bool:
-        return vehicle.name in self._vehicles
-
     def notes(self, vehicle: Vehicle) -> Iterator[str]:
         """Notes about saved places of a vehicle that have no effect."""
         for name in self._vehicles.get(vehicle.name, {}):

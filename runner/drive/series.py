@@ -40,7 +40,7 @@ T = TypeVar("T")
 
 RATE_WINDOW_S = 1.0  # rates of sent video are measured over at least this long, as the operator's are
 SET_S = 1.0  # a clock that was set by less is not recognised: samples follow their arrivals by a third of a second
-DOWN_DEG = 20.0  # a camera pitched further down looks at the surroundings, not along the road
+DOWN_DEG = 25.0  # a camera pitched down by this much is a top view, as on the operator's page
 PANEL_CAMERAS = 4  # number of curves distinguishable in one panel; more are split if the mounting gives no groups
 
 
@@ -533,7 +533,7 @@ def panels(cameras: Mapping[str, Any]) -> tuple[Panel, ...]:
     On the paper's vehicle these are the front- and rear-mounted ones and the top views, as in its figures. If pitch
     makes no difference, up to four cameras share one panel; more are split in half, in the order of their tiles.
     """
-    down = [name for name, camera in cameras.items() if (camera.get("pose") or {}).get("pitch_deg", 0) > DOWN_DEG]
+    down = [name for name, camera in cameras.items() if (camera.get("pose") or {}).get("pitch_deg", 0) >= DOWN_DEG]
     along = [name for name in cameras if name not in down]
     if down and along:
         return _panel(along), _panel(down)
