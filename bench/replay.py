@@ -43,7 +43,8 @@ def drive(count: int) -> Iterator[dict[str, Any]]:
         elif index % 4 == 2:
             yield {"t": t, "event": "position_reported", "lat": 48.26, "lon": 11.66, "speed_mps": 8.3}
         else:
-            yield {"t": t, "event": "link_measured", "camera": "front_left", "kbps": 780, "loss": 0.01}
+            link = {"kbps": 3200 + index % 7, "queue_ms": 3, "loss": 0, "state": "clear", "rtt_ms": 31}
+            yield {"t": t, "event": "link_measured", **link}
 
 
 def seconds(modes: str, events: Path) -> float:

@@ -84,7 +84,7 @@ def main() -> None:
         words = [EXPERIMENT, "~experiment.runs", *cases[name], *options.words]
         quality = options.quality and not name.endswith(TCP_ALONE)
         drives, found = zip(*(_drive(path, words, quality) for path in paths), strict=True)
-        void = median(one["busy"] for one in found) > DROPPED
+        void = max(one["busy"] for one in found) > DROPPED
         label = f"{name} (void)" if void else name
         print(row(label, *(shown(key, [one[key] for one in found]) for key in FIGURES)), flush=True)
         charted[name] = drives[0]

@@ -290,3 +290,14 @@ def test_a_directory_without_a_drive_is_reported(tmp_path: Path) -> None:
         with pytest.raises(UserError) as error:
             read_drive(path)
         assert str(error.value) == f"{path}: {rule}"
+
+
+def test_two_processes_do_not_take_one_drive(tmp_path: Path) -> None:
+    """The second used to remove the file of the first, which then logged into nothing."""
+    first = Log(tmp_path, "vehicle", {}, {}, print)
+    with pytest.raises(UserError, match=r"another process is about to write drive\.jsonl"):
+        Log(tmp_path, "vehicle", {}, {}, print)
+    first.begin()
+    first.note("still here")
+    first.close()
+    assert "still here" in (tmp_path / "drive.jsonl").read_text()

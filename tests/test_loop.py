@@ -21,7 +21,7 @@ from runner.core.roles import SETTINGS, Role, denial
 from runner.core.step import step
 from runner.drive.log import Log
 from runner.plans import compile_plans
-from runner.records import Outcome, ReceptionReport, SteeringAngle, Telemetry, VehicleState
+from runner.records import Outcome, ReceptionReport, SpeedAdvice, SteeringAngle, Telemetry, VehicleState
 from runner.security import keyring
 from runner.security.keyring import Person
 from runner.system.reports import MOST
@@ -280,8 +280,9 @@ def test_attention_of_the_operator_in_control_is_published_until_control_passes(
         states("other", attention="hidden")
         states("driver", attention="slow")
         until(lambda: attention() == "slow")
-        states("driver")
-        until(lambda: attention() is UNSET)
+        began = time.monotonic()
+        until(lambda: (states("driver"), attention() is UNSET)[1])
+        assert time.monotonic() - began >= SILENT_S / 3, "another process of the same operator has no page"
         states("driver", attention="hidden")
         until(lambda: attention() == "hidden")
         watched.loop.take(Request("driver", {"event": "operator_disconnected"}))
@@ -371,3 +372,37 @@ def test_reports_of_a_revoked_operator_keep_nobody_present(tmp_path: Path, monke
             time.sleep(0.05)
         assert any(line.startswith("operator driver has been silent") for line in watched.reports)
         assert watched.loop.refused > refused
+
+
+def test_a_second_process_of_the_driver_neither_ends_control_nor_advises_a_speed() -> None:
+    """It may be a program on another machine, with the same keys and a better link."""
+    watched = Watched("latency.fixed_ms=0")
+
+    def report(run: int, latency_ms: float) -> None:
+        numbers = {"at": time.monotonic(), "as_of": watched.loop._now(), "packets": 0, "lost": 0}
+        watched.loop.take(QueuedReport("driver", ReceptionReport(units=(), latency_ms=latency_ms, run=run, **numbers)))
+
+    def says_goodbye(run: int | None, *, will: bool) -> Outcome:
+        outcomes: list[Outcome] = []
+        document = {"event": "operator_disconnected"}
+        watched.loop.take(Request("driver", document, outcomes.append, will=will, run=run))
+        until(lambda: outcomes)
+        return outcomes[0]
+
+    with watched.running():
+        watched.loop.take(Request("driver", {"event": "operator_connected"}))
+        until(lambda: "operator driver is present" in watched.reports)
+        for _ in range(20):
+            report(1, 400)
+            report(2, 20)
+            time.sleep(0.03)
+        assert {advice.speed_factor for advice in watched.of(SpeedAdvice) if advice.speed_factor} == {0.5}
+        for will in (False, True):
+            report(1, 400)
+            assert says_goodbye(2, will=will).reason == "another process of this operator goes on"
+        assert not [line for line in watched.reports if "disconnected" in line]
+        report(1, 400)
+        time.sleep(0.1)
+        assert says_goodbye(1, will=False).reason == "another process of this operator goes on"
+        time.sleep(1.1)
+        assert not says_goodbye(1, will=False).reason

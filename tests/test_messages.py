@@ -71,15 +71,18 @@ def test_an_id_that_its_reply_would_repeat_has_a_limited_length() -> None:
 @pytest.mark.parametrize(
     ("event", "rule"),
     [
-        ({"event": "bitrate_predicted", "kbps": 1e305}, "kbps: 1e+305: must be at most 1000000000"),
-        ({"event": "bitrate_predicted", "kbps": 1, "lower_kbps": 1e10}, "lower_kbps: 10000000000.0: must be at most "),
+        ({"event": "bitrate_predicted", "kbps": 1e305}, "kbps: 1e+305: must be at most 1e+09"),
+        ({"event": "bitrate_predicted", "kbps": 1, "lower_kbps": 1e10}, "lower_kbps: 1e+10: must be at most 1e+09"),
         ({"event": "bitrate_predicted", "kbps": 0, "valid_s": 1e300}, "valid_s: 1e+300: must be at most 3600"),
-        ({"event": "total_set", "kbps": 1e305}, "kbps: 1e+305: must be at most 1000000000"),
-        ({"event": "weights_set", "weights": {"front": 1e305}}, "weights.front: 1e+305: must be at most 1000000"),
+        ({"event": "total_set", "kbps": 10**300}, "kbps: 1e+300: must be at most 1e+09"),
+        ({"event": "weights_set", "weights": {"front": 1e305}}, "weights.front: 1e+305: must be at most 1e+06"),
+        ({"event": "bitrate_predicted", "kbps": 1e9, "valid_s": 3600}, None),
     ],
 )
-def test_numbers_that_no_operator_could_read_again_are_refused(event: dict[str, Any], rule: str) -> None:
-    assert (event_problem({"t": 0, **event}) or "").startswith(rule)
+def test_numbers_that_no_operator_could_read_again_are_refused(event: dict[str, Any], rule: str | None) -> None:
+    payload = json.dumps({"id": "1", "as_of": 0, **event}).encode()
+    assert read_request(MqttMessage("tod/car/request/alice", payload, False)).problem == rule
+    assert event_problem({"t": 0, **event}) is None, "older drives remain readable"
 
 
 def test_records_can_be_parsed_by_several_threads_at_first_use() -> None:

@@ -17,8 +17,9 @@ def test_a_correct_answer_opens_a_session_until_it_expires() -> None:
     challenge = login.challenge(0)
     session = login.open(challenge, answer(challenge), 1)
     assert session is not None
-    assert login.accepts(session, 1 + SESSION_S)
-    assert not login.accepts(session, 2 + SESSION_S)
+    assert login.accepts(session, 1 + SESSION_S), "used in time, it stays open"
+    assert login.accepts(session, 1 + 2 * SESSION_S)
+    assert not login.accepts(session, 2 + 3 * SESSION_S)
     assert not login.accepts(None, 1)
     assert not login.accepts("guessed", 1)
 

@@ -125,7 +125,8 @@ class Builder:
         self.built = set(built)
         recording = self.part(("recording",), _recording)
         page = PageSettings(**document["page"])
-        inputs = self.part(("inputs",), lambda data: Inputs(**data)) if "inputs" in document else None  # older drives
+        # Older drives have no inputs.
+        inputs = self.part(("inputs",), lambda data: Inputs(**_yielding(data))) if "inputs" in document else None
         known = document.get("dimensions") is not None
         dimensions = self.part(("dimensions",), lambda data: Dimensions(**data)) if known else None
         ros = _ros(document.get("ros", {}))  # older drives lack it
@@ -509,3 +510,11 @@ def _split(key: str) -> schema.Path:
     for piece in filter(None, key.replace("]", "").replace("[", ".#").split(".")):
         parts.append(int(piece[1:]) if piece[0] == "#" else piece)
     return tuple(parts)
+
+
+def _yielding(inputs: Mapping[str, Any]) -> dict[str, Any]:
+    """The inputs, where a digit that another action has selects no camera: configurations may predate `camera_1`."""
+    keys = inputs.get("keys") or {}
+    digits = {f"camera_{key}": key for key in map(str, range(1, 10))}
+    taken = {value for action, value in keys.items() if digits.get(action) != value}
+    return {**inputs, "keys": {it: None if digits.get(it) == key and key in taken else key for it, key in keys.items()}}

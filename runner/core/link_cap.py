@@ -243,11 +243,11 @@ def start_cap(cap: LinkCap, link: LinkMeasured | None, since: float | None, limi
     cap, kbps = replace(cap, connected=since), _short(limit * share)
     if link is not None or (cap.kbps is not None and cap.kbps <= kbps):
         return cap
-    return replace(_reset(cap), kbps=kbps, provisional=True, idle=max(cap.idle, since))
+    return replace(_reset(cap), kbps=kbps, provisional=True, idle=max(cap.idle, since), replaced=cap.replaced)
 
 
 def _reset(cap: LinkCap) -> LinkCap:
-    """A new cap that keeps only the places where limits proved too high, and when the link was last measured."""
+    """A new cap that keeps only the places where limits proved too high, and what it is about."""
     trust = Trust(places=cap.trust.places)
     return LinkCap(trust=trust, connected=cap.connected, measured=cap.measured, predicted=cap.predicted)
 

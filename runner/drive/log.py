@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import platform
@@ -282,12 +283,34 @@ def _create(directory: Path, side: str) -> int:
     """A new file of a drive, open for appending."""
     check_free(directory, side)
     try:
-        (directory / FILES[side]).unlink(missing_ok=True)
+        _remove_abandoned(directory / FILES[side])
         directory.mkdir(parents=True, exist_ok=True)
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC
-        return os.open(directory / FILES[side], flags, 0o666)
+        file = os.open(directory / FILES[side], flags, 0o666)
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until it is closed, also by the end of this process
+        return file
+    except BlockingIOError:
+        raise _refused(
+            directory, f"another process is about to write {FILES[side]}, choose another directory"
+        ) from None
     except OSError as error:
         raise _refused(directory, (error.strerror or str(error)).lower()) from None
+
+
+def _remove_abandoned(path: Path) -> None:
+    """Remove the empty file of a process that ended before its drive began.
+
+    raises  BlockingIOError if that process still runs
+    """
+    try:
+        file = os.open(path, os.O_WRONLY | os.O_CLOEXEC)
+    except FileNotFoundError:
+        return
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        path.unlink()
+    finally:
+        os.close(file)
 
 
 def _refused(directory: Path, rule: str) -> UserError:

@@ -58,7 +58,7 @@ class _Client(Client):
 class ControlLink:
     """One side's connection to the broker, kept alive until it is closed. Callbacks run in the link's own thread.
 
-    will          topic and message that the broker publishes when this side disappears
+    will          topic and message that the broker publishes when this side disappears; None: it publishes none
     listen        by topic filter, the callback for its messages
     on_connected  called with True once this side receives its messages, with False when the connection is lost
     on_report     called with one line when the broker is unreachable, once per reason, and when it is back
@@ -70,7 +70,7 @@ class ControlLink:
     def __init__(
         self,
         broker: Endpoint,
-        will: tuple[str, JsonObject],
+        will: tuple[str, JsonObject] | None,
         listen: Mapping[str, Callable[[MqttMessage], None]],
         on_connected: Callable[[bool], None],
         on_report: Callable[[str], None],
@@ -161,8 +161,9 @@ class ControlLink:
         client.on_broken = self._on_broken
         client.connect_timeout = CONNECT_S
         client.reconnect_delay_set(*RETRY_S)  # type: ignore[arg-type]  # s; fractions work
-        topic, message = self._will
-        client.will_set(topic, json.dumps(message), qos=1, retain=_is_retained(topic))
+        if self._will:
+            topic, message = self._will
+            client.will_set(topic, json.dumps(message), qos=1, retain=_is_retained(topic))
         client.on_socket_open = _configure_socket
         if self._login:
             client.tls_set_context(self._login.context)

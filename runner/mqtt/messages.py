@@ -35,7 +35,7 @@ from runner.records import (
     VehicleState,
     from_json,
 )
-from runner.schema import message_problem, read_json
+from runner.schema import message_problem, read_json, shortened
 
 OFFLINE = {"online": False}
 OPERATOR_GONE = {"id": "will", "event": "operator_disconnected"}  # by the broker, when the connection has broken
@@ -43,6 +43,8 @@ SIGNED_OFF = {**OPERATOR_GONE, "id": "signed off"}  # by the operator itself
 OPERATOR = re.compile(r"[A-Za-z0-9_-]{1,64}")  # shown to operators and logged
 _SURROGATE = re.compile(rb"\\u[dD]")  # perhaps half of a pair
 OPERATOR_RULE = "topic: an operator's id must be 1 to 64 letters, digits, _ and -"
+LARGEST = {"kbps": 1e9, "lower_kbps": 1e9, "valid_s": 3600.0}  # a larger number could not be read back by operators ...
+LARGEST_WEIGHT = 1e6  # ... or would outlast its sender
 MAX_ID = 128  # characters of a request's id, which its reply repeats
 MAX_REQUEST_BYTES = 65_536  # the longest event is a hundredth of it
 MAX_OFFLINE_BYTES = 64  # a longer state is of a vehicle that is online
@@ -53,6 +55,22 @@ SLACK_S = 0.5  # extra time for the answer to a request that was executed at the
 MAX_ROUND_TRIP_S = 0.5  # allowed for an old request; a longer round trip is too long for driving
 
 JsonObject = Mapping[str, Any]
+
+
+def of_run(goodbye: JsonObject, run: int) -> JsonObject:
+    """A will, or signing off, of one process: another one with the same keys goes on."""
+    return {**goodbye, "id": f"{goodbye['id']} {run}"}
+
+
+def is_will(identity: str) -> bool:
+    """Whether the broker sent a goodbye, by its id."""
+    return identity.partition(" ")[0] == OPERATOR_GONE["id"]
+
+
+def run_of(identity: str) -> int | None:
+    """The process that a goodbye is of, by its id; None: not stated."""
+    run = identity.rpartition(" ")[2]
+    return int(run) if run.isdecimal() and run.isascii() else None
 
 
 def topic(vehicle: str, *parts: str) -> str:
@@ -182,7 +200,7 @@ def read_request(message: MqttMessage) -> ParsedRequest:
     identity, as_of = document.pop("id", None), document.pop("as_of", None)
     if not isinstance(identity, str) or not 0 < len(identity) <= MAX_ID:
         return ParsedRequest(document, problem=f"id: must be given, as text of 1 to {MAX_ID} characters")
-    problem: str | None = None
+    problem = _too_large(document)
     if message.retained:
         problem = "must not be retained: a request is for now"
     elif "t" in document:
@@ -192,3 +210,14 @@ def read_request(message: MqttMessage) -> ParsedRequest:
     elif isinstance(as_of, bool) or not isinstance(as_of, int | float) or not math.isfinite(as_of):
         problem = "as_of: must be given: the vehicle's t in the newest telemetry, plus the time since, s"
     return ParsedRequest(document, identity, None if problem else float(as_of), problem)
+
+
+def _too_large(document: JsonObject) -> str | None:
+    """Which number of a request is too large; None: none is. Logged events, and the vehicle's own, are not bounded."""
+    bounds = [(key, document.get(key), most) for key, most in LARGEST.items()]
+    if isinstance(weights := document.get("weights"), dict):
+        bounds += [(f"weights.{name}", weight, LARGEST_WEIGHT) for name, weight in weights.items()]
+    for key, value, most in bounds:
+        if isinstance(value, int | float) and value > most:
+            return f"{shortened(key)}: {value:g}: must be at most {most:g}"
+    return None

@@ -24,6 +24,7 @@ from runner.mqtt.messages import (
     MqttMessage,
     answer_s,
     is_online,
+    of_run,
     read_clock,
     read_reply,
     read_settings,
@@ -149,9 +150,8 @@ class Station:
         }
         self._requests = topic(vehicle.name, "request", self.identity)
         self._receptions = topic(vehicle.name, "reception", self.identity)
-        self._link = ControlLink(
-            vehicle.control, (self._requests, OPERATOR_GONE), listen, self._on_connected, self.note, login
-        )
+        will = (self._requests, of_run(OPERATOR_GONE, self._run))
+        self._link = ControlLink(vehicle.control, will, listen, self._on_connected, self.note, login)
 
     def connect(self) -> None:
         """Connect to the broker, and stay connected; returns immediately."""
@@ -159,7 +159,7 @@ class Station:
 
     def close(self) -> None:
         self.state = None  # so that signing off is not reported as a loss
-        self._link.close((self._requests, SIGNED_OFF))
+        self._link.close((self._requests, of_run(SIGNED_OFF, self._run)))
 
     def ask(self, event: JsonObject, on_reply: OnReply | None = None) -> None:
         """Send a request to the vehicle.
@@ -227,7 +227,8 @@ class Station:
 
         A camera whose source is being replaced sends nothing, but keeps its session.
         """
-        cameras = self.state.cameras if self.state else {}
+        state = self.state  # another thread may replace it
+        cameras = state.cameras if state else {}
         return {name: camera.sending and not camera.fault for name, camera in cameras.items()}
 
     def take(self, samples: Mapping[str, StreamCounters]) -> None:
@@ -374,7 +375,8 @@ class Station:
         )
 
     def _camera(self, name: str) -> CameraState | None:
-        return self.state.cameras.get(name) if self.state else None
+        state = self.state
+        return state.cameras.get(name) if state else None
 
     def _on_any_state(self, message: MqttMessage) -> None:
         """The state of any vehicle at the broker; of other vehicles only the name is used."""

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from runner.security.keyring import derived
 
 CHALLENGE_S = 60.0  # until an unanswered challenge expires
-SESSION_S = 43_200.0  # twelve hours; then the browser must log in again
+SESSION_S = 43_200.0  # twelve hours after its last use; an open page uses it
 MAX_SESSIONS = 100
 COOKIE = "tod_session"
 
@@ -53,11 +53,14 @@ class PageLogin:
         return _open(self._sessions, now)
 
     def accepts(self, session: str | None, now: float) -> bool:
-        """Whether a session is open."""
+        """Whether a session is open; it then stays open."""
         if self._session_token != (token := self._token()):
             self._session_token = token
             self._sessions.clear()
-        return session is not None and self._sessions.get(session, -1.0) >= now
+        if session is None or self._sessions.get(session, -1.0) < now:
+            return False
+        self._sessions[session] = now + SESSION_S  # it must not end while somebody drives
+        return True
 
 
 def _open(sessions: dict[str, float], now: float) -> str:

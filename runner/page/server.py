@@ -31,7 +31,7 @@ from runner.operator.station import Listener, Station
 from runner.page.control import Control, combined_attention, page_of
 from runner.page.counter import CounterReading, counter_reading
 from runner.page.history import History
-from runner.page.login import COOKIE, SESSION_S, PageLogin
+from runner.page.login import COOKIE, PageLogin
 from runner.page.tls import PageTls
 from runner.page.viewer import PageViewer
 from runner.records import Note, Outcome, Sample, VehicleState, state_to_json, to_json
@@ -217,19 +217,23 @@ class PageServer(Listener):
     def _expire(self, connection: RequestHandler) -> None:
         if connection in self._awaiting_request:
             self._awaiting_request.remove(connection)
-            connection.force_close()
+            if connection.transport:
+                connection.transport.abort()
 
     def _limit_strangers(self) -> None:
         """Make room for a new connection: without a limit, strangers would take all of the process's descriptors."""
         shaken = self._loop.time() - REQUEST_S  # handshakes that began before have ended
-        self._strangers = {it: came for it, came in self._strangers.items() if it.transport or came > shaken}
+        # `_manager` is private: aiohttp clears it once a connection is closed.
+        pending = {it for it, came in self._strangers.items() if came > shaken and it._manager is not None}
+        self._strangers = {it: came for it, came in self._strangers.items() if it.transport or it in pending}
         if len(self._strangers) < MAX_STRANGERS:
             return
         oldest = next((it for it in self._strangers if it.transport), None)
         if oldest is None:
             raise ConnectionRefusedError("too many connections")
         del self._strangers[oldest]
-        oldest.force_close()
+        assert oldest.transport
+        oldest.transport.abort()  # a close would wait for the peer's answer
 
     async def _close(self) -> None:
         self._server.close()
@@ -317,7 +321,7 @@ class PageServer(Listener):
             self._report_refusal(request, "wrong token")
             raise web.HTTPForbidden(text="wrong token\n")
         response = web.Response(text="logged in\n")
-        response.set_cookie(COOKIE, session, max_age=int(SESSION_S), secure=True, httponly=True, samesite="Strict")
+        response.set_cookie(COOKIE, session, secure=True, httponly=True, samesite="Strict")
         return response
 
     def _add_sample(self, sample: Sample) -> None:

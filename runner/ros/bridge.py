@@ -66,7 +66,8 @@ class Bridge:
             topic(vehicle.name, "telemetry"): self._on_telemetry,
             topic(vehicle.name, "reply", self.identity): self._on_reply,
         }
-        will = (self._requests, OPERATOR_GONE)
+        # With keys an operator's side may have the same name; after a crash its silence shows that it is gone.
+        will = None if self._has_keys else (self._requests, OPERATOR_GONE)
         self._link = ControlLink(vehicle.control, will, listen, lambda here: None, on_report, login)
         inputs = {REQUEST: "text", **{name: operator_input.kind for name, operator_input in self._topics.items()}}
         if not self._reports:

@@ -31,6 +31,7 @@ class Request(NamedTuple):
     sender  operator's id from the topic; "" for this process
     as_of   see `runner.vehicle.operators`; None for this process, which need not state it
     will    whether the broker sent it as the last will of an operator
+    run     the process whose goodbye it is; None: not stated
     """
 
     sender: str
@@ -38,6 +39,7 @@ class Request(NamedTuple):
     answer: Answer | None = None
     as_of: float | None = None
     will: bool = False
+    run: int | None = None
 
     @property
     def queue(self) -> str:

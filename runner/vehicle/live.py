@@ -30,13 +30,14 @@ from runner.mqtt.link import ControlLink
 from runner.mqtt.login import Login
 from runner.mqtt.messages import (
     OFFLINE,
-    OPERATOR_GONE,
     MqttMessage,
+    is_will,
     read_reception,
     read_request,
     read_settings,
     read_state,
     read_telemetry,
+    run_of,
     topic,
 )
 from runner.plans import compile_plans, render_missing
@@ -258,8 +259,8 @@ class _VehicleControl:
         def answer(outcome: Outcome) -> None:
             self._link.publish(reply, {"id": parsed.identity, **to_json(outcome)})
 
-        will = parsed.identity == OPERATOR_GONE["id"]
-        request = Request(message.sender, parsed.document, answer, parsed.as_of, will)
+        will, run = is_will(parsed.identity), run_of(parsed.identity)
+        request = Request(message.sender, parsed.document, answer, parsed.as_of, will, run)
         if parsed.problem:
             self._live.loop.refuse(request, parsed.problem)
         else:

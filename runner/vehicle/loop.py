@@ -48,7 +48,7 @@ from runner.system.reports import LimitedReports
 from runner.vehicle.access import Access
 from runner.vehicle.inbox import MAX_QUEUED, Answer, Inbox, Item, QueuedReport, Request
 from runner.vehicle.operators import SILENT_S, Operators
-from runner.vehicle.uplink import MeasuredUplink
+from runner.vehicle.uplink import PRESENT_S, MeasuredUplink
 
 if TYPE_CHECKING:
     from runner.pqos.track import Track
@@ -131,6 +131,8 @@ class ControlLoop:
     _reported: dict[str, float] = field(default_factory=dict)  # by fault, time of its last report
     _clock_stated: dict[str, float] = field(default_factory=dict)  # by operator, time of the last answer
     _latency: tuple[float, float | None] = (-ADVICE_S, None)  # time of the last reported latency, and its value, ms
+    _runs: dict[tuple[str, int], float] = field(default_factory=dict)  # by operator and process, the last report
+    _attention_stated: tuple[str, float] = ("", 0.0)  # by whom and when
     _key_frames: dict[str, float] = field(default_factory=dict)  # by camera, time of the last request for one
     _steering_published: float = -STEERING_S  # when the steering angle was last published
     _refusals: dict[str, int] = field(default_factory=dict)  # by sender, since the last tick
@@ -177,10 +179,10 @@ class ControlLoop:
         self._refusals[sender] = self._refusals.get(sender, 0) + 1
 
     def refuse(self, request: Request, problem: str) -> None:
-        """Refuse a request, from any thread; answers between two ticks are limited."""
+        """Refuse a request, from any thread; answers to one sender between two ticks are limited."""
         self.refused += 1
         answers = self._refusals[request.sender] = self._refusals.get(request.sender, 0) + 1
-        if request.answer and answers <= REFUSALS:
+        if request.answer and (not request.sender or answers <= REFUSALS):
             request.answer(Outcome(self._now(), "refused", problem))
 
     def wake(self) -> None:
@@ -282,6 +284,9 @@ class ControlLoop:
         stamped = {**request.document, "t": t}
         problem = event_problem(stamped)
         event = None if problem else parse(stamped)
+        if isinstance(event, OperatorDisconnected) and self._goes_on(request, t):
+            self._answer(request.answer, Outcome(t, "applied", "another process of this operator goes on"))
+            return
         self._update_presence(request.sender, t, event, signed_off=not request.will)
         if event is None:
             assert problem
@@ -305,18 +310,29 @@ class ControlLoop:
         if item.sender not in self._operators.present:
             return
         self._state_clock(item, t)
+        if item.report.run is not UNSET:
+            self._runs = {key: at for key, at in self._runs.items() if t - at < PRESENT_S} | {
+                (item.sender, item.report.run): t
+            }
         reported = ReceptionReported(t, item.sender, item.sender == self._operators.in_control, item.report)
+        self.log.record(reported)
+        link = self._uplink.take(reported)
+        if self._uplink.has_rival:
+            self._report_once(f"{item.sender}: two processes of this operator send reception reports; one is ignored")
+            return
         if reported.in_control:
             latency_ms = item.report.latency_ms
             overdue_s = self._operators.overdue_s(item.sender, t, item.report.as_of)
             self._latency = (t - overdue_s, None if latency_ms is UNSET else latency_ms)
-        self.log.record(reported)
-        if link := self._uplink.take(reported):
+        if link:
             self._take(link)
-        if self._uplink.has_rival:
-            self._report_once(f"{item.sender}: two processes of this operator send reception reports; one is ignored")
         if reported.in_control and item.report.damaged is not UNSET:
             self._repair(item.report.damaged, t)
+
+    def _goes_on(self, goodbye: Request, t: float) -> bool:
+        """Whether another process of the operator that says goodbye still sends reports."""
+        others = [at for (name, run), at in self._runs.items() if name == goodbye.sender and run != goodbye.run]
+        return goodbye.run is not None and any(t - at < PRESENT_S for at in others)
 
     def _repair(self, damaged: Iterable[str], t: float) -> None:
         """Send key frames of cameras with unrecovered packet loss; a camera that is not sent needs none."""
@@ -362,7 +378,15 @@ class ControlLoop:
             self._update_attention(sender, event.attention, t)
 
     def _update_attention(self, operator: str, attention: Attention | None, t: float) -> None:
-        """Pass on the driver's attention as stated by the operator in control."""
+        """Pass on the driver's attention as stated by the operator in control.
+
+        A heartbeat without it, such as of a ROS interface with the same keys, leaves what a page stated just before.
+        """
+        stated_by, at = self._attention_stated
+        if attention is None and stated_by == operator and t - at < SILENT_S:
+            return
+        if attention is not None:
+            self._attention_stated = (operator, t)
         if attention is not self._run.state.attention:
             self._take(AttentionChanged(t=t, attention=attention))
             self.on_report(f"operator {operator} is {attention or 'no longer stating its attention'}")
@@ -412,6 +436,7 @@ class ControlLoop:
             self.applier.turn(after.commands)
         except Exception:
             self._run = replace(after, commanded=before.commanded)  # the next event repeats the commands
+            log_run(self.log, event, before, after)  # decided all the same, as a replay will decide
             raise
         log_run(self.log, event, before, after)
         if isinstance(event, PositionReported):

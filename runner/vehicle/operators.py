@@ -89,6 +89,7 @@ class Operators:
         was_present = operator is not None and operator.present
         if operator:
             operator.present, operator.signed_off = False, signed_off
+            operator.announced = operator.announced and not signed_off  # a report may be queued behind it
         self._pass_control(t)
         return was_present
 

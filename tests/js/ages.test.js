@@ -26,6 +26,12 @@ test("an age within the clock error is shown as 0, not as negative", () => {
   assert.equal(ageOf([picture(10, 5, 6, 7, 8)]).age_ms, 0);
 });
 
+test("an age that no clock error explains is unknown: a clock was set", () => {
+  const early = (by) => [picture(1000 + by, 1000, 1000, 1000, 1000)];
+  assert.equal(ageOf(early(14), 10).age_ms, 0);
+  assert.equal(ageOf(early(16), 10).age_ms, null);
+});
+
 test("with an unknown capture time the parts on the page remain", () => {
   assert.deepEqual(ageOf([picture(NaN, 10, 12, 15, 20)]), { age_ms: null, parts_ms: { page: 2, decode: 3, draw: 5 } });
 });

@@ -3,21 +3,25 @@
 import { MOVING } from "./status.js";
 
 const RECENT_MS = 500; // of pictures drawn, for a median
+const SLACK_MS = 5; // beyond the error bound
 const NEAR = 0.75; // of the limit
 
 /** @typedef {[captured: number, arrived: number, received: number, decoded: number, drawn: number]} Times */
 
 /**
  * The median age of the pictures drawn in the last half second, and of its parts on this page: from the station to the
- * page, through the decoder, and until drawn. null: unknown.
+ * page, through the decoder, and until drawn. null: unknown, also if it would be negative by more than the error bound: a
+ * clock has been set, and its difference is not known again yet.
  * @param {Times[]} pictures
+ * @param {number} [bound_ms]
  */
-export function ageOf(pictures) {
+export function ageOf(pictures, bound_ms = Infinity) {
   const newest = pictures.at(-1)?.[4] ?? 0;
-  const last = pictures.slice(pictures.findLastIndex(([, , , , drawn]) => newest - drawn > RECENT_MS) + 1);
+  const last = pictures.slice(pictures.findLastIndex(([, , , , drawn]) => Math.abs(newest - drawn) > RECENT_MS) + 1);
   const age_ms = Number.isFinite(last.at(-1)?.[0]) ? median(last.map(([captured, , , , drawn]) => drawn - captured)) : null;
   const part = (from, to) => median(last.map((times) => times[to] - times[from]));
-  return { age_ms: age_ms === null ? null : Math.max(0, age_ms), parts_ms: { page: part(1, 2), decode: part(2, 3), draw: part(3, 4) } };
+  const isKnown = age_ms !== null && age_ms >= -bound_ms - SLACK_MS;
+  return { age_ms: isKnown ? Math.max(0, age_ms ?? 0) : null, parts_ms: { page: part(1, 2), decode: part(2, 3), draw: part(3, 4) } };
 }
 
 /**

@@ -171,6 +171,7 @@ export class GroundView {
     const laid = groundPlacement(display, dimensions);
     if (!why) drawDistances(context, dimensions, laid, size);
     if (!why && rad !== null) drawPaths(context, pathGuides(dimensions, rad), laid);
+    if (why) coverWith(context, display); // the last picture, which would look like the present one
     drawVehicle(context, dimensions, laid);
     if (why) return drawLabel(context, display.width / 2, display.height / 4, size, `No bird's-eye view: ${why}`, RED, "#fff", display.width);
     drawScale(context, display, laid, size);
@@ -295,4 +296,10 @@ function drawLabel(context, x, y, size, label, back, fore, width) {
 function boxOf({ rear, front, right, left }, laid) {
   const [a, b] = [toBox({ x: front, y: left }, laid), toBox({ x: rear, y: right }, laid)];
   return { x: a.x, y: a.y, width: b.x - a.x, height: b.y - a.y };
+}
+
+/** Cover a canvas. @param {OffscreenCanvasRenderingContext2D} context  @param {{width: number, height: number}} display */
+function coverWith(context, { width, height }) {
+  context.fillStyle = "#000";
+  context.fillRect(0, 0, width, height);
 }

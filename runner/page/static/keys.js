@@ -73,10 +73,10 @@ function onFixedKey(key) {
 function keyTables() {
   const buttons = store.hello?.inputs.buttons ?? {};
   /** @type {(names: string[], description: string) => [string, string, string]} */
-  const cells = (names, description) => [names.map((name) => labelOf(keys()[name])).join(" "), names.map((name) => buttons[name] ?? "").join(" ").trim(), description];
+  const cells = (names, description) => [names.map((name) => labelOf(keys()[name])).join(" ").trim(), names.map((name) => buttons[name] ?? "").join(" ").trim(), description];
   const numbered = Object.keys(ACTIONS).filter((name) => NUMBERED.test(name));
   const rows = Object.entries(ACTIONS).filter(([name]) => !NUMBERED.test(name)).map(([name, { description }]) => cells([name], description));
-  rows.splice(ROLES, 0, cells(numbered.slice(0, store.hello?.cameras.length), "select a camera by its number"));
+  rows.splice(ROLES, 0, cells(numbered.slice(0, store.view === "monitor" ? undefined : store.hello?.cameras.length), "select a camera by its number"));
   /** @param {[string, string, string]} cells */
   const row = ([key, button, description]) => make("tr", {}, make("th", { scope: "row" }, key), make("td", {}, button), make("td", {}, description));
   const heads = () => ["Key", "Button", "Action"].map((head) => make("th", { scope: "col" }, head));

@@ -35,7 +35,7 @@ const handlers = {
     publish("ages", ages);
   },
   asked: () => worker.postMessage({ order: "ready" }),
-  login: () => location.assign(`/login${location.search}`),
+  login: () => location.assign(`/login${location.search}${location.hash}`),
   crooked: (message) => publish("crooked", message),
   sent: ({ id, sent }) => sent || publish("unsent", id),
   answer({ id, value }) {

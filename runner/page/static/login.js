@@ -22,7 +22,7 @@ async function logIn() {
   const { challenge } = await response.json();
   const answer = await answerTo(field.value.trim(), challenge);
   const result = await fetch("/login", { method: "POST", body: JSON.stringify({ challenge, answer }) });
-  if (result.ok) location.assign(`/${location.search}`);
+  if (result.ok) location.assign(`/${location.search}${location.hash}`);
   else problem.textContent = result.status === 403 ? "Wrong token." : `Login failed: ${await result.text()}`;
 }
 

@@ -4,6 +4,7 @@ export const MOVING = ["live", "late", "damaged"];
 export const STALLED = ["frozen", "lost"]; // no new pictures although they are due
 
 const LOST_MS = 1000;
+const SYNCHRONISED_MS = 5000; // two refresh waves, and time for the decoder
 export const INTERVALS = 1.3; // this many frame intervals without a picture are more than jitter
 
 /**
@@ -14,6 +15,7 @@ export const INTERVALS = 1.3; // this many frame intervals without a picture are
  * @property {boolean|null} sending
  * @property {string} refused why there is no decoder, "" if there is one
  * @property {boolean} drawn whether a picture was drawn since the stream last started
+ * @property {number} [waits_since] page time since which units arrive and none was drawn
  * @property {number|null} stood_since page time of the last picture before the decoder restarted in the middle of the stream; null: it did not
  * @property {boolean} faulty whether the source has a fault: it may repeat old pictures
  * @property {boolean} damaged whether the picture shows that packets were lost
@@ -33,7 +35,7 @@ export function judge(s, limits, now) {
   if (reachable && s.sending === false) return "paused";
   if (!reachable || now - s.arrived > LOST_MS) return "lost";
   if (s.refused) return "unsupported";
-  if (!s.drawn && s.stood_since === null) return "synchronising";
+  if (!s.drawn && s.stood_since === null) return now - (s.waits_since ?? now) > SYNCHRONISED_MS ? "frozen" : "synchronising";
   const limit = Math.max(limits.frozen_ms, (INTERVALS * 1000) / s.fps);
   if (s.faulty || now - Math.min(s.arrived, s.drawn ? s.decoded : (s.stood_since ?? 0)) > limit) return "frozen";
   if (s.damaged) return "damaged";

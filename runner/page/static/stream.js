@@ -27,6 +27,7 @@ const SETTLE_MS = 2000; // after a restart the decoder may take this long for th
 const REFUSED_RETRY_MS = 5000; // between two checks whether the browser can decode a refused stream
 const LATE_HOLD_MS = 500; // how long one late picture is indicated, at least until it counts as frozen
 const STAGES = 1200;
+const WAITING = ["synchronising", "frozen"];
 const NEW_REGION = "NEW REGION"; // while it is unknown which part of the image a picture shows
 const NO_VIDEO = "This browser has no WebCodecs.";
 const UNTIMED_MS = 1000; // longest transit of a picture without a capture time
@@ -41,6 +42,7 @@ export class Stream {
   arrived = now(); // page times of the newest unit and of the newest picture to draw, or of the start of the stream
   decoded = this.arrived;
   drawn = false;
+  waits_since = this.arrived; // since when pictures arrive and none is drawn
   /** @type {number|null} */
   stood_since = null; // when the last picture before a restart of the decoder was drawn; null: none was since the stream started
   damaged = false; // the picture drawn shows that packets were lost
@@ -110,7 +112,7 @@ export class Stream {
 
   /** The stream starts or restarts: silence counts from now. */
   resetTimes() {
-    this.arrived = this.decoded = now();
+    this.arrived = this.decoded = this.waits_since = now();
     this.drawn = this.damaged = false;
     this.stood_since = null;
     this.composed_at = -Infinity;
@@ -321,7 +323,7 @@ export class Stream {
   async drawStraightened(next) {
     const { straight, decoder } = this;
     const isStraightened = await this.straightenPicture(next);
-    if (!isStraightened || straight !== this.straight || decoder !== this.decoder) return next.picture.close();
+    if (!isStraightened || straight !== this.straight || decoder !== this.decoder) return closeShown(next);
     if (!this.isOnlyInBirdseye) this.decoded = now();
     this.show(next);
   }
@@ -331,7 +333,9 @@ export class Stream {
     const { straight } = this;
     const region = this.regionOf(one);
     try {
-      one.image = region && straight ? await straight.straightened(one.picture, region, this.straightSize()) : null;
+      const image = region && straight ? await straight.straightened(one.picture, region, this.straightSize()) : null;
+      closeImage(one);
+      one.image = image;
       return true;
     } catch (error) {
       if (straight === this.straight) this.station.onStraightenFailed(this, error);
@@ -341,7 +345,7 @@ export class Stream {
 
   /** @param {Shown} next */
   show(next) {
-    this.shown?.picture.close();
+    closeShown(this.shown);
     this.shown = next;
     this.drawn = true;
     this.stood_since = null;
@@ -422,16 +426,18 @@ export class Stream {
   onComposed(one, isPart, fps) {
     this.composed_fps = fps;
     if (!this.isOnlyInBirdseye || !this.drawn || !one || one.meta.decoded <= this.composed_at) return;
-    this.decoded = this.composed_at === -Infinity ? one.meta.decoded : now(); // to show an old picture makes it no newer
+    const isOld = now() - one.meta.decoded > Math.max(this.station.limits.frozen_ms, (1000 * INTERVALS) / this.camera.fps);
+    this.decoded = this.composed_at === -Infinity && isOld ? one.meta.decoded : now(); // to show an old picture makes it no newer
     this.composed_at = one.meta.decoded;
     if (!isPart) return;
     this.checkAge(one.meta, now());
     this.recordStages(one.meta, now());
   }
 
-  checkAge({ captured }, time) {
+  checkAge({ captured, arrived }, time) {
     const { clock, limits, bound } = this.station;
-    const age = clock.toStation(time) - captured + bound + clock.bound; // upper bound; not finite if a clock is unknown
+    const upper = clock.toStation(time) - captured + bound + clock.bound; // not finite if a clock is unknown
+    const age = Number.isFinite(upper) ? upper : clock.toStation(time) - arrived - clock.bound; // at least
     if (Number.isFinite(age) && age > limits.late_ms) Object.assign(this, { late_until: time + Math.max(LATE_HOLD_MS, (1000 * INTERVALS) / this.camera.fps), late_age: age });
   }
 
@@ -460,11 +466,11 @@ export class Stream {
 
   times() {
     const { connected, online } = this.station;
-    const { on, sending, refused, stood_since, damaged, arrived, decoded, late_until } = this;
+    const { on, sending, refused, stood_since, waits_since, damaged, arrived, decoded, late_until } = this;
     const [faulty, isAbove] = [this.failed_at !== null, this.isOnlyInBirdseye];
     const drawn = this.drawn && (!isAbove || this.composed_at > -Infinity);
     const fps = Math.min(this.camera.fps, this.straight?.warp.fps ?? Infinity, isAbove ? this.composed_fps : Infinity);
-    return { connected, online, on, sending, refused, drawn, stood_since, damaged, faulty, arrived, decoded, late_until, fps };
+    return { connected, online, on, sending, refused, drawn, stood_since, waits_since, damaged, faulty, arrived, decoded, late_until, fps };
   }
 
   /** Whether too few pictures are drawn; to be called a few times a second. */
@@ -477,6 +483,7 @@ export class Stream {
   updateStatus() {
     const time = now();
     this.status = judge(this.times(), this.station.limits, time);
+    if (!WAITING.includes(this.status)) this.waits_since = time;
     const text = this.overlayText(time);
     if (this.context && text !== this.painted_text) this.paint(time);
     if (!MOVING.includes(this.status)) this.drawGuides();
@@ -597,9 +604,22 @@ export class Stream {
   dispose() {
     this.close();
     this.straight?.dispose();
-    this.shown?.picture.close();
+    closeShown(this.shown);
     this.shown = null;
   }
+}
+
+/** Free a picture at once: garbage collection may be late. @param {Shown|null} shown */
+function closeShown(shown) {
+  if (!shown) return;
+  closeImage(shown);
+  shown.picture.close();
+}
+
+/** @param {Shown} shown */
+function closeImage(shown) {
+  /** @type {any} */ (shown.image)?.close?.();
+  shown.image = null;
 }
 
 /** Whether a picture has a region's aspect ratio, to within rounding to even numbers of px. */

@@ -232,7 +232,7 @@ function judgeAll() {
 /** Report the ages that the page shows, and the skew between the pictures of the cameras. */
 function reportAges() {
   const bound_ms = station.bound + station.clock.bound;
-  const ages = Object.fromEntries(streams.map(({ name, stages, status }) => [name, { ...ageOf(stages), bound_ms, status }]));
+  const ages = Object.fromEntries(streams.map(({ name, stages, status }) => [name, { ...ageOf(stages, bound_ms), bound_ms, status }]));
   const skew_ms = skewOf(streams.map(({ status, shown }) => ({ status, captured: shown?.meta.captured ?? NaN })));
   const slow = streams.filter((stream) => stream.isSlow()).length > 0; // not some(): every stream counts its pictures
   toPage({ kind: "ages", ages, skew_ms, slow });
@@ -292,7 +292,9 @@ const orders = {
   above: ({ shown, width, height, ratio }) => ground.show({ shown, width, height, ratio }),
   size({ name, ...display }) {
     const stream = find(name);
-    if (stream) Object.assign(stream, { display, painted_text: null });
+    if (!stream) return;
+    Object.assign(stream, { display, painted_text: null });
+    stream.drawGuides(); // the picture follows its box at once
   },
   send: ({ message }) => toPage({ kind: "sent", id: message.id, sent: send(message) }),
   async ask({ id, what, name }) {
