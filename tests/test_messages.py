@@ -74,7 +74,7 @@ def test_an_id_that_its_reply_would_repeat_has_a_limited_length() -> None:
         ({"event": "bitrate_predicted", "kbps": 1e305}, "kbps: 1e+305: must be at most 1e+09"),
         ({"event": "bitrate_predicted", "kbps": 1, "lower_kbps": 1e10}, "lower_kbps: 1e+10: must be at most 1e+09"),
         ({"event": "bitrate_predicted", "kbps": 0, "valid_s": 1e300}, "valid_s: 1e+300: must be at most 3600"),
-        ({"event": "total_set", "kbps": 10**300}, "kbps: 1e+300: must be at most 1e+09"),
+        ({"event": "total_set", "kbps": 10**299}, "kbps: 1e+299: must be at most 1e+09"),
         ({"event": "weights_set", "weights": {"front": 1e305}}, "weights.front: 1e+305: must be at most 1e+06"),
         ({"event": "bitrate_predicted", "kbps": 1e9, "valid_s": 3600}, None),
     ],
