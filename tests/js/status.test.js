@@ -27,6 +27,8 @@ const CASES = [
   ["unsupported", { refused: "no decoder" }],
   ["lost", { refused: "no decoder", arrived: NOW - 1001 }],
   ["synchronising", { drawn: false }],
+  ["synchronising", { drawn: false, waits_since: NOW - 4000 }],
+  ["frozen", { drawn: false, waits_since: NOW - 6000 }],
   ["live", { drawn: false, stood_since: NOW - 120 }], // the decoder restarts: the last picture is still recent,
   ["frozen", { drawn: false, stood_since: NOW - 121 }], // and then it stands, although units arrive
   ["live", { stood_since: NOW - 5000 }], // pictures are drawn again

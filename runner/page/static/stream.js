@@ -501,7 +501,7 @@ export class Stream {
   overlayText(time) {
     if (this.status === "live") return this.straight && !this.shown?.image ? NEW_REGION : "";
     const late = this.isLateToo(time) ? `, ${alarmText("late", 0, this.late_age)}` : "";
-    const stood = this.status === "frozen" ? (this.drawn ? this.decoded : this.stood_since) : null; // units may still arrive
+    const stood = this.status === "frozen" ? (this.drawn ? this.decoded : (this.stood_since ?? this.waits_since)) : null; // units may still arrive
     return alarmText(this.status, time - Math.min(this.arrived, stood ?? Infinity, this.failed_at ?? Infinity), this.late_age) + late;
   }
 
