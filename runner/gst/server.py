@@ -55,13 +55,12 @@ LEFT_S = 10.0  # how long a camera is monitored after a viewer has left
 SESSIONS_EVERY_S = 1.0
 GIVE_BACK_S = 10.0  # interval at which memory of ended pipelines and of replaced encoders is returned to the system
 METHODS = ("options", "describe", "setup", "play", "pause", "get-parameter", "set-parameter", "teardown")
-OK, FORBIDDEN, REFUSED, UNAVAILABLE, MOVED, NOT_NOW = (
+OK, FORBIDDEN, REFUSED, UNAVAILABLE, MOVED = (
     GstRtsp.RTSPStatusCode.OK,
     GstRtsp.RTSPStatusCode.FORBIDDEN,
     GstRtsp.RTSPStatusCode.NOT_ENOUGH_BANDWIDTH,
     GstRtsp.RTSPStatusCode.SERVICE_UNAVAILABLE,
     GstRtsp.RTSPStatusCode.MOVED_PERMANENTLY,
-    GstRtsp.RTSPStatusCode.METHOD_NOT_VALID_IN_THIS_STATE,
 )
 
 # Default reasons for refusing a client that has not authenticated.
@@ -436,8 +435,7 @@ class CameraServer:
                 return UNAVAILABLE
             new_viewer.identify(self._viewers.viewer(client) if self._viewers else operator_of(_user_agent(context)))
             if camera.name in new_viewer.cameras:
-                # The library would forget a first transport without ending it: a copy that nobody counts or revokes.
-                return OK if new_viewer.cameras[camera.name] is None else NOT_NOW
+                return OK
             current = [c for c in self._connections.values() if camera.name in c.cameras]
             leaving = admit([c.viewer for c in current], new_viewer.viewer, self._media.max_viewers, self.controller)
             if leaving is None:

@@ -400,31 +400,6 @@ def test_a_silent_viewer_over_udp_is_sent_nothing_after_its_session_ends():
         assert len(silent.packets) == seen
 
 
-@pytest.mark.parametrize("is_new_session", [False, True])
-def test_a_camera_is_set_up_once_on_a_connection(is_new_session):
-    """Otherwise the first copy would go on after the viewer has left, counted by nobody."""
-    with ExitStack() as stack:
-        vehicle = stack.enter_context(serving("media.max_viewers=2"))
-        other = stack.enter_context(RtspClient(vehicle.url()))
-        assert other.open() == [200, 200, 200]
-        other.read()
-        client = stack.enter_context(RtspClient(vehicle.url()))
-        assert client.open(udp=True) == [200, 200, 200]
-        client.read()
-        until(lambda: client.frames > 5)
-        if is_new_session:
-            client.session = ""
-        assert client.ask("SETUP", f"{vehicle.url()}/stream=0", Transport="RTP/AVP/TCP;unicast;interleaved=0-1") == 455
-        client.tcp.close()
-
-        def is_silent():
-            seen, frames = len(client.packets), other.frames
-            until(lambda: other.frames > frames + 10)
-            return len(client.packets) == seen
-
-        until(is_silent)
-
-
 def test_viewers_that_keep_their_session_alive_stay_on_a_paused_camera():
     """A player's RTCP and keep-alive requests, a raw client's GET_PARAMETER."""
     with ExitStack() as stack:
