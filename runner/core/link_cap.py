@@ -284,17 +284,16 @@ def probe(cap: LinkCap, t: float, asked: Kbps, limit: Kbps) -> LinkCap:
     return replace(cap, alone=True, kbps=kbps, overuse=Overuse(t, known, limit), steps=0, provisional=False)
 
 
-def end_probe(cap: LinkCap, limit: Kbps) -> LinkCap:
-    """The cap when the limit applies again; the known capacity was measured under a different limit."""
-    if not cap.alone:
-        return cap
-    return replace(cap, alone=False, overuse=cap.overuse and cap.overuse._replace(limit=limit))
+def end_probe(cap: LinkCap) -> LinkCap:
+    """The cap when the limit applies again; `follow` then relates the known capacity to it."""
+    return replace(cap, alone=False) if cap.alone else cap
 
 
 def follow(cap: LinkCap, limit: Kbps, is_prediction: bool) -> LinkCap:
     """The cap under a limit of this kind. Only a prediction that rises means that the link carries more than it did."""
-    known = cap.overuse if cap.predicted and is_prediction else cap.overuse and cap.overuse._replace(limit=limit)
-    return replace(cap, predicted=is_prediction, overuse=known)
+    if cap.predicted and is_prediction:
+        return cap
+    return replace(cap, predicted=is_prediction, overuse=cap.overuse and cap.overuse._replace(limit=limit))
 
 
 def mark_idle(cap: LinkCap, t: float) -> LinkCap:

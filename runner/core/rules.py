@@ -381,7 +381,7 @@ def cap_by_link(
             draft, asked, limit = draft.replaced(measured=True, total=most), limit, wire_kbps(cameras, most)
             cap = replace(probe(cap, state.t, asked, limit), replaced=state.t)
         else:
-            cap = end_probe(cap, limit)
+            cap = end_probe(cap)
         cap = follow(cap, limit, state.mode is Mode.AUTOMATIC and not alone)
         cap = start_cap(cap, link, state.operator_since, limit, start)
         cap = update_cap(replace(cap, reserve=reserve_kbps), link, state.t, limit, least_trust, state.position)

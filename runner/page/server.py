@@ -70,6 +70,7 @@ HEADERS = {
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
 }
+LOGIN_HEADERS = HEADERS | {"Content-Security-Policy": LOGIN_POLICY}
 # What a browser needs before login.
 UNPROTECTED = (
     "/login",
@@ -249,7 +250,7 @@ class PageServer(Listener):
     @web.middleware
     async def _add_headers(self, request: web.Request, handler: Any) -> web.StreamResponse:
         """Add HEADERS to every response, also to one that is raised."""
-        headers = HEADERS | ({"Content-Security-Policy": LOGIN_POLICY} if request.path in UNPROTECTED else {})
+        headers = LOGIN_HEADERS if request.path in UNPROTECTED else HEADERS
         try:
             response: web.StreamResponse = await handler(request)
         except web.HTTPException as raised:
