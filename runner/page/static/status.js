@@ -36,11 +36,14 @@ export function judge(s, limits, now) {
   if (!reachable || now - s.arrived > LOST_MS) return "lost";
   if (s.refused) return "unsupported";
   if (!s.drawn && s.stood_since === null) return now - (s.waits_since ?? now) > SYNCHRONISED_MS ? "frozen" : "synchronising";
-  const limit = Math.max(limits.frozen_ms, (INTERVALS * 1000) / s.fps);
+  const limit = frozenAfter(limits, s.fps);
   if (s.faulty || now - Math.min(s.arrived, s.drawn ? s.decoded : (s.stood_since ?? 0)) > limit) return "frozen";
   if (s.damaged) return "damaged";
   return now < s.late_until ? "late" : "live";
 }
+
+/** How long a picture may stand until it is frozen, ms. @param {{frozen_ms: number}} limits  @param {number} fps */
+export const frozenAfter = (limits, fps) => Math.max(limits.frozen_ms, (INTERVALS * 1000) / fps);
 
 /**
  * The text of an alarm: "FROZEN 0.4 s", "LATE 310 ms", "LOST 3 s".

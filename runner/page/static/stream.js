@@ -8,7 +8,7 @@ import { Pace } from "./pace.js";
 import { paintImage, pictureOf } from "./picture.js";
 import { ESTIMATED, GuideLayer, labelPicture } from "./guide_layer.js";
 import { resize } from "./resizing.js";
-import { alarmText, INTERVALS, judge, MOVING, STALLED } from "./status.js";
+import { alarmText, frozenAfter, INTERVALS, judge, MOVING, STALLED } from "./status.js";
 import { drawOverlay, readably } from "./overlay.js";
 import { straightOptics } from "./straight.js";
 import { StraightView } from "./straight_view.js";
@@ -426,7 +426,7 @@ export class Stream {
   onComposed(one, isPart, fps) {
     this.composed_fps = fps;
     if (!this.isOnlyInBirdseye || !this.drawn || !one || one.meta.decoded <= this.composed_at) return;
-    const isOld = now() - one.meta.decoded > Math.max(this.station.limits.frozen_ms, (1000 * INTERVALS) / this.camera.fps);
+    const isOld = now() - one.meta.decoded > frozenAfter(this.station.limits, this.camera.fps);
     this.decoded = this.composed_at === -Infinity && isOld ? one.meta.decoded : now(); // to show an old picture makes it no newer
     this.composed_at = one.meta.decoded;
     if (!isPart) return;
