@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import socket
 import time
 from itertools import pairwise
 
@@ -11,8 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from runner.link.bucket import Bucket
-from runner.link.direction import Direction, LossModel
+from runner.link.direction import UNLIMITED, Direction, Link, LossModel, exact_loop
 from runner.link.limit import burst_bytes, queue_bytes
+from runner.link.relay import TCP_HEADERS, join
 from runner.link.rtsp import Splitter, ports, with_ports
 
 KBPS, QUEUE_MS = 800, 100  # 100 bytes in a ms
@@ -103,6 +105,42 @@ def test_at_a_rate_of_0_packets_stay_queued():
 def test_a_slow_link_has_room_for_a_packet():
     assert queue_bytes(1, 10) == burst_bytes(1) == 3000
     assert (burst_bytes(40_000), queue_bytes(8000, 200)) == (10_000, 200_000)
+
+
+def connected():
+    """Both ends of a TCP connection."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        end = socket.create_connection(server.getsockname())
+        return server.accept()[0], end
+
+
+def test_tcp_waits_for_room_where_udp_is_dropped():
+    message, size = b"x" * 150, 150 + TCP_HEADERS
+
+    async def run():
+        link = Link(Direction(KBPS, QUEUE_MS, 0), Direction(**UNLIMITED))
+        (near, vehicle), (far, operator) = connected(), connected()
+        with near, vehicle, far, operator:
+            operator.setblocking(False)
+            joined = asyncio.create_task(join(link, near, far, lambda data: [data], lambda data: [data]))
+            await asyncio.sleep(0.01)  # the relay waits for data: the queue still has room
+            while not link.up.change(None, None)["dropped"]:
+                link.up.put(100, lambda: None)
+            vehicle.sendall(message)
+            received = asyncio.create_task(asyncio.get_running_loop().sock_recv(operator, 1000))
+            longest = 0.0
+            while not received.done():
+                await asyncio.sleep(0)
+                link.up.put(100, lambda: None)  # UDP takes all room that TCP leaves
+                longest = max(longest, link.up.change(None, None)["queue_ms"])
+            joined.cancel()
+            await asyncio.wait([joined])
+            return await received, longest
+
+    with asyncio.Runner(loop_factory=exact_loop) as runner:
+        received, longest = runner.run(asyncio.wait_for(run(), 20))
+    assert received == message
+    assert QUEUE_MS - 1000 * size / (KBPS * 125) <= longest <= QUEUE_MS
 
 
 SETUP = (

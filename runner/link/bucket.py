@@ -23,6 +23,7 @@ class Bucket(Generic[T]):
         self._items: deque[tuple[int, T]] = deque()
         self._left: deque[tuple[float, T]] = deque()  # with departure times
         self._backlog = 0  # bytes
+        self.reserved = 0  # bytes that only packets to be kept may take
         self._at = now  # time of `_tokens`
         self._passed = self._packets = self._dropped = 0
         self._set(kbps)
@@ -42,9 +43,9 @@ class Bucket(Generic[T]):
         return self._backlog + size <= self._limit
 
     def put(self, size: int, item: T, now: float, *, keep: bool = False) -> None:
-        """Queue a packet; it is dropped if the queue has no room, unless it is to be kept."""
+        """Queue a packet; it is dropped if the queue has no room beside `reserved`, unless it is to be kept."""
         self._advance(now)
-        if not (keep or self.has_room(size)):
+        if not (keep or self.has_room(size + self.reserved)):
             self._dropped += 1
             return
         if not self._items:

@@ -73,10 +73,14 @@ class Direction:
         self._lost += 1
 
     async def room(self, size: int) -> None:
-        """Wait until the queue has room for `size` bytes."""
-        while not self._bucket.has_room(size):
-            self._departed.clear()
-            await self._departed.wait()
+        """Wait until the queue has room for `size` bytes, which packets that may be dropped do not take meanwhile."""
+        self._bucket.reserved += size
+        try:
+            while not self._bucket.has_room(size):
+                self._departed.clear()
+                await self._departed.wait()
+        finally:
+            self._bucket.reserved -= size
 
     def _deliver(self) -> None:
         """Deliver all packets that are due, and set a timer for the rest."""

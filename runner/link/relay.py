@@ -70,11 +70,11 @@ async def _pass(direction: Direction, source: socket.socket, arrived: asyncio.Qu
     with suppress(OSError, ValueError):
         while True:
             await arrived.join()  # a receiver that does not read is sent no more
-            await direction.room(SEGMENT + TCP_HEADERS)
             if not (data := await loop.sock_recv(source, SEGMENT)):
                 break
             for unit in cut(data):
                 size = len(unit) + TCP_HEADERS * -(-len(unit) // SEGMENT)
+                await direction.room(min(size, SEGMENT + TCP_HEADERS))
                 direction.put(size, partial(arrived.put_nowait, unit), keep=True)
     direction.put(0, partial(arrived.put_nowait, b""), keep=True)  # after all earlier data
 
