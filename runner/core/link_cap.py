@@ -8,7 +8,6 @@ When an operator connects, the cap starts at a share of the limit.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import NamedTuple
 
@@ -120,8 +119,7 @@ NO_PROOFS = Proofs((), Fraction(0), -float("inf"))
 NO_LIMIT = LastLimit(Fraction(0), -float("inf"), Fraction(0))
 
 
-@dataclass(frozen=True, slots=True)
-class LinkCap:
+class LinkCap(NamedTuple):
     """Memory between measurements.
 
     kbps        cap in force; None: no cap below the limit
@@ -196,18 +194,18 @@ def update_cap(
         unmeasured = t - max(cap.measured, cap.changed, cap.idle)
         return _reset(cap) if unmeasured > (START_S if cap.provisional else UNMEASURED_S) else cap
     cap, full = _adapt_overuse(cap, t, limit), limit
-    cap = replace(cap, trust=update_trust(cap.trust, t, least_trust, position))
+    cap = cap._replace(trust=update_trust(cap.trust, t, least_trust, position))
     limit = believed_limit(cap, limit, least_trust)
     if link.t <= cap.measured:
         return _handle_silence(cap, link, t, limit)
-    cap = _record(replace(cap, measured=link.t, began=min(t, cap.began)), link, t)
+    cap = _record(cap._replace(measured=link.t, began=min(t, cap.began)), link, t)
     if link.state is LinkState.STALLED:
         return _handle_stall(cap, link, t, limit)
     lossy = cap.losses.share > TOO_LOSSY and t - cap.losses.t <= LOSING_S
     unanswered = lossy and t - cap.changed >= LOSS_S + _rtt_s(link)
     if (link.state is LinkState.FILLING or unanswered) and link.kbps:
         if cap.stall and cap.before:  # after a stall the link carries less than before
-            cap = replace(cap, before=min(cap.before, link.kbps))
+            cap = cap._replace(before=min(cap.before, link.kbps))
         if _may_be_jitter(cap, link):
             cap = _cut_by_jitter(cap, link, t, limit, full)
             carried = cap.overuse.carried if cap.overuse else None
@@ -223,13 +221,13 @@ def _adapt_overuse(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
     """Correct the last overuse if the limit has followed the link since: it was late, and less wrong than it seemed."""
     known = cap.limit
     rose = limit > known.kbps > 0
-    cap = replace(cap, limit=LastLimit(limit, t, known.kbps) if rose else known._replace(kbps=limit))
+    cap = cap._replace(limit=LastLimit(limit, t, known.kbps) if rose else known._replace(kbps=limit))
     last = cap.overuse
     if last is None or limit >= last.limit or last.carried >= last.limit or t - last.t > LATE_S:
         return cap
     followed = max(limit, last.carried)
     trust = relieve(cap.trust, last.t, followed / last.limit)
-    return replace(cap, overuse=last._replace(limit=followed), trust=trust)
+    return cap._replace(overuse=last._replace(limit=followed), trust=trust)
 
 
 def start_cap(cap: LinkCap, link: LinkMeasured | None, since: float | None, limit: Kbps, share: Fraction) -> LinkCap:
@@ -240,10 +238,10 @@ def start_cap(cap: LinkCap, link: LinkMeasured | None, since: float | None, limi
     """
     if since is None or since <= cap.connected or share == 1:
         return cap
-    cap, kbps = replace(cap, connected=since), _short(limit * share)
+    cap, kbps = cap._replace(connected=since), _short(limit * share)
     if link is not None or (cap.kbps is not None and cap.kbps <= kbps):
         return cap
-    return replace(_reset(cap), kbps=kbps, provisional=True, idle=max(cap.idle, since), replaced=cap.replaced)
+    return _reset(cap)._replace(kbps=kbps, provisional=True, idle=max(cap.idle, since), replaced=cap.replaced)
 
 
 def _reset(cap: LinkCap) -> LinkCap:
@@ -262,12 +260,12 @@ def _doubt_limit(cap: LinkCap, carried: Kbps | None, t: float, limit: Kbps, leas
     if cap.changed != t or carried is None or cap.alone or least == 1:
         return cap
     share = min(Fraction(1), thousandths(BELIEVED * carried / limit))
-    return replace(cap, trust=add_doubt(cap.trust, t, share))
+    return cap._replace(trust=add_doubt(cap.trust, t, share))
 
 
 def raise_cap(cap: LinkCap, least: Kbps) -> LinkCap:
     """The cap, but at least the minimum needed to measure the link."""
-    return replace(cap, kbps=least) if cap.kbps is not None and cap.kbps < least else cap
+    return cap._replace(kbps=least) if cap.kbps is not None and cap.kbps < least else cap
 
 
 def is_fresh(link: LinkMeasured | None, t: float) -> bool:
@@ -281,24 +279,24 @@ def probe(cap: LinkCap, t: float, asked: Kbps, limit: Kbps) -> LinkCap:
         return cap
     kbps = _short(asked if cap.kbps is None else min(asked, cap.kbps))
     known = _short(asked if cap.overuse is None else min(asked, cap.overuse.carried))
-    return replace(cap, alone=True, kbps=kbps, overuse=Overuse(t, known, limit), steps=0, provisional=False)
+    return cap._replace(alone=True, kbps=kbps, overuse=Overuse(t, known, limit), steps=0, provisional=False)
 
 
 def end_probe(cap: LinkCap) -> LinkCap:
     """The cap when the limit applies again; `follow` then relates the known capacity to it."""
-    return replace(cap, alone=False) if cap.alone else cap
+    return cap._replace(alone=False) if cap.alone else cap
 
 
 def follow(cap: LinkCap, limit: Kbps, is_prediction: bool) -> LinkCap:
     """The cap under a limit of this kind. Only a prediction that rises means that the link carries more than it did."""
     if cap.predicted and is_prediction:
         return cap
-    return replace(cap, predicted=is_prediction, overuse=cap.overuse and cap.overuse._replace(limit=limit))
+    return cap._replace(predicted=is_prediction, overuse=cap.overuse and cap.overuse._replace(limit=limit))
 
 
 def mark_idle(cap: LinkCap, t: float) -> LinkCap:
     """The cap at time t when there is nothing to send: silence then, or soon after, is no stall."""
-    return replace(cap, idle=t)
+    return cap._replace(idle=t)
 
 
 def _record(cap: LinkCap, link: LinkMeasured, t: float) -> LinkCap:
@@ -313,7 +311,7 @@ def _record(cap: LinkCap, link: LinkMeasured, t: float) -> LinkCap:
     losses = Losses(loss, t if loss > cap.losses.share else cap.losses.t)
     most = most._replace(kbps=max(most.kbps, kbps))
     short = t if _is_short(link) else cap.short
-    return replace(cap, most=most, passed=(cap.changed, passed), losses=losses, short=short)
+    return cap._replace(most=most, passed=(cap.changed, passed), losses=losses, short=short)
 
 
 def _is_narrow(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> bool:
@@ -336,11 +334,11 @@ def _note_proof(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> Link
     times = tuple(each for each in proofs.times if t - each <= OFTEN_S)
     most = max(proofs.most, cap.most.kbps) if t - proofs.t <= OFTEN_S else cap.most.kbps
     is_new = not _is_short(link) and not (times and times[-1] > cap.short)
-    cap = replace(cap, proofs=Proofs((*times, t)[-OFTEN:] if is_new else times, most, t))
+    cap = cap._replace(proofs=Proofs((*times, t)[-OFTEN:] if is_new else times, most, t))
     if not is_new or not _is_contested(cap) or cap.kbps is None:
         return cap
     least = _short(CONTESTED * YIELDED * min(most, limit))
-    return replace(cap, most=cap.most._replace(kbps=most), kbps=max(cap.kbps, least))
+    return cap._replace(most=cap.most._replace(kbps=most), kbps=max(cap.kbps, least))
 
 
 def _is_contested(cap: LinkCap) -> bool:
@@ -378,7 +376,7 @@ def _cut_by_jitter(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full
     cap = _cut(cap, link, t, limit, full)
     if cap.overuse is None:
         return cap
-    return replace(cap, overuse=cap.overuse._replace(carried=max(known, cap.overuse.carried)))
+    return cap._replace(overuse=cap.overuse._replace(carried=max(known, cap.overuse.carried)))
 
 
 def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps) -> LinkCap:
@@ -400,8 +398,7 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps) ->
     settled = t - cap.changed >= SETTLE_S + _rtt_s(link)
     if target >= _in_force(cap, limit) or not (settled or (link.queue_ms or 0) > cap.queue_ms):
         return _raise_known(_lower_known(cap, carried, link, t), link, t)
-    return replace(
-        cap,
+    return cap._replace(
         kbps=_short(target),
         overuse=Overuse(t, carried, cap.limit.before if t - cap.limit.t < SEEN_S + _rtt_s(link) else full),
         queue_ms=link.queue_ms or 0.0,
@@ -417,7 +414,7 @@ def _lower_known(cap: LinkCap, carried: Kbps, link: LinkMeasured, t: float) -> L
     if cap.overuse is None or carried >= cap.overuse.carried:
         return cap
     known = max(cap.overuse.carried, cap.lowering.known if _is_recent(cap.lowering.t, link, t) else carried)
-    return replace(cap, overuse=cap.overuse._replace(carried=carried), lowering=Lowering(t, known))
+    return cap._replace(overuse=cap.overuse._replace(carried=carried), lowering=Lowering(t, known))
 
 
 def _raise_known(cap: LinkCap, link: LinkMeasured, t: float) -> LinkCap:
@@ -430,9 +427,9 @@ def _raise_known(cap: LinkCap, link: LinkMeasured, t: float) -> LinkCap:
     if last is None or link.kbps is None or link.kbps <= last.carried:
         return cap
     if _is_recent(last.t, link, t):
-        return replace(cap, overuse=last._replace(carried=link.kbps))
+        return cap._replace(overuse=last._replace(carried=link.kbps))
     if _is_recent(cap.lowering.t, link, t):
-        return replace(cap, overuse=last._replace(carried=max(last.carried, min(link.kbps, cap.lowering.known))))
+        return cap._replace(overuse=last._replace(carried=max(last.carried, min(link.kbps, cap.lowering.known))))
     return cap
 
 
@@ -442,11 +439,11 @@ def _is_recent(since: float, link: LinkMeasured, t: float) -> bool:
 
 
 def _recover(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps) -> LinkCap:
-    cap = replace(cap, before=link.kbps or cap.before, queue_ms=0.0)
+    cap = cap._replace(before=link.kbps or cap.before, queue_ms=0.0)
     if cap.kbps is None or cap.kbps >= limit or t - cap.changed < STEP_S + _rtt_s(link):
         return cap  # a cap that is not in force is untested, and so does not grow
     if cap.provisional and t - cap.began >= BEGIN_S:  # static pictures may never fill it
-        return replace(cap, kbps=None, provisional=False, changed=t)
+        return cap._replace(kbps=None, provisional=False, changed=t)
     if cap.provisional and cap.before is None:
         return cap  # it does not grow before a rate has been measured
     if link.kbps is not None and _sent(cap, limit) > TESTED * link.kbps:
@@ -460,8 +457,8 @@ def _recover(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps
         factor, steps = min(FAST, 1 + CAREFUL * 2 ** (steps // DOUBLING)), steps + 1
     kbps = _short(cap.kbps * factor)
     if kbps >= limit:
-        return replace(cap, kbps=None, provisional=False, steps=steps, changed=t)
-    return replace(cap, kbps=kbps, steps=steps, changed=t)
+        return cap._replace(kbps=None, provisional=False, steps=steps, changed=t)
+    return cap._replace(kbps=kbps, steps=steps, changed=t)
 
 
 def _handle_stall(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:
@@ -470,15 +467,15 @@ def _handle_stall(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> Li
         if t - cap.idle < SILENCE_S + _rtt_s(link):
             return cap
         arrived = min(_in_force(cap, limit), cap.before or limit)
-        return replace(cap, kbps=_short(arrived * DEEPEST), stall=Stall(t, 0), changed=t, provisional=False)
+        return cap._replace(kbps=_short(arrived * DEEPEST), stall=Stall(t, 0), changed=t, provisional=False)
     return _halve(cap, cap.stall, t, limit)
 
 
 def _halve(cap: LinkCap, stall: Stall, t: float, limit: Kbps) -> LinkCap:
     if t - cap.changed < SILENCE_S:
-        return replace(cap, stall=stall)
+        return cap._replace(stall=stall)
     kbps = _short(_in_force(cap, limit) / 2)
-    return replace(cap, kbps=kbps, stall=stall._replace(halved=stall.halved + 1), changed=t, provisional=False)
+    return cap._replace(kbps=kbps, stall=stall._replace(halved=stall.halved + 1), changed=t, provisional=False)
 
 
 def _handle_silence(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:
@@ -496,7 +493,7 @@ def _resume(cap: LinkCap, limit: Kbps) -> LinkCap:
     kbps = cap.kbps
     if kbps is not None and cap.stall.halved and cap.before:
         kbps = max(kbps, min(cap.before, limit) / 2)
-    return replace(cap, kbps=kbps, stall=None)
+    return cap._replace(kbps=kbps, stall=None)
 
 
 def _rtt_s(link: LinkMeasured) -> float:

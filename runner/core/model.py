@@ -12,6 +12,7 @@ from decimal import Decimal
 from difflib import get_close_matches
 from enum import StrEnum
 from fractions import Fraction
+from functools import lru_cache
 from itertools import islice, pairwise
 from typing import Any, Protocol
 
@@ -35,8 +36,13 @@ def exact(number: float | str | Fraction) -> Fraction:
 
     A float prints as the shortest decimal text that parses to the same float: up to 15 digits, the text as typed.
     """
-    if isinstance(number, int | Fraction):
-        return Fraction(number)
+    if isinstance(number, float):
+        return _exact(number)
+    return Fraction(number) if isinstance(number, (int, Fraction)) else Fraction(Decimal(str(number)))
+
+
+@lru_cache(maxsize=256)  # of the times of an event, which many rules read
+def _exact(number: float) -> Fraction:
     return Fraction(Decimal(str(number)))
 
 

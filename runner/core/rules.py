@@ -379,12 +379,12 @@ def cap_by_link(
         if alone:
             most = sum((camera.rate_quality.b_full for camera in cameras), allocation.ZERO)
             draft, asked, limit = draft.replaced(measured=True, total=most), limit, wire_kbps(cameras, most)
-            cap = replace(probe(cap, state.t, asked, limit), replaced=state.t)
+            cap = probe(cap, state.t, asked, limit)._replace(replaced=state.t)
         else:
             cap = end_probe(cap)
         cap = follow(cap, limit, state.mode is Mode.AUTOMATIC and not alone)
         cap = start_cap(cap, link, state.operator_since, limit, start)
-        cap = update_cap(replace(cap, reserve=reserve_kbps), link, state.t, limit, least_trust, state.position)
+        cap = update_cap(cap._replace(reserve=reserve_kbps), link, state.t, limit, least_trust, state.position)
         cap = raise_cap(cap, least)  # with less, some cameras would not be sent, and so not measured
     memory = {**memory, "cap_by_link": cap}
     carried = believed_limit(cap, limit, least_trust)
@@ -530,6 +530,8 @@ def _draft_problem(state: State, before: Draft, draft: Any) -> str | None:
     """Why the parts of the draft that a rule has changed cannot be used; None if they can."""
     if not isinstance(draft, Draft):
         return "it must return a Draft and the memory"
+    if draft is before:
+        return None
     if draft.total is not before.total and not _is_bitrate(draft.total):
         return f"total {draft.total!r}: {BITRATE_RULE}"
     for part, fits, rule in PARTS:
