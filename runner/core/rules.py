@@ -476,7 +476,7 @@ def _hold_back(
     state: State, draft: Draft, past: Mapping[str, _Hold], for_s: Fraction
 ) -> tuple[Draft, Mapping[str, _Hold]]:
     now: dict[str, _Hold] = {}
-    factors, reasons = dict(draft.scaling), dict(draft.reasons)
+    factors: dict[str, Fraction] = {}  # of the cameras whose larger factor is held back
     for name, requested in draft.scaling.items():
         held, since = past.get(name, (requested, None))
         if requested is held or requested <= held:
@@ -488,8 +488,11 @@ def _hold_back(
         else:
             now[name] = (held, since)
             factors[name] = held
-            reasons[name] += f", held at {plain(held)} until it has been so for {plain(for_s)} s"
-    return draft.replaced(scaling=factors, reasons=reasons), now
+    if not factors:
+        return draft, now
+    until = f"until it has been so for {plain(for_s)} s"
+    reasons = {name: f"{draft.reasons[name]}, held at {plain(held)} {until}" for name, held in factors.items()}
+    return draft.replaced(scaling={**draft.scaling, **factors}, reasons={**draft.reasons, **reasons}), now
 
 
 # --- running a list ---------------------------------------------------------------------------------------------------

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields
 from fractions import Fraction
+from operator import attrgetter
 from typing import Any, assert_never
 
 from runner.core import events as ev
@@ -72,6 +73,10 @@ class State:
         )
 
 
+FIELDS = tuple(part.name for part in fields(State))
+_values = attrgetter(*FIELDS)
+
+
 def advance(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision) -> State:
     """The state after an event.
 
@@ -79,7 +84,9 @@ def advance(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision)
               from it
     raises    Refused
     """
-    return replace(state, t=event.t, **_changes(vehicle, state, event, in_force))
+    # As dataclasses.replace, in half the time.
+    values = dict(zip(FIELDS, _values(state), strict=True))
+    return State(**(values | {"t": event.t} | _changes(vehicle, state, event, in_force)))
 
 
 def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision) -> dict[str, Any]:  # noqa: PLR0911, PLR0912

@@ -249,7 +249,8 @@ class _Answers:
             self._decision, self._text = now.decision, ""
             return f"{_encode(acknowledged | decision_to_json(now.decision) | {'commands': commands})}\n"
         self._text = self._text or _encode(decision_to_json(self._decision))[1:-1]
-        return f'{_encode(acknowledged)[:-1]}, {self._text}, "commands": {_encode(commands)}}}\n'
+        turned = _encode(commands) if commands else "[]"
+        return f'{_encode(acknowledged)[:-1]}, {self._text}, "commands": {turned}}}\n'
 
 
 def _acknowledgement(document: Mapping[str, Any], now: Run) -> dict[str, Any]:
