@@ -55,12 +55,13 @@ LEFT_S = 10.0  # how long a camera is monitored after a viewer has left
 SESSIONS_EVERY_S = 1.0
 GIVE_BACK_S = 10.0  # interval at which memory of ended pipelines and of replaced encoders is returned to the system
 METHODS = ("options", "describe", "setup", "play", "pause", "get-parameter", "set-parameter", "teardown")
-OK, FORBIDDEN, REFUSED, UNAVAILABLE, MOVED = (
+OK, FORBIDDEN, REFUSED, UNAVAILABLE, MOVED, NOT_NOW = (
     GstRtsp.RTSPStatusCode.OK,
     GstRtsp.RTSPStatusCode.FORBIDDEN,
     GstRtsp.RTSPStatusCode.NOT_ENOUGH_BANDWIDTH,
     GstRtsp.RTSPStatusCode.SERVICE_UNAVAILABLE,
     GstRtsp.RTSPStatusCode.MOVED_PERMANENTLY,
+    GstRtsp.RTSPStatusCode.METHOD_NOT_VALID_IN_THIS_STATE,
 )
 
 # Default reasons for refusing a client that has not authenticated.
@@ -429,6 +430,8 @@ class CameraServer:
         if self._viewers and connection and (refusal := self._viewers.refusal(client, context.token)):
             connection.refusal = refusal
             return FORBIDDEN
+        if _is_streamed(client, context):
+            return NOT_NOW
         with self._changed:
             new_viewer = self._connections.get(client)
             if camera is None or new_viewer is None or not camera.is_open:
@@ -610,6 +613,20 @@ def _on_media_error(media: GstRtspServer.RTSPMedia, _message: Gst.Message, camer
     if camera.media is not media or camera.prepared:
         GObject.signal_stop_emission_by_name(media, MEDIA_ERROR)
     return True
+
+
+def _is_streamed(client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext) -> bool:
+    """Whether a connection plays the requested camera already, or has set it up in another session.
+
+    The library would not end the first copy: it would go on after the viewer has left, and no one would count it. A
+    camera that does not play yet may be set up again, as ffmpeg does for each profile in the description.
+    """
+    held = [(session, media) for session in client.session_filter(None) for media in session.filter(None)]
+    return any(
+        media.get_media() is context.media
+        and (session is not context.session or media.get_rtsp_state() == GstRtsp.RTSPState.PLAYING)
+        for session, media in held
+    )
 
 
 def _profiles(repairs: bool, secure: bool) -> GstRtsp.RTSPProfile:

@@ -400,6 +400,45 @@ def test_a_silent_viewer_over_udp_is_sent_nothing_after_its_session_ends():
         assert len(silent.packets) == seen
 
 
+@pytest.mark.parametrize("is_new_session", [False, True])
+def test_a_camera_that_plays_is_not_set_up_again_on_a_connection(is_new_session):
+    """Otherwise the first copy would go on after the viewer has left, counted by nobody."""
+    with ExitStack() as stack:
+        vehicle = stack.enter_context(serving("media.max_viewers=2"))
+        other = stack.enter_context(RtspClient(vehicle.url()))
+        assert other.open() == [200, 200, 200]
+        other.read()
+        client = stack.enter_context(RtspClient(vehicle.url()))
+        assert client.open(udp=True) == [200, 200, 200]
+        client.read()
+        until(lambda: client.frames > 5)
+        if is_new_session:
+            client.session = ""
+        assert client.ask("SETUP", f"{vehicle.url()}/stream=0", Transport="RTP/AVP/TCP;unicast;interleaved=0-1") == 455
+        client.tcp.close()
+
+        def is_silent():
+            seen, frames = len(client.packets), other.frames
+            until(lambda: other.frames > frames + 10)
+            return len(client.packets) == seen
+
+        until(is_silent)
+
+
+def test_a_camera_that_does_not_play_may_be_set_up_again():
+    """As ffmpeg does for each profile, and after a pause."""
+    with serving() as vehicle, RtspClient(vehicle.url()) as client:
+        transports = [f"RTP/{profile}/TCP;unicast;interleaved=0-1" for profile in ("AVPF", "AVP")]
+        assert client.ask("DESCRIBE", Accept="application/sdp") == 200
+        for transport in transports:
+            assert client.ask("SETUP", f"{vehicle.url()}/stream=0", Transport=transport) == 200
+        assert client.ask("PLAY") == client.ask("PAUSE") == 200
+        assert client.ask("SETUP", f"{vehicle.url()}/stream=0", Transport=transports[0]) == 200
+        assert client.ask("PLAY") == 200
+        client.read()
+        until(lambda: client.frames > 5)
+
+
 def test_viewers_that_keep_their_session_alive_stay_on_a_paused_camera():
     """A player's RTCP and keep-alive requests, a raw client's GET_PARAMETER."""
     with ExitStack() as stack:
