@@ -14,7 +14,7 @@ from runner.drive.checks import ClaimCheck
 from runner.drive.series import LinkSeries, Series
 from runner.drive.statistics import CameraStatistics, DriveStatistics, Latency
 
-VERSION = 1
+FORMAT_VERSION = 1
 
 
 def to_json(
@@ -28,7 +28,7 @@ def to_json(
     checks  by label of a drive
     """
     return {
-        "version": VERSION,
+        "version": FORMAT_VERSION,
         "tod_runner": version("tod-runner"),
         "figures": list(figures),
         "left_out": list(left_out),

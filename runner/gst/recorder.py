@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from runner.gst.bag_feed import BagFeed
 
 CHECK_MS = 100
-SILENT_S = 10.0  # a source that delivers nothing for this long has failed
+SOURCE_SILENT_S = 10.0  # a source that delivers nothing for this long has failed
 WRITE_S = 60.0  # an encoder or a disk that makes no progress for this long has failed
 LAST_S = 1.0  # in this last period each frame is checked, so that the file ends with the right one
 
@@ -201,7 +201,7 @@ class Recorder:
             return f"the file was not finished within {WRITE_S:g} s" if stalled_s > WRITE_S else None
         if self._queue.get_property("current-level-buffers"):  # the first frame of an encoder may take seconds
             return f"frames are queued, but none was written for {WRITE_S:g} s" if stalled_s > WRITE_S else None
-        return f"no frame for {SILENT_S:g} s" if stalled_s > SILENT_S else None
+        return f"no frame for {SOURCE_SILENT_S:g} s" if stalled_s > SOURCE_SILENT_S else None
 
     def _count_down(self) -> None:
         """Start checking every frame, to cut at the right one."""

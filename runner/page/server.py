@@ -55,7 +55,7 @@ MAX_STRANGERS = 100  # connections without access; a new one replaces the oldest
 MAX_BODY = 4096  # bytes of a request
 REQUEST_S = 10.0  # a connection without a complete request for this long is closed
 PING_S = 0.5
-SILENT_S = 2.0  # a viewer that has not answered a ping for this long is dropped, and reconnects if it is alive
+UNRESPONSIVE_S = 2.0  # a viewer that has not answered a ping for this long is dropped, and reconnects if it is alive
 CLOSE_TYPES = (WSMsgType.CLOSE, WSMsgType.CLOSING, WSMsgType.CLOSED, WSMsgType.ERROR)
 MAX_MESSAGE_BYTES = 1_048_576  # a longer message closes the connection
 # Inline styles: Plotly adds style elements and attributes of its own. Inline scripts stay forbidden.
@@ -382,9 +382,9 @@ class PageServer(Listener):
 
         raises  TimeoutError if it makes no progress: pings share the connection with the video and must be answered
         """
-        while (message := await ws.receive(SILENT_S)).type not in CLOSE_TYPES:
+        while (message := await ws.receive(UNRESPONSIVE_S)).type not in CLOSE_TYPES:
             if message.type is WSMsgType.PING:
-                await asyncio.wait_for(ws.pong(message.data), SILENT_S)
+                await asyncio.wait_for(ws.pong(message.data), UNRESPONSIVE_S)
             elif message.type in (WSMsgType.TEXT, WSMsgType.BINARY):
                 self._on_message(viewer, message.data)
 

@@ -18,7 +18,7 @@ from runner.rate_quality.choice import Choice
 from runner.rate_quality.curves import Crossing, Ladder, Point
 from runner.rate_quality.sequence import Sequence as Clip
 
-VERSION = 1
+FORMAT_VERSION = 1
 SCHEMA = "rate_quality"
 MARK = "Measured by `tod-runner model`"  # in each camera YAML written by this module
 
@@ -65,7 +65,7 @@ def to_json(measured: Measured) -> dict[str, Any]:
     choice = measured.choice
     sequences = {name: _clip_to_json(clip) for name, clip in measured.clips.items()}
     return {
-        "version": VERSION,
+        "version": FORMAT_VERSION,
         "tod_runner": version("tod-runner"),
         "name": measured.name,
         "content": digest(
@@ -135,8 +135,8 @@ def read_model(path: Path) -> dict[str, Any]:
         raise wrong((error.strerror or str(error)).lower()) from None
     except ValueError as error:
         raise wrong(f"is not a model file: {error}") from None
-    if isinstance(document, dict) and document.get("version", VERSION) != VERSION:
-        raise wrong(f"is of version {document['version']}, this tod-runner reads {VERSION}")
+    if isinstance(document, dict) and document.get("version", FORMAT_VERSION) != FORMAT_VERSION:
+        raise wrong(f"is of version {document['version']}, this tod-runner reads {FORMAT_VERSION}")
     found = schema.findings(document, SCHEMA)
     if found:
         raise wrong(found[0].rule, schema.dotted(found[0].path), found[0].found)

@@ -42,9 +42,13 @@ from rig import CHECKOUT
 
 
 def _tests(_seed: int, _scale: float) -> list[str]:
-    """Tests that `make test` excludes."""
-    status = subprocess.run([sys.executable, "-m", "pytest", "-m", "soak"], check=False, cwd=CHECKOUT).returncode
-    return [f"pytest ended with {status}"] if status else []
+    """Tests that `make test` excludes, and what `validate` finds in mutations of packaged files."""
+    commands = {"pytest": ("-m", "pytest", "-m", "soak"), "golden": ("tests/golden", "mutations")}
+    ended = {
+        name: subprocess.run([sys.executable, *words], check=False, cwd=CHECKOUT).returncode
+        for name, words in commands.items()
+    }
+    return [f"{name} ended with {status}" for name, status in ended.items() if status]
 
 
 Part = Callable[[int, float], list[str]]  # seed, scale -> problems
