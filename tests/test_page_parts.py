@@ -585,6 +585,22 @@ def test_a_viewer_starts_with_a_burst_of_which_only_the_last_unit_is_drawn():
     assert sent(viewer) == [(0, 0, 9), (0, KEY, 10)]
 
 
+def test_a_viewer_that_starts_late_is_not_shown_a_mixed_picture():
+    """Others go on: their decoders hold what was sent before."""
+    stored = [unit(0, key=True)]
+    viewer, late = (PageViewer(name, range(1), lambda camera: stored) for name in ("viewer", "late"))
+    assert sent(viewer) == [(0, KEY | RESTART, 0)]
+    units = [unit(7)._replace(whole=False), unit(8)._replace(whole=False), unit(9), unit(10)._replace(whole=False)]
+    stored.append(units[0])
+    for each in units[1:]:
+        viewer.show(0, each)
+    assert sent(viewer) == [(0, 0, 8), (0, 0, 9), (0, 0, 10)]
+    assert sent(late) == [(0, KEY | RESTART | CATCH_UP, 0), (0, CATCH_UP, 7)]
+    for each in units[1:]:
+        late.show(0, each)
+    assert sent(late) == [(0, CATCH_UP, 8), (0, 0, 9), (0, 0, 10)]
+
+
 def test_a_viewer_waits_for_a_burst_and_a_single_unit_is_drawn():
     burst = []
     viewer = PageViewer("me", range(1), lambda camera: burst)

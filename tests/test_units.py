@@ -136,6 +136,35 @@ def test_a_wave_that_takes_longer_than_stated_is_kept_whole():
     assert len(rest) == 19
 
 
+@pytest.mark.parametrize("waves", [True, False])
+def test_who_joins_after_a_long_pause_is_not_shown_an_old_picture_in_part(waves):
+    recent = RecentUnits(refresh_s=1.0)
+
+    def passed(seconds, begin):
+        times = [round(begin + tenth / 10, 1) for tenth in range(round(10 * seconds))]
+        return [recent.add(unit(t, recovery=9 if waves and round(10 * t) % 10 == 0 else None)) for t in times]
+
+    recent.add(unit(0, key=True))
+    assert all(u.whole for u in passed(10, begin=0.1))
+    resumed = passed(4, begin=30.5)
+    assert all(u.exact for u in resumed), "a decoder that has been running is exact"
+    first = next(u.arrived for u in resumed if u.whole)
+    assert first == (31.9 if waves else 32.5), "the end of the first wave, or two periods"
+    assert all(u.whole for u in resumed if u.arrived >= first)
+    assert recent.add(unit(60)).whole is False
+    recent.add(unit(60.1, key=True))
+    assert recent.add(unit(60.2)).whole
+
+
+def test_who_joins_after_a_short_pause_starts_with_the_units_before_it():
+    recent = RecentUnits(refresh_s=1.0)
+    recent.add(unit(0, key=True))
+    times = [*(tenth / 10 for tenth in range(1, 60)), 11.0, 11.1]
+    shown = [recent.add(unit(t, recovery=9 if round(10 * t) % 10 == 0 else None)) for t in times]
+    assert all(u.whole for u in shown)
+    assert recent.burst()[1].arrived < 6
+
+
 def test_waves_that_never_end_are_forgotten():
     recent = RecentUnits(refresh_s=1.0)
     recent.add(unit(0, key=True))

@@ -26,6 +26,7 @@ class AccessUnit(NamedTuple):
     recovery  frames after which a decoder that starts here is exact, if a refresh wave begins here; otherwise None
     exact     False: the decoded picture still shows content that was never sent
     damaged   whether the decoded picture still shows earlier packet loss
+    whole     False: a decoder that starts late shows an older picture in part, see `RecentUnits`
     """
 
     data: bytes
@@ -35,6 +36,7 @@ class AccessUnit(NamedTuple):
     recovery: int | None = None
     exact: bool = True
     damaged: bool = False
+    whole: bool = True
 
 
 def read_unit(
@@ -105,7 +107,9 @@ class RecentUnits:
 
     With intra-refresh, an IDR is sent only when the picture size changes. Starting from it alone mixes an old picture
     with new changes; after two refresh periods, or one whole wave that the stream announces, the old picture is gone.
-    A stream that others already watch sends no IDR for a late viewer, who starts from a grey one.
+    A stream that others already watch sends no IDR for a late viewer, who starts from a grey one. After a long pause
+    the units before it are gone, so a decoder that starts now shows the last IDR where no wave has passed yet; one that
+    has been running does not.
 
     refresh_s  length of a refresh wave or keyframe interval, s; None if the graph does not state it
     codec      h264 or h265; an H.265 stream that others already watch starts with its next IRAP picture
@@ -117,12 +121,15 @@ class RecentUnits:
         self._key: AccessUnit | None = None
         self._since: deque[AccessUnit] = deque()
         self._exact_from = 0.0  # after a grey start: when two periods have passed
+        self._resumed = 0.0  # when the stream went on after its last long pause
+        self._is_cut = False  # whether units since the last IDR are no longer stored
 
     def add(self, unit: AccessUnit) -> AccessUnit:
         """Store a received unit; returns it with `exact` set for a decoder that starts from the stored units."""
         if unit.key:
             self._key, self._exact_from = unit, unit.arrived + (0 if unit.exact else self._window)
             self._since.clear()
+            self._is_cut = False
             return unit
         if self._key is None and (grey := self._grey(unit.data)):
             self._key = AccessUnit(grey, None, unit.arrived, key=True, exact=False)
@@ -130,12 +137,16 @@ class RecentUnits:
         if self._key is None:
             return unit._replace(exact=False)
         self._follow_clock(unit.arrived)
+        if self._since and unit.arrived - self._since[-1].arrived > self._window:
+            self._resumed = unit.arrived
         self._since.append(unit)
         self._forget(unit.arrived)
         if unit.arrived < self._exact_from and self._wave() is not None:
             self._exact_from = unit.arrived
         if unit.arrived < self._exact_from:
             self._since[-1] = unit = unit._replace(exact=False)
+        if self._is_cut and unit.arrived - self._resumed < self._window and self._wave() is None:
+            self._since[-1] = unit = unit._replace(whole=False)
         return unit
 
     def _follow_clock(self, now: float) -> None:
@@ -144,6 +155,7 @@ class RecentUnits:
         if back > 0:
             self._since = deque(each._replace(arrived=each.arrived - back) for each in self._since)
             self._exact_from -= back
+            self._resumed -= back
 
     def _forget(self, now: float) -> None:
         """Drop units older than the window, but keep waves whole that take longer because frames are late."""
@@ -153,6 +165,7 @@ class RecentUnits:
             spare, oldest = len(self._since), now - self._window
         while self._since[0].arrived < oldest or (spare > 0 and self._since[0].arrived < now - self._window):
             self._since.popleft()
+            self._is_cut = True
             spare -= 1
 
     def burst(self) -> list[AccessUnit]:

@@ -90,13 +90,15 @@ class PageViewer:
                 return self._pack(camera, *queue.burst.popleft())
             if queue.live:
                 unit = queue.live.popleft()
-                return self._pack(camera, 0, unit)
+                queue.is_mixed = queue.is_mixed and not unit.whole
+                return self._pack(camera, CATCH_UP if queue.is_mixed else 0, unit)
         return None
 
     def _catch_up(self, camera: int, queue: _CameraQueue) -> None:
         units = self._burst(camera)
         queue.needs_burst = not units
-        last = len(units) - 1
+        queue.is_mixed = bool(units) and not units[-1].whole
+        last = len(units) - (0 if queue.is_mixed else 1)
         for number, unit in enumerate(units):
             flags = (RESTART if number == 0 else 0) | (CATCH_UP if number < last else 0)
             queue.burst.append((flags, unit))
@@ -110,8 +112,12 @@ class PageViewer:
 
 @dataclass
 class _CameraQueue:
-    """Units of one camera: whether a burst is due, the rest of that burst, and the units received since."""
+    """Units of one camera: whether a burst is due, the rest of that burst, and the units received since.
+
+    is_mixed  whether the viewer's decoder started too late to show the whole picture, see `AccessUnit.whole`
+    """
 
     needs_burst: bool = True
     burst: deque[tuple[int, AccessUnit]] = field(default_factory=deque)
     live: deque[AccessUnit] = field(default_factory=deque)
+    is_mixed: bool = False
