@@ -3,7 +3,8 @@
     python fed_vehicle.py CONF OVERRIDE...
 
 Each line of input is a camera and its new behaviour: `rear moves`, `rear hangs` (it delivers nothing) or
-`rear repeats` (its last picture, as new). The answer is the time of the change, s since 1970. Ends with its input.
+`rear repeats` (its last picture, as new); `rear loses` (the packets of its next picture, which nothing can repair,
+then it goes on as before). The answer is the time of the change, s since 1970. Ends with its input.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from runner.configuration.config import configuration
 from runner.core.model import Camera, Vehicle
 from runner.vehicle.live import LiveVehicle, live_vehicle
 
-DOES = ("moves", "hangs", "repeats")
+DOES = ("moves", "hangs", "repeats", "loses")
 STEP_PX = 4  # of the picture from one to the next
 NOISES, NOISE = 7, 12  # different ones, and their size: an encoder needs all of its bitrate for it
 
@@ -41,8 +42,25 @@ class Feed:
         """Returns the time of the change."""
         assert camera in self._does and does in DOES, f"{camera} {does}"
         with self._lock:
-            self._does[camera] = does
+            if does == "loses":
+                self._lose(camera)
+            else:
+                self._does[camera] = does
             return time.time()
+
+    def _lose(self, camera: str) -> None:
+        """Drop the packets of one picture before the server numbers the copies that it keeps for retransmission."""
+        from runner.gst import Gst
+
+        server = self._live.side._server
+        assert server
+        packets = server.pipelines[camera]._elements[-1].get_static_pad("src")
+
+        def drop(_pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+            packets.remove_probe(info.id)
+            return Gst.PadProbeReturn.DROP
+
+        packets.add_probe(Gst.PadProbeType.BUFFER_LIST, drop)
 
     def run(self) -> None:
         due = time.monotonic()

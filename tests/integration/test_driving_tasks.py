@@ -54,7 +54,7 @@ class Drive:
         self.noticed_ms = vehicle.page.late_ms + MORE_MS
 
     def let(self, camera, does):
-        """A camera moves, hangs or repeats its picture from now on; returns since when, ms since 1970."""
+        """A camera moves, hangs or repeats its picture from now on, or loses one; returns when, ms since 1970."""
         self._fed.stdin.write(f"{camera} {does}\n")
         self._fed.stdin.flush()
         assert select.select([self._fed.stdout], [], [], 10)[0], "the vehicle does not answer"
@@ -348,6 +348,16 @@ def test_notice_a_picture_that_is_repeated_as_new(page, drive):
             until(lambda: share(page, "rear", RED) > 0.05)
         drive.let("rear", "moves")
     within("repeated rear view", delays, 1000 * REPEATED_S + drive.noticed_ms)
+
+
+def test_notice_a_damaged_picture(page, drive):
+    """Until a key frame heals it."""
+    delays = []
+    for _ in range(ROUNDS):
+        settled(page)
+        cause = drive.let("left", "loses")
+        delays.append(marked_ms(page, "left", {"damaged"}, cause))
+    within("damaged picture", delays, drive.noticed_ms)
 
 
 def test_notice_a_late_picture(page, drive):

@@ -137,6 +137,37 @@ def test_the_wheel_zooms_the_region_the_middle_button_moves_it_and_its_aspect_ma
     assert (roi["y"], roi["width"], roi["height"]) == (60, 880, 495)
 
 
+def test_two_fingers_zoom_and_move_the_region(page, station):
+    """As a wheel does: the point between the fingers stays between them."""
+    box = page.locator("[data-camera=scaled] .picture").bounding_box()
+    touch_screen = page.context.new_cdp_session(page)
+
+    def touch(kind, *fingers):
+        points = [
+            {"id": number, "x": box["x"] + x * box["width"], "y": box["y"] + y * box["height"]}
+            for number, (x, y) in enumerate(fingers)
+        ]
+        touch_screen.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+    def is_requested(**roi):
+        request = getattr(station, "last_request", None) or {}
+        return request == {"event": "roi_set", "camera": "scaled"} | {key: pytest.approx(at, abs=4) for key, at in roi.items()}
+
+    station.last_request = None
+    touch("touchStart", (0.2, 0.5))
+    touch("touchStart", (0.2, 0.5), (0.3, 0.5))
+    for apart in (0.06, 0.08, 0.1):
+        touch("touchMove", (0.25 - apart, 0.5), (0.25 + apart, 0.5))
+    until(lambda: is_requested(x=160, y=180, width=640, height=360))
+    touch("touchMove", (0.2, 0.5), (0.4, 0.5))
+    until(lambda: is_requested(x=128, y=180, width=640, height=360))
+    touch("touchEnd", (0.2, 0.5))
+    touch("touchMove", (0.3, 0.7))  # one finger is no pinch
+    touch("touchEnd")
+    until(lambda: page.evaluate("tod.requests.pending") == [])
+    assert is_requested(x=128, y=180, width=640, height=360)
+
+
 def test_a_picture_of_a_region_shows_where_it_lies_in_the_full_image(page):
     def frame(name):
         return page.locator(f"[data-camera={name}] .picture .diagram")
