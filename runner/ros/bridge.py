@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import threading
 import time
 import uuid
 from collections.abc import Callable, Mapping
@@ -29,9 +30,11 @@ from runner.mqtt.messages import (
 from runner.ros.inputs import PRESENCE, OperatorInput, check_names, input_services, input_topics, ros_name
 from runner.ros.process import Message, NodeProcess
 from runner.security.keyring import Keyring
+from runner.system.reports import LimitedReports
 
 REQUEST, REPLY, STATE, TELEMETRY, URL = "~/request", "~/reply", "~/state", "~/telemetry", "~/url"
 EVERY_S = 0.1  # between two positions, and between two predictions
+OFFLINE = '{"online": false}'
 
 
 class Bridge:
@@ -47,7 +50,7 @@ class Bridge:
 
     def __init__(self, vehicle: Vehicle, keyring: Keyring | None, on_report: Callable[[str], None]) -> None:
         check_names(vehicle)
-        self._vehicle, self._on_report = vehicle, on_report
+        self._vehicle, self._on_report, self._report_fault = vehicle, on_report, LimitedReports(on_report)
         login = Login(keyring, on_report) if keyring else None
         self.identity = login.user if login else uuid.uuid4().hex[:12]
         self._vehicle_time = (0.0, -math.inf)  # in the newest telemetry, and when it arrived by time.monotonic
@@ -59,7 +62,10 @@ class Bridge:
         self._topics, self._services = input_topics(vehicle), input_services(vehicle)
         self._reports = bool(vehicle.ros.position or vehicle.ros.prediction)
         self._due: dict[str, float] = {}  # by event, when the next may be sent
-        self._reported: set[str] = set()
+        self._lock = threading.Lock()  # of the next three
+        self._state = OFFLINE  # the newest from the vehicle
+        self._is_shown = True  # whether it was published last; OFFLINE is, once the vehicle has been silent
+        self._state_time = -math.inf  # when it arrived by time.monotonic
         self._requests = topic(vehicle.name, "request", self.identity)
         listen = {
             topic(vehicle.name, "state"): self._on_state,
@@ -104,8 +110,16 @@ class Bridge:
         self._node.close()
 
     def time_out(self) -> None:
-        """Answer requests that the vehicle has not answered; to be called a few times a second."""
+        """Answer requests that the vehicle has not answered, and publish that it is offline once it has been silent.
+
+        To be called a few times a second.
+        """
         now = time.monotonic()
+        with self._lock:
+            is_silent = now - max(self._state_time, self._vehicle_time[1]) > SILENT_S
+            if self._is_shown and is_silent and self._state != OFFLINE:
+                self._node.publish(STATE, OFFLINE)
+                self._is_shown = False
         for identity in [identity for identity, until in tuple(self._pending.items()) if now > until]:
             if self._pending.pop(identity, None) is not None:
                 self._answer(identity, "timed out", f"the vehicle did not answer within {self._answer_s:g} s")
@@ -113,13 +127,19 @@ class Bridge:
     # --- from the vehicle, in the link's thread -----------------------------------------------------------------------
 
     def _on_state(self, message: MqttMessage) -> None:
-        read_state(message.payload)
-        self._node.publish(STATE, message.payload.decode())
+        state = OFFLINE if read_state(message.payload) is None else message.payload.decode()
+        with self._lock:
+            self._node.publish(STATE, state)
+            self._state, self._is_shown, self._state_time = state, True, time.monotonic()
 
     def _on_telemetry(self, message: MqttMessage) -> None:
         telemetry = read_telemetry(message.payload)
         if not message.retained:
-            self._vehicle_time = (telemetry.t, time.monotonic())
+            with self._lock:
+                self._vehicle_time = (telemetry.t, time.monotonic())
+                if not self._is_shown:
+                    self._node.publish(STATE, self._state)
+                    self._is_shown = True
             self._node.publish(TELEMETRY, message.payload.decode())
 
     def _on_reply(self, message: MqttMessage) -> None:
@@ -127,7 +147,7 @@ class Bridge:
         if self._pending.pop(reply.id, None) is not None:
             self._answer(reply.id, reply.result, reply.reason, reply.t)
         elif reply.result != "applied":
-            self._report_once(f"{reply.id.partition(' ')[0]}: {reply.result}: {reply.reason}")
+            self._report_fault(f"{reply.id.partition(' ')[0]}: {reply.result}: {reply.reason}")
 
     # --- from ROS, in the node's thread -------------------------------------------------------------------------------
 
@@ -163,7 +183,7 @@ class Bridge:
         assert prediction
         if others := [name for name in nodes if name != prediction.node]:
             published = f"is published by {', '.join(others)}, must be by {prediction.node} alone"
-            self._report_once(f"{prediction.topic} {published}: predictions are left out")
+            self._report_fault(f"{prediction.topic} {published}: predictions are left out")
         return nodes == [prediction.node]
 
     def _on_request(self, text: str) -> None:
@@ -215,9 +235,3 @@ class Bridge:
 
     def _on_node_report(self, name: str, what: str) -> None:
         self._on_report(f"{name}: {what}" if name else what)
-
-    def _report_once(self, what: str) -> None:
-        """Report a fault once."""
-        if what not in self._reported:
-            self._reported.add(what)
-            self._on_report(what)

@@ -133,13 +133,15 @@ def offline(operator):
     return reply if reply["reason"] == "the vehicle is offline" else None
 
 
-def test_a_request_that_the_vehicle_does_not_answer_times_out(ros, lines):
+def test_a_vehicle_that_hangs_is_offline_and_its_requests_time_out(ros, lines):
     with bridged(ros, lines) as (_, _, (vehicle, _)), ros.client("interface", *HEARD) as operator:
         operator.newest("telemetry")
         assert operator.ask(id="one", event="mode_selected", mode="collective")["result"] == "applied"
         vehicle.send_signal(signal.SIGSTOP)
         reply = operator.ask(id="two", event="mode_selected", mode="single")
+        until(lambda: operator.texts("state")[-1] == '{"online": false}')
         vehicle.send_signal(signal.SIGCONT)
+        until(lambda: operator.newest("state").get("mode"))
         assert (reply["id"], reply["result"]) == ("two", "timed out")
         assert reply["reason"] == "the vehicle did not answer within 3 s"
 
