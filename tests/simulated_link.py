@@ -131,6 +131,10 @@ class Drive:
     def lowest(self, begin: float, end: float) -> float:
         return min(cap for t, cap, _ in self.caps if begin <= t < end)
 
+    def cuts(self, begin: float, end: float) -> int:
+        caps = [cap for t, cap, _ in self.caps if begin <= t < end]
+        return sum(after < before for before, after in itertools.pairwise(caps))
+
     def first(self, since: float, wanted: Callable[[float], bool]) -> float:
         """Time until the cap fulfils a condition, s."""
         return next(t for t, cap, _ in self.caps if t >= since and wanted(cap)) - since

@@ -158,6 +158,7 @@ def test_a_stall_cuts_once_and_is_over_within_a_second(begin: float, seconds: fl
     end = begin + seconds
     done = drive(Link(steps((0, 4000)), stalls((begin, end))), steps((0, RIGHT)), 8)
     assert done.lowest(begin, 8) >= 0.6 * 0.97 * RIGHT
+    assert done.cuts(begin - 0.5, 8) <= 1
     assert done.first(end, lambda cap: cap >= 0.9 * RIGHT) <= 1
     assert done.lowest(end + 1, 8) >= 0.9 * RIGHT
 
