@@ -132,7 +132,7 @@ class _Glib:
         load_types()
         self._loop = GLib.MainLoop()
         self._calls: deque[Callable[[], None]] = deque()
-        # One watch for all calls: see runner/gst/one_shot.py. Its priority is that of the timers: at a lower one,
+        # One watch for all calls: see runner/gst/buffer_probe.py. Its priority is that of the timers: at a lower one,
         # calls would wait for as long as an overloaded loop always has a timer to run.
         self._wakeup = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         self._watch = GLib.unix_fd_add_full(GLib.PRIORITY_DEFAULT, self._wakeup, GLib.IOCondition.IN, self._on_wakeup)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
-from gi.repository import GLib
+from runner.gst.timers import later
 
-MERGE_MS = 300
+MERGE_S = 0.3
 
 
 class Outage:
@@ -63,11 +63,10 @@ class ReportMerger:
             if camera not in cameras:
                 cameras.append(camera)
         if first:
-            GLib.timeout_add(MERGE_MS, self.flush)
+            later(MERGE_S, self.flush)
 
-    def flush(self) -> bool:
+    def flush(self) -> None:
         with self._lock:
             merged, self._cameras = self._cameras, {}
         for what, cameras in merged.items():
             self._on_report(", ".join(cameras), what)
-        return False

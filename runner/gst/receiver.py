@@ -13,7 +13,7 @@ from gi.repository import GObject, Gst, GstSdp
 from runner.graph import Plan, video_codec
 from runner.gst.arriving import MAX_FRAMES, NTP_EPOCH_S, RTP_HZ, MediaClock
 from runner.gst.caps import structure
-from runner.gst.one_shot import OneShot, PassingBuffer
+from runner.gst.buffer_probe import BufferProbe, PassingBuffer
 from runner.gst.repair import RepairBuffer
 from runner.gst.sender_filter import SenderFilter
 from runner.gst.supervised import SupervisedPipeline
@@ -127,7 +127,7 @@ class Receiver:
         self._supervised = SupervisedPipeline(launch, self._on_built, lambda what: on_report(name, what))
         self._before = Reception()  # counters of earlier pipelines
         self._latency, self._decode = RecentValue[float](), RecentValue[float]()  # ms, of a sampled frame
-        self._entered = (0, 0.0)  # PTS of the newest access unit, and when it arrived
+        self._entered: tuple[int | None, float] = (None, 0.0)  # PTS of the newest access unit, and when it arrived
         self._foreign_reported = False
         self._filter: SenderFilter | None = None
         self._built = False
@@ -233,10 +233,8 @@ class Receiver:
         self._progress = (self._frames, time.monotonic())
         pipeline.get_bus().connect("message::progress", self._on_progress)
         self._sink = pipeline.get_by_name(self._sink_name)
-        self._next_picture = OneShot(self._sink.get_static_pad("sink"), self._on_frame)
+        self._next_picture = BufferProbe(self._sink.get_static_pad("sink"), self._on_frame)
         self._begun = False
-        for buffer in self._buffers:
-            buffer.close()
         self._buffers, self._over_udp, self._feedback = [], False, False
         pipeline.connect("deep-element-added", self._on_element)
         self._client = pipeline.get_by_name(self._client_name)
@@ -249,9 +247,11 @@ class Receiver:
         if self._video:
             VideoFile(self._video, self._name, "operator", _captured, self._on_report).follow(pipeline)
         received = pipeline.get_by_name("received").get_static_pad("src")
-        received.add_probe(Gst.PadProbeType.BUFFER, self._on_arrival)
+        self._probes = [BufferProbe(received, self._on_arrival)]
         if self._untimed and (depayloader := pipeline.get_by_name(self._untimed)):
-            depayloader.get_static_pad("sink").add_probe(Gst.PadProbeType.BUFFER, self._on_packet)
+            self._probes.append(BufferProbe(depayloader.get_static_pad("sink"), self._on_packet))
+        for probe in self._probes:
+            probe.arm()
         if self._on_picture:
             self._sink.connect("new-sample", self._on_sample)
         return received
@@ -310,39 +310,38 @@ class Receiver:
         now, reference_ns, (pts, arrived) = time.monotonic(), picture.reference_ns, self._entered
         if reference_ns is not None:
             self._latency.set(1000 * (time.time() - unix_s(reference_ns)))
-        if picture.pts == pts:
+        if pts is not None and picture.pts == pts:
             self._decode.set(1000 * (now - arrived))
         return True
 
-    def _on_arrival(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+    def _on_arrival(self, _pad: Gst.Pad, buffer: PassingBuffer) -> bool:
         """An access unit has arrived; page and log share its times, and over SRT the reception report too."""
-        arrived, monotonic, buffer = time.time(), time.monotonic(), info.get_buffer()
-        captured = capture_time(buffer)
+        arrived, monotonic, size, reference_ns = time.time(), time.monotonic(), buffer.size, buffer.reference_ns
+        captured = None if reference_ns is None else unix_s(reference_ns)
         self._entered = (buffer.pts, monotonic)
         if captured is not None or self._untimed:
             sampled = self._media_clock.seconds if captured is None else captured
-            self._newest = Arrival(monotonic, sampled, buffer.get_size())
+            self._newest = Arrival(monotonic, sampled, size)
             if not self._buffers:
                 self._unread.append(self._newest)
         if self._arrivals is not None:
             self._arrivals.append((arrived, captured))
-        self._bytes += buffer.get_size()
+        self._bytes += size
         self._frames += 1  # after its arrival is recorded: no sample counts a frame without one
         # The depayloader marks the very first unit, and each unit with missing packets.
         incomplete, self._begun = self._begun and buffer.has_flags(Gst.BufferFlags.DISCONT), True
-        damaged = self._damage.add(incomplete, lambda: bytes(buffer.extract_dup(0, HEAD_BYTES)))
+        damaged = self._damage.add(incomplete, lambda: buffer.extract(0, HEAD_BYTES))
         self._damaged += damaged
         if self._on_unit:
-            data = buffer.extract_dup(0, buffer.get_size())
-            unit = read_unit(data, captured, arrived, damaged=incomplete, codec=self._codec)
+            unit = read_unit(buffer.extract(0, size), captured, arrived, damaged=incomplete, codec=self._codec)
             if unit:
                 self._on_unit(self._name, unit._replace(damaged=damaged))
-        return Gst.PadProbeReturn.OK
+        return False
 
-    def _on_packet(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+    def _on_packet(self, _pad: Gst.Pad, packet: PassingBuffer) -> bool:
         """Use the RTP timestamp (RFC 3550, section 5.1) in place of the capture time."""
-        self._media_clock.tick(int.from_bytes(info.get_buffer().extract_dup(4, 4), "big"))
-        return Gst.PadProbeReturn.OK
+        self._media_clock.tick(int.from_bytes(packet.extract(4, 4), "big"))
+        return False
 
     def _arrived(self, frames: int) -> tuple[tuple[float, float | None], ...]:
         """Arrivals since the last call, only of frames already counted: more may arrive meanwhile."""

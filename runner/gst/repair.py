@@ -8,7 +8,7 @@ from collections import deque
 from gi.repository import GObject, Gst
 
 from runner.gst.arriving import HEADER_BYTES, ArrivingFrames, read_packet
-from runner.gst.one_shot import OneShot, PassingBuffer
+from runner.gst.buffer_probe import BufferProbe, PassingBuffer
 from runner.system.recent import RecentValue
 
 REORDER_MS = 5  # a packet that is missing for longer was lost, not reordered
@@ -38,12 +38,13 @@ class RepairBuffer:
         buffer.set_property("rtx-next-seqnum", False)
         buffer.set_property("rtx-delay", REORDER_MS)
         self._pad = buffer.get_static_pad("sink")
-        self._probe = self._pad.add_probe(Gst.PadProbeType.BUFFER, self._on_packet)
+        self._arriving = BufferProbe(self._pad, self._on_packet)
+        self._arriving.arm()
         self.frames = ArrivingFrames()
         self._tail_requested = False
         self._ends: deque[tuple[int, float]] = deque(maxlen=FRAMES)  # of frames: timestamp, arrival of the last packet
         self._waited = RecentValue[float]()  # how long a frame waited here, ms
-        self._passing = OneShot(buffer.get_static_pad("src"), self._on_passed)
+        self._passing = BufferProbe(buffer.get_static_pad("src"), self._on_passed)
         self._counted = (0, 0)  # packets received, and missing
         self._recent: tuple[float, ...] = (0.0, 0.0)  # the same, decaying
         self._congested = False  # no retransmission
@@ -68,10 +69,6 @@ class RepairBuffer:
         """How long the end of a recent frame waited here; samples the next frame. A few times a second."""
         self._passing.arm()
         return self._waited.get()
-
-    def close(self) -> None:
-        """Break the reference cycle between this object and the pads of a buffer whose pipeline has ended."""
-        self._pad.remove_probe(self._probe)
 
     def _on_passed(self, _pad: Gst.Pad, buffer: PassingBuffer) -> bool:
         now = time.monotonic()
@@ -105,15 +102,15 @@ class RepairBuffer:
         request.set_value("seqnum", GObject.Value(GObject.TYPE_UINT, self.frames.next_number()))
         self._pad.push_event(Gst.Event.new_custom(Gst.EventType.CUSTOM_UPSTREAM, request))
 
-    def _on_packet(self, _pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
-        buffer, now = info.get_buffer(), time.monotonic()
-        packet = read_packet(buffer.extract_dup(0, HEADER_BYTES), buffer.get_size())
+    def _on_packet(self, _pad: Gst.Pad, buffer: PassingBuffer) -> bool:
+        now = time.monotonic()
+        packet = read_packet(buffer.extract(0, HEADER_BYTES), buffer.size)
         retransmitted = buffer.has_flags(RETRANSMITTED)
         if not self.frames.add(packet, now, retransmitted=retransmitted):
-            return Gst.PadProbeReturn.OK
+            return False
         if self._tail_requested and retransmitted:
             buffer.unset_flags(RETRANSMITTED)  # the buffer drops retransmissions that it has not requested itself
         if packet.last:
             self._ends.append((packet.stamp, now))
         self._tail_requested = False
-        return Gst.PadProbeReturn.OK
+        return False

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from gi.repository import Gst
 
 from runner.gst.caps import structure
-from runner.gst.one_shot import OneShot, PassingBuffer
+from runner.gst.buffer_probe import BufferProbe, PassingBuffer
 from runner.gst.outage import Outage
 
 SLICES, SLICE_BYTES = 16, 8192  # compared parts of a picture: sensor noise is everywhere
@@ -26,7 +26,7 @@ class RepeatDetector:
 
     def __init__(self, pad: Gst.Pad, after_s: float | None, on_report: Callable[[str], None]) -> None:
         self._after_s = after_s
-        self._next = OneShot(pad, self._on_picture)
+        self._next = BufferProbe(pad, self._on_picture)
         self.outage = Outage(on_report)
         self._digest: int | None = None
         self._since, self._checks = 0.0, 0

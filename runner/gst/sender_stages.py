@@ -9,7 +9,7 @@ from typing import NamedTuple
 from gi.repository import Gst
 
 from runner.gst.clocks import captured_at
-from runner.gst.one_shot import OneShot, PassingBuffer
+from runner.gst.buffer_probe import BufferProbe, PassingBuffer
 from runner.system.recent import RecentValue
 
 SAME_S = 1e-4  # capture times of the same picture before and after the encoder differ by less
@@ -31,8 +31,8 @@ class EncoderWatch:
 
     def __init__(self, elements: Iterable[Gst.Element]) -> None:
         encoder = next((element for element in elements if _is_encoder(element)), None)
-        self._into = OneShot(encoder.get_static_pad("sink"), self._on_raw) if encoder else None
-        self._out = OneShot(encoder.get_static_pad("src"), self._on_coded) if encoder else None
+        self._into = BufferProbe(encoder.get_static_pad("sink"), self._on_raw) if encoder else None
+        self._out = BufferProbe(encoder.get_static_pad("src"), self._on_coded) if encoder else None
         self._remaining = 0
         self._entered = (0.0, 0.0)  # capture time, s since 1970; ms from it to the encoder
         self._measured = RecentValue[SenderStages]()

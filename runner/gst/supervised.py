@@ -5,19 +5,21 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from gi.repository import GLib, Gst
 
 from runner.graph import Plan
 from runner.gst.aside import HUNG, set_state_in_thread
+from runner.gst.buffer_probe import BufferProbe, PassingBuffer
 from runner.gst.outage import Outage
 from runner.gst.pipeline import Build, CameraPipeline, encrypt
-from runner.gst.timers import every
+from runner.gst.timers import Delayed, every, later
 
 RETRY_S = 1.0  # minimum time between the starts of two attempts
 STOPPED_S = 2.0  # how long the next pipeline waits for the previous one to release its port
-STOPPING_MS = 20  # how often it checks
+STOPPING_S = 0.02  # between two checks
 WATCH_MS = 250  # how often a caller's acknowledgements are counted
 UNACKNOWLEDGED_S = 1.5  # without an acknowledgement for this long, packets are not delivered; SRT itself needs 5 s
 PATIENCE_S = 5.0  # the other side may start later: until then a waiting side reports nothing
@@ -40,8 +42,8 @@ class SupervisedPipeline:
         self._launch, self._on_built, self._on_report = launch, on_built, on_report
         self._pipeline: Gst.Pipeline | None = None
         self._change: threading.Thread | None = None  # the last state change of the last pipeline
-        self._retry = 0
-        self._attempt = 0
+        self._retry: Delayed | None = None
+        self._first: Gst.Pad | None = None  # whose first buffer shows that this pipeline works
         self._begun = self._ended = time.monotonic()  # start and end of the last attempt
         self._lost = self._begun  # when a pipeline last worked
         self._works = self._worked = False  # this pipeline, any pipeline
@@ -54,18 +56,19 @@ class SupervisedPipeline:
             element, pipeline = pipeline, Gst.Pipeline.new(None)
             pipeline.add(element)
         self._pipeline, self._begun, self._works = pipeline, time.monotonic(), False
-        self._attempt += 1
         bus = pipeline.get_bus()
         bus.add_signal_watch()
         bus.connect("message::error", self._on_failed)
         bus.connect("message::eos", self._on_failed)
-        self._on_built(pipeline).add_probe(Gst.PadProbeType.BUFFER, self._on_first_buffer, self._attempt)
+        self._first = self._on_built(pipeline)
+        self._probe = BufferProbe(self._first, self._on_first_buffer)
+        self._probe.arm()
         self._change = set_state_in_thread(pipeline, Gst.State.PLAYING)
 
     def stop(self) -> None:
         if self._retry:
-            GLib.source_remove(self._retry)
-            self._retry = 0
+            self._retry.cancel()
+            self._retry = None
         if self._pipeline is not None:
             self._pipeline.get_bus().remove_signal_watch()
             self._change = set_state_in_thread(
@@ -84,30 +87,28 @@ class SupervisedPipeline:
         if self._worked or now - self._lost > PATIENCE_S:
             self._outage.report_failure(why, self._lost)
         self.stop()
-        self._retry = GLib.timeout_add(round(1000 * max(0.0, self._begun + RETRY_S - now)), self._retry_start)
+        self._retry = later(max(0.0, self._begun + RETRY_S - now), self._retry_start)
 
-    def _retry_start(self) -> bool:
+    def _retry_start(self) -> None:
         if self._change and self._change.is_alive() and time.monotonic() - self._ended < STOPPED_S:
-            self._retry = GLib.timeout_add(STOPPING_MS, self._retry_start)
-            return False
-        self._retry = 0
+            self._retry = later(STOPPING_S, self._retry_start)
+            return
+        self._retry = None
         self.start()
-        return False
 
     def _on_failed(self, _bus: Gst.Bus, message: Gst.Message) -> None:
         failed = message.type == Gst.MessageType.ERROR
         self.restart(message.parse_error()[0].message if failed else "the stream ended")
 
-    def _on_first_buffer(self, _pad: Gst.Pad, _info: Gst.PadProbeInfo, attempt: int) -> Gst.PadProbeReturn:
+    def _on_first_buffer(self, pad: Gst.Pad, _buffer: PassingBuffer) -> bool:
         """From a streaming thread."""
-        GLib.idle_add(self._on_working, attempt, priority=GLib.PRIORITY_DEFAULT)  # idle priority may starve
-        return Gst.PadProbeReturn.REMOVE
+        later(0, partial(self._on_working, pad))
+        return True
 
-    def _on_working(self, attempt: int) -> bool:
-        if attempt == self._attempt and self._pipeline is not None:
+    def _on_working(self, pad: Gst.Pad) -> None:
+        if pad is self._first and self._pipeline is not None:
             self._works = self._worked = True
             self._outage.report_recovery(time.monotonic())
-        return False
 
 
 class _AcknowledgementWatch:

@@ -2,9 +2,68 @@
 
 from __future__ import annotations
 
+import heapq
+import itertools
+import threading
+import time
+import traceback
 from collections.abc import Callable
 
 from gi.repository import GLib
+
+TICK_MS = 20  # by which a delayed call may be late
+
+
+class Delayed:
+    """A call that is due later."""
+
+    def __init__(self, work: Callable[[], None]) -> None:
+        self.work: Callable[[], None] | None = work
+
+    def cancel(self) -> None:
+        self.work = None
+
+
+class _Delays:
+    """Calls that are due later. They share one timer, since each would leak memory: runner/gst/buffer_probe.py."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._calls: list[tuple[float, int, Delayed]] = []  # a heap: when due, a number, the call
+        self._numbers = itertools.count()
+        self._timer = 0
+
+    def add(self, delay_s: float, call: Delayed) -> None:
+        with self._lock:
+            heapq.heappush(self._calls, (time.monotonic() + delay_s, next(self._numbers), call))
+            if not self._timer:
+                self._timer = GLib.timeout_add(TICK_MS, self._on_tick)
+
+    def _on_tick(self) -> bool:
+        for call in self._due():
+            try:
+                if call.work:
+                    call.work()
+            except Exception:
+                traceback.print_exc()
+        return True
+
+    def _due(self) -> list[Delayed]:
+        now, due = time.monotonic(), []
+        with self._lock:
+            while self._calls and self._calls[0][0] <= now:
+                due.append(heapq.heappop(self._calls)[2])
+        return due
+
+
+_delays = _Delays()
+
+
+def later(delay_s: float, work: Callable[[], None]) -> Delayed:
+    """Call a function once in GLib's thread, after a delay. May be called from any thread."""
+    call = Delayed(work)
+    _delays.add(delay_s, call)
+    return call
 
 
 def every(interval_ms: int, work: Callable[[], None], on_fault: Callable[[str], None]) -> int:

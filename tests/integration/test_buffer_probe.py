@@ -1,4 +1,4 @@
-"""Reading single buffers: the same as GStreamer's own binding reads, without keeping memory."""
+"""Reading buffers: the same as GStreamer's own binding reads, without keeping memory."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ from runner.apply import OperatorSide, VehicleSide
 from runner.configuration.config import configuration
 from runner.core.commands import Command
 from runner.gst import GLib, Gst
-from runner.gst.one_shot import OneShot
+from runner.gst import supervised
+from runner.gst.buffer_probe import BufferProbe
+from runner.gst.supervised import SupervisedPipeline
 from runner.plans import compile_plans
 
 SAMPLES = 20_000
@@ -45,7 +47,7 @@ class Watcher:
 
     def __init__(self, pad, on_buffer):
         self._on_buffer = on_buffer
-        self.shot = OneShot(pad, self.on_passed)
+        self.probe = BufferProbe(pad, self.on_passed)
 
     def on_passed(self, pad, buffer):
         return self._on_buffer(pad, buffer)
@@ -61,7 +63,9 @@ def fed_buffers():
     for number, pts in enumerate((5, Gst.CLOCK_TIME_NONE, 7)):
         buffer = Gst.Buffer.new_wrapped(bytes(range(40 + number)))
         buffer.pts = pts
+        buffer.set_flags(Gst.BufferFlags.LAST)
         if pts == 7:
+            buffer.set_flags(Gst.BufferFlags.DISCONT)
             reference = Gst.Caps.from_string("timestamp/x-ntp")
             buffer.add_reference_timestamp_meta(reference, STAMPED, Gst.CLOCK_TIME_NONE)
         yield buffer
@@ -75,25 +79,30 @@ def test_it_reads_the_same_as_the_binding():
         meta, size = buffer.get_reference_timestamp_meta(None), buffer.get_size()
         pts = None if buffer.pts == Gst.CLOCK_TIME_NONE else buffer.pts
         ends = buffer.extract_dup(0, 16), buffer.extract_dup(size - 8, 16)
-        stated.append((pts, size, *ends, meta.timestamp if meta else None))
+        flags = buffer.has_flags(Gst.BufferFlags.DISCONT), buffer.has_flags(Gst.BufferFlags.LAST)
+        stated.append((pts, size, *ends, meta.timestamp if meta else None, *flags))
         return Gst.PadProbeReturn.OK
 
     def on_buffer(_pad, buffer):
         ends = buffer.extract(0, 16), buffer.extract(buffer.size - 8, 16)
-        read.append((buffer.pts, buffer.size, *ends, buffer.reference_ns))
+        buffer.unset_flags(Gst.BufferFlags.LAST)
+        flags = buffer.has_flags(Gst.BufferFlags.DISCONT), buffer.has_flags(Gst.BufferFlags.LAST)
+        read.append((buffer.pts, buffer.size, *ends, buffer.reference_ns, *flags))
         if len(read) == 3:
             both.set()
         return len(read) >= 3
 
     with running(FED) as (pipeline, pad):
         watcher = Watcher(pad, on_buffer)
-        pad.add_probe(Gst.PadProbeType.BUFFER, on_binding)  # probes of a pad are called in order
-        watcher.shot.arm()
+        watcher.probe.arm()  # probes of a pad are called in order
+        pad.add_probe(Gst.PadProbeType.BUFFER, on_binding)
         pipeline.set_state(Gst.State.PLAYING)
         for buffer in fed_buffers():
             pipeline.get_by_name("fed").emit("push-buffer", buffer)
         assert both.wait(20)
+    until(lambda: len(stated) == 3)
     assert read == stated
+    assert [one[5:] for one in read] == [(True, False), (False, False), (True, False)], "the first is marked as well"
     assert [(one[0], one[1], one[4]) for one in read] == [(5, 40, None), (None, 41, None), (7, 42, STAMPED)]
     assert read[0][2:4] == (bytes(range(16)), bytes(range(32, 40)))  # there are no more bytes
 
@@ -111,7 +120,7 @@ def test_reading_keeps_no_memory(playing):
 
     def look(count):
         def looked():
-            watcher.shot.arm()
+            watcher.probe.arm()
             return looks[0] >= count
 
         until(looked, every_s=0)
@@ -125,15 +134,30 @@ def test_a_deleted_owner_is_no_longer_called(playing):
     pipeline, pad = playing
     seen = []
     owner = Watcher(pad, lambda _pad, _buffer: seen.append(1))
-    owner.shot.arm()
-    shot = owner.shot
-    Watcher(pad, lambda _pad, _buffer: seen.append(2)).shot.arm()
+    owner.probe.arm()
+    probe = owner.probe
+    Watcher(pad, lambda _pad, _buffer: seen.append(2)).probe.arm()
     del owner  # neither owner is kept alive, although a probe is
     last = Watcher(pad, lambda _pad, _buffer: True)
     pipeline.set_state(Gst.State.PLAYING)
-    last.shot.arm()
-    until(lambda: not last.shot.armed)
-    assert seen == [] and not shot.armed
+    last.probe.arm()
+    until(lambda: not last.probe.armed)
+    assert seen == [] and not probe.armed
+
+
+def test_a_fault_of_the_owner_does_not_drop_buffers(playing, capfd):
+    pipeline, pad = playing
+    passed = []
+
+    def fails(_pad, _buffer):
+        raise ValueError("a fault")
+
+    owner, after = Watcher(pad, fails), Watcher(pad, lambda _pad, _buffer: passed.append(1))
+    owner.probe.arm()
+    after.probe.arm()
+    pipeline.set_state(Gst.State.PLAYING)
+    until(lambda: len(passed) > 3)
+    assert "ValueError: a fault" in capfd.readouterr().err
 
 
 def counting(made, name, function):
@@ -144,11 +168,31 @@ def counting(made, name, function):
     return counted
 
 
-def test_sides_that_are_sampled_make_no_callback(monkeypatch):
-    """Each would be kept forever."""
-    made = Counter()
+@pytest.fixture
+def made(monkeypatch):
+    """Callbacks passed to C, by function: each would be kept forever."""
+    counted = Counter()
     for owner, name in ((Gst.Pad, "add_probe"), (GLib, "idle_add"), (GLib, "timeout_add")):
-        monkeypatch.setattr(owner, name, counting(made, name, getattr(owner, name)))
+        monkeypatch.setattr(owner, name, counting(counted, name, getattr(owner, name)))
+    return counted
+
+
+def test_attempts_to_reach_a_vehicle_that_is_away_make_no_callback(made, monkeypatch):
+    starts = Counter()
+    monkeypatch.setattr(supervised, "RETRY_S", 0.05)
+    monkeypatch.setattr(SupervisedPipeline, "start", counting(starts, "start", SupervisedPipeline.start))
+    vehicle = configuration([*SMALL_ROBOT, f"media.port={free_port()}"], runnable=False).vehicle()
+    viewer = OperatorSide(compile_plans(vehicle), lambda *_: None)
+    try:
+        until(lambda: starts["start"] > 10)
+        made.clear()
+        until(lambda: starts["start"] > 40)
+        assert not made
+    finally:
+        viewer.stop()
+
+
+def test_sides_that_are_sampled_make_no_callback(made):
     vehicle = configuration([*SMALL_ROBOT, "source=test", f"media.port={free_port()}"]).vehicle()
     plans = compile_plans(vehicle)
     side = VehicleSide(plans, vehicle.media, lambda *_: None)

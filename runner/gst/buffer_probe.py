@@ -1,14 +1,16 @@
-"""Samples single buffers of a pad, at no cost for the others and without leaking memory.
+"""Probes that see buffers of a pad without leaking memory: single ones, at no cost for the others, or all.
 
-PyGObject before 3.44.2 (Debian 12, Ubuntu 22.04) leaks 130 bytes for each callback passed to C, such as a probe.
-Latencies of eight cameras are sampled 80 times a second, which would leak a gigabyte a day. So these probes share one
-ctypes callback, which reads the structures of GStreamer's stable ABI.
+PyGObject before 3.44.2 (Debian 12, Ubuntu 22.04) leaks 130 bytes for each callback passed to C, such as a probe or a
+timer. Latencies of eight cameras are sampled 80 times a second, and an operator's side tries once a second to reach
+each camera of a vehicle that is away: a gigabyte a day. So these probes share one ctypes callback, which reads the
+structures of GStreamer's stable ABI.
 """
 
 from __future__ import annotations
 
 import ctypes
 import itertools
+import traceback
 from collections.abc import Callable
 from ctypes import CFUNCTYPE, POINTER, Structure, c_char_p, c_int, c_size_t, c_uint, c_uint64, c_ulong, c_void_p
 from typing import Any
@@ -74,6 +76,16 @@ class PassingBuffer:
         """Bytes."""
         return int(_get_size(self._address))
 
+    def has_flags(self, flags: Gst.BufferFlags) -> bool:
+        return bool(self._object.counts[2] & int(flags))
+
+    def unset_flags(self, flags: Gst.BufferFlags) -> None:
+        self._object.counts[2] &= ~int(flags)
+
+    @property
+    def _object(self) -> _MiniObject:
+        return _MiniObject.from_address(self._address)
+
     @property
     def reference_ns(self) -> int | None:
         """Its reference timestamp; None if it has none."""
@@ -87,8 +99,8 @@ class PassingBuffer:
         return data.raw[:copied]
 
 
-class OneShot:
-    """A probe that can be armed repeatedly. While it is not armed, buffers cost nothing.
+class BufferProbe:
+    """A probe that can be armed repeatedly. While it is not armed, buffers cost nothing. It ends with its owner.
 
     on_buffer  method of the owner, which it does not keep alive: called in the streaming thread with the pad and each
                buffer, until it returns True
@@ -99,7 +111,7 @@ class OneShot:
         self._pad, self._on_buffer = pad, WeakMethod(on_buffer)
         self._key = next(_keys)
         self.armed = False
-        _shots[self._key] = self
+        _probes[self._key] = self
 
     def arm(self) -> None:
         """Wait for the next buffer, unless already armed. To be called by one thread at a time."""
@@ -117,13 +129,17 @@ class OneShot:
 
 
 _keys = itertools.count(1)
-_shots: WeakValueDictionary[int, OneShot] = WeakValueDictionary()
+_probes: WeakValueDictionary[int, BufferProbe] = WeakValueDictionary()
 
 
 def _dispatch(_pad: int, info: Any, key: int) -> int:
     """A pad does not keep its probe alive: an armed probe is removed once its owner is gone."""
-    shot = _shots.get(key)
-    return shot.handle(info.contents.data) if shot else int(Gst.PadProbeReturn.REMOVE)
+    probe = _probes.get(key)
+    try:
+        return probe.handle(info.contents.data) if probe else int(Gst.PadProbeReturn.REMOVE)
+    except Exception:  # to which ctypes would return 0: drop the buffer
+        traceback.print_exc()
+        return int(Gst.PadProbeReturn.OK)
 
 
 _on_probe = _Callback(_dispatch)
