@@ -12,8 +12,8 @@ from gi.repository import GObject, Gst, GstSdp
 
 from runner.graph import Plan, video_codec
 from runner.gst.arriving import MAX_FRAMES, NTP_EPOCH_S, RTP_HZ, MediaClock
-from runner.gst.caps import structure
 from runner.gst.buffer_probe import BufferProbe, PassingBuffer
+from runner.gst.caps import structure
 from runner.gst.repair import RepairBuffer
 from runner.gst.sender_filter import SenderFilter
 from runner.gst.supervised import SupervisedPipeline

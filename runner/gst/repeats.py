@@ -8,8 +8,8 @@ from collections.abc import Callable
 
 from gi.repository import Gst
 
-from runner.gst.caps import structure
 from runner.gst.buffer_probe import BufferProbe, PassingBuffer
+from runner.gst.caps import structure
 from runner.gst.outage import Outage
 
 SLICES, SLICE_BYTES = 16, 8192  # compared parts of a picture: sensor noise is everywhere

@@ -13,8 +13,7 @@ from rig import SMALL_ROBOT, free_port, until
 from runner.apply import OperatorSide, VehicleSide
 from runner.configuration.config import configuration
 from runner.core.commands import Command
-from runner.gst import GLib, Gst
-from runner.gst import supervised
+from runner.gst import GLib, Gst, supervised
 from runner.gst.buffer_probe import BufferProbe
 from runner.gst.supervised import SupervisedPipeline
 from runner.plans import compile_plans

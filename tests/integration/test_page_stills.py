@@ -151,7 +151,9 @@ def test_two_fingers_zoom_and_move_the_region(page, station):
 
     def is_requested(**roi):
         request = getattr(station, "last_request", None) or {}
-        return request == {"event": "roi_set", "camera": "scaled"} | {key: pytest.approx(at, abs=4) for key, at in roi.items()}
+        return request == {"event": "roi_set", "camera": "scaled"} | {
+            key: pytest.approx(at, abs=4) for key, at in roi.items()
+        }
 
     station.last_request = None
     touch("touchStart", (0.2, 0.5))
