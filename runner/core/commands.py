@@ -49,10 +49,10 @@ def difference(decision: Decision, commanded: Mapping[str, KnobValues]) -> list[
     """Commands that take every camera's knobs from the values last commanded to those of the decision."""
     commands = []
     for name, setting in decision.settings.items():
-        now, then = commanded.get(name, {}), wanted(setting)
-        if then == now:
+        now, values = commanded.get(name, {}), wanted(setting)
+        if values == now:
             continue
-        for knob, value in then.items():
+        for knob, value in values.items():
             last = now.get(knob)
             # Most values are the same object as commanded; comparing regions field by field is slow.
             if last is not value and last != value:

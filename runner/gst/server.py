@@ -168,6 +168,7 @@ class CameraServer:
         if self._viewers:
             self._server.set_auth(self._viewers.auth)
         self._server.connect("client-connected", self._on_connected)
+        self._server.get_session_pool().connect("session-removed", _on_session_removed)
         self._addresses = _address_pool(media)
         self._cameras = {plan.camera.name: self._camera(plan) for plan in plans}
         for name, camera in self._cameras.items():
@@ -430,7 +431,7 @@ class CameraServer:
         if self._viewers and connection and (refusal := self._viewers.refusal(client, context.token)):
             connection.refusal = refusal
             return FORBIDDEN
-        if _is_streamed(client, context):
+        if not _end_other(client, context):
             return NOT_NOW
         with self._changed:
             new_viewer = self._connections.get(client)
@@ -493,7 +494,8 @@ class CameraServer:
         connection = self._connection(client)
         if connection:
             with self._changed:
-                connection.cameras.pop(_camera_name(context), None)
+                if not _is_held(client, context.sessmedia):  # the session may be another connection's
+                    connection.cameras.pop(_camera_name(context), None)
                 self._note_left((_camera_name(context),))
 
     def _note_left(self, cameras: Iterable[str]) -> None:
@@ -615,18 +617,49 @@ def _on_media_error(media: GstRtspServer.RTSPMedia, _message: Gst.Message, camer
     return True
 
 
-def _is_streamed(client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext) -> bool:
-    """Whether a connection plays the requested camera already, or has set it up in another session.
+def _end_other(client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext) -> bool:
+    """End what a connection has set up of the requested camera in other sessions; False if it is being sent a copy.
 
-    The library would not end the first copy: it would go on after the viewer has left, and no one would count it. A
-    camera that does not play yet may be set up again, as ffmpeg does for each profile in the description.
+    The library would not end that copy: it would go on after the viewer has left, and nobody would count it. A camera
+    that is not being sent may be set up again: ffmpeg does so for each profile in the description, and in a new session
+    when it pauses UDP to try TCP.
     """
-    held = [(session, media) for session in client.session_filter(None) for media in session.filter(None)]
-    return any(
-        media.get_media() is context.media
-        and (session is not context.session or media.get_rtsp_state() == GstRtsp.RTSPState.PLAYING)
-        for session, media in held
-    )
+    held = [
+        (session, media)
+        for session in client.session_filter(None)
+        for media in session.filter(None)
+        if media.get_media() is context.media
+    ]
+    sent = context.stream.transport_filter(None)
+    if any(transport in sent for _, media in held for transport in _transports(media)):
+        return False
+    for session, media in held:
+        if session is not context.session:
+            _end(session, media)
+    return True
+
+
+def _is_held(client: GstRtspServer.RTSPClient, ended: GstRtspServer.RTSPSessionMedia) -> bool:
+    """Whether a connection has set up the same camera as what has just ended, in a session of its own."""
+    held = [media for session in client.session_filter(None) for media in session.filter(None)]
+    return any(media is not ended and media.get_media() is ended.get_media() for media in held)
+
+
+def _transports(media: GstRtspServer.RTSPSessionMedia) -> list[GstRtspServer.RTSPStreamTransport]:
+    each = (media.get_transport(number) for number in range(media.get_media().n_streams()))
+    return [transport for transport in each if transport is not None]
+
+
+def _end(session: GstRtspServer.RTSPSession, media: GstRtspServer.RTSPSessionMedia) -> None:
+    """End what a session has set up, as TEARDOWN does."""
+    media.set_state(Gst.State.NULL)
+    session.release_media(media)
+
+
+def _on_session_removed(_pool: object, session: GstRtspServer.RTSPSession) -> None:
+    """A session ends its media only in its finalizer, and the library (1.22) leaks one when it refuses a SETUP."""
+    for media in session.filter(None):
+        _end(session, media)
 
 
 def _profiles(repairs: bool, secure: bool) -> GstRtsp.RTSPProfile:

@@ -50,6 +50,7 @@ class Direction:
         self._delayed: deque[tuple[float, Delivery]] = deque()
         self._timer: asyncio.TimerHandle | None = None
         self._departed = asyncio.Event()
+        self._turn = asyncio.Lock()  # connections take turns, in order
 
     def put(self, size: int, delivery: Delivery, *, keep: bool = False) -> None:
         """Queue a packet of `size` bytes; without `keep` it may be dropped or lost. `delivery` is called on arrival."""
@@ -74,13 +75,14 @@ class Direction:
 
     async def room(self, size: int) -> None:
         """Wait until the queue has room for `size` bytes, which packets that may be dropped do not take meanwhile."""
-        self._bucket.reserved += size
-        try:
-            while not self._bucket.has_room(size):
-                self._departed.clear()
-                await self._departed.wait()
-        finally:
-            self._bucket.reserved -= size
+        async with self._turn:
+            self._bucket.reserved = size
+            try:
+                while not self._bucket.has_room(size):
+                    self._departed.clear()
+                    await self._departed.wait()
+            finally:
+                self._bucket.reserved = 0
 
     def _deliver(self) -> None:
         """Deliver all packets that are due, and set a timer for the rest."""

@@ -425,6 +425,45 @@ def test_a_camera_that_plays_is_not_set_up_again_on_a_connection(is_new_session)
         until(is_silent)
 
 
+def test_a_session_ends_although_its_last_setup_was_refused():
+    """The library (1.22) then keeps it, and would send its copy forever."""
+    with serving("media.session_timeout_s=1") as vehicle, RtspClient(vehicle.url()) as client:
+        assert client.open(udp=True) == [200, 200, 200]
+        again = client.ask("SETUP", f"{vehicle.url()}/stream=0", Transport="RTP/AVP/TCP;unicast;interleaved=0-1")
+        assert again == 455
+        until(lambda: not vehicle.side.applied()[CAMERA])
+
+
+def test_a_play_request_that_fails_leaves_no_second_copy():
+    """The library sends all the same."""
+    with serving("media.max_viewers=2") as vehicle, watched(vehicle), RtspClient(vehicle.url()) as client:
+        assert client.open(udp=True, Scale=0) == [200, 200, 400]
+        client.read()
+        until(lambda: client.frames > 5)
+        other = "RTP/AVP;unicast;client_port=50000-50001"
+        assert client.ask("SETUP", f"{vehicle.url()}/stream=0", Transport=other) == 455
+
+
+def test_a_viewer_counts_until_its_own_session_ends():
+    """The library ends any session whose id it is given."""
+    with ExitStack() as stack:
+        vehicle = stack.enter_context(serving())
+        viewer, other = (stack.enter_context(RtspClient(vehicle.url())) for _ in range(2))
+        for client in (viewer, other):
+            assert client.open(udp=True) == [200, 200, 200]
+        own, viewer.session = viewer.session, other.session
+        assert viewer.ask("TEARDOWN") == 200
+        viewer.session = own
+        server = vehicle.side._server
+        assert len(server._watching(CAMERA)) == 2
+        other.close()
+        until(lambda: len(server._watching(CAMERA)) < 2)
+        viewer.read()
+        seen = viewer.frames
+        until(lambda: viewer.frames > seen + 5)
+        assert len(server._watching(CAMERA)) == 1
+
+
 def test_a_camera_that_does_not_play_may_be_set_up_again():
     """As ffmpeg does for each profile, and after a pause."""
     with serving() as vehicle, RtspClient(vehicle.url()) as client:
@@ -432,11 +471,15 @@ def test_a_camera_that_does_not_play_may_be_set_up_again():
         assert client.ask("DESCRIBE", Accept="application/sdp") == 200
         for transport in transports:
             assert client.ask("SETUP", f"{vehicle.url()}/stream=0", Transport=transport) == 200
-        assert client.ask("PLAY") == client.ask("PAUSE") == 200
-        assert client.ask("SETUP", f"{vehicle.url()}/stream=0", Transport=transports[0]) == 200
+        for session in (client.session, ""):  # ffmpeg names none when it changes to TCP
+            assert client.ask("PLAY") == client.ask("PAUSE") == 200
+            client.session = session
+            assert client.ask("SETUP", f"{vehicle.url()}/stream=0", Transport=transports[0]) == 200
         assert client.ask("PLAY") == 200
         client.read()
         until(lambda: client.frames > 5)
+        numbers = [number for _, number, _ in client.packets]
+        assert len(numbers) == len(set(numbers)), "one copy"
 
 
 def test_viewers_that_keep_their_session_alive_stay_on_a_paused_camera():
