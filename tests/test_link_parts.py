@@ -126,9 +126,9 @@ def test_tcp_waits_for_room_where_udp_is_dropped():
             await asyncio.sleep(0.01)  # the relay waits for data: the queue still has room
             while not link.up.change(None, None)["dropped"]:
                 link.up.put(100, lambda: None)
+            longest = link.up.change(None, None)["queue_ms"]
             vehicle.sendall(message)
             received = asyncio.create_task(asyncio.get_running_loop().sock_recv(operator, 1000))
-            longest = 0.0
             while not received.done():
                 await asyncio.sleep(0)
                 link.up.put(100, lambda: None)  # UDP takes all room that TCP leaves

@@ -20,6 +20,7 @@ from urllib.parse import urlencode
 import pytest
 from helpers import vehicle
 
+from rig import free_port
 from runner.errors import RunError
 from runner.h264.access_unit import AccessUnit
 
@@ -64,24 +65,27 @@ def sent(viewer):
 
 @contextmanager
 def served(*overrides, layouts=None, login=None, keyring=None, note=print):
-    """Port of a page, and its station; with a login, browsers must expect HTTPS, although it is not encrypted."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    """Port of a page, and its station; with a login, browsers must expect HTTPS, although it is not encrypted.
+
+    No window is dropped for its silence: most clients here answer pings only while they receive.
+    """
+    port = free_port()
     station = SimpleNamespace(state=None, note=note, answer_s=1.0, attention=None)
     page = PageServer(vehicle(f"page.port={port}", *overrides), station, layouts=layouts, keyring=keyring)
     page._login = login or page._login
-    page.start()
-    try:
-        yield port, station
-    finally:
-        page.stop()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("runner.page.server.UNRESPONSIVE_S", 60)
+        page.start()
+        try:
+            yield port, station
+        finally:
+            page.stop()
 
 
 @pytest.mark.parametrize("begun", [b"", b"GET / HT", b"GET / HTTP/1.1\r\nHost: localhost\r\n", FULL + b"GET / H"])
 def test_a_request_that_is_never_finished_is_closed(monkeypatch, begun):
     monkeypatch.setattr("runner.page.server.REQUEST_S", 0.3)
-    with served() as (port, _), socket.create_connection(("127.0.0.1", port), timeout=5) as line:
+    with served() as (port, _), socket.create_connection(("127.0.0.1", port), timeout=60) as line:
         line.sendall(begun.replace(b"PORT", str(port).encode()))
         with suppress(ConnectionResetError):
             while line.recv(65536):  # the response to the finished request, then the end
@@ -92,7 +96,7 @@ def test_a_login_whose_body_never_comes_is_closed(monkeypatch):
     """The body is read before anybody has logged in."""
     monkeypatch.setattr("runner.page.server.REQUEST_S", 0.3)
     login = PageLogin(lambda: b"token")
-    with served(login=login) as (port, _), socket.create_connection(("127.0.0.1", port), timeout=5) as line:
+    with served(login=login) as (port, _), socket.create_connection(("127.0.0.1", port), timeout=60) as line:
         own = f"Host: localhost:{port}\r\nOrigin: https://localhost:{port}\r\n"
         line.sendall(f"POST /login HTTP/1.1\r\n{own}Content-Length: 100\r\n\r\n".encode())
         assert line.recv(1) == b""
@@ -107,7 +111,7 @@ def test_connections_without_access_replace_each_other_and_close_none_with_acces
     with served(login=login) as (port, _), ExitStack() as stack:
 
         def connected(path, cookie=""):
-            line = stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=5))
+            line = stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=60))
             line.sendall(f"GET {path} HTTP/1.1\r\nHost: localhost:{port}\r\n{cookie}\r\n".encode())
             assert line.recv(65536).startswith(b"HTTP/1.1 200")
             return line
@@ -138,7 +142,7 @@ def keys(tmp_path):
 def answered(port, keys, path="/login", host="", method="GET", **headers):
     """The serial number of the certificate that a page presents, and its answer."""
     tls = ssl.create_default_context(cafile=keys.directory / "alice" / keyring.AUTHORITY)
-    connection = http.client.HTTPSConnection("127.0.0.1", port, context=tls, timeout=5)
+    connection = http.client.HTTPSConnection("127.0.0.1", port, context=tls, timeout=60)
     with closing(connection):
         connection.request(method, path, headers={"Host": host or f"127.0.0.1:{port}", **headers})
         serial = int(connection.sock.getpeercert()["serialNumber"], 16)
@@ -167,7 +171,7 @@ def test_a_handshake_that_never_ends_is_closed(keys, monkeypatch):
     monkeypatch.setattr("runner.page.server.REQUEST_S", 0.3)
     with (
         served(keyring=Keyring.of(keys.directory / "alice")) as (port, _),
-        socket.create_connection(("127.0.0.1", port), timeout=5) as line,
+        socket.create_connection(("127.0.0.1", port), timeout=60) as line,
     ):
         assert line.recv(1) == b""
 
@@ -201,7 +205,7 @@ def test_every_refusal_is_reported_once_without_secrets_and_carries_the_policy(k
 
 def test_a_path_outside_the_page_does_not_exist_and_is_reported():
     notes = []
-    with served(note=notes.append) as (port, _), socket.create_connection(("127.0.0.1", port), timeout=5) as line:
+    with served(note=notes.append) as (port, _), socket.create_connection(("127.0.0.1", port), timeout=60) as line:
         line.sendall(f"GET /static/%2e%2e/../server.py HTTP/1.1\r\nHost: localhost:{port}\r\n\r\n".encode())
         assert line.recv(12) == b"HTTP/1.1 404"
     assert notes == ["page: refused GET '/static/%2e%2e/../server.py' from 127.0.0.1: not found"]
@@ -212,7 +216,7 @@ def test_wrong_answers_to_the_login_do_not_displace_the_other_notes():
     with served(login=login, note=notes.append) as (port, _):
         own = f"Host: localhost:{port}\r\nOrigin: https://localhost:{port}\r\nConnection: close\r\n"
         for _ in range(100):
-            with socket.create_connection(("127.0.0.1", port), timeout=5) as line:
+            with socket.create_connection(("127.0.0.1", port), timeout=60) as line:
                 line.sendall(f"POST /login HTTP/1.1\r\n{own}Content-Length: 2\r\n\r\n{{}}".encode())
                 assert line.recv(12) == b"HTTP/1.1 403"
     assert notes == ["page: refused POST '/login' from 127.0.0.1: wrong token"]
@@ -233,7 +237,7 @@ def test_a_page_is_known_by_the_names_that_browsers_send(port, scheme, accepted)
 
 def test_a_page_at_an_ipv6_address():
     try:
-        with served("page.host=::1") as (port, _), socket.create_connection(("::1", port), timeout=5) as line:
+        with served("page.host=::1") as (port, _), socket.create_connection(("::1", port), timeout=60) as line:
             line.sendall(f"GET / HTTP/1.1\r\nHost: [::1]:{port}\r\nConnection: close\r\n\r\n".encode())
             assert line.recv(12) == b"HTTP/1.1 200"
     except RunError as error:  # only where there is no IPv6
@@ -242,7 +246,7 @@ def test_a_page_at_an_ipv6_address():
 
 @pytest.mark.parametrize("line", [b"GET \x01 HTTP/1.1", b"\xff" * 50, b"GET / HTTP/9", b"GET / HTTP/1.1\r\nHost"])
 def test_invalid_http_is_refused_without_a_traceback(line, caplog, capfd):
-    with served() as (port, _), socket.create_connection(("127.0.0.1", port), timeout=5) as connection:
+    with served() as (port, _), socket.create_connection(("127.0.0.1", port), timeout=60) as connection:
         connection.sendall(line + b"\r\n\r\n")
         assert connection.recv(12)[:10] in (b"HTTP/1.0 4", b"HTTP/1.1 4")
     assert (caplog.text, *capfd.readouterr()) == ("", "", "")
@@ -251,18 +255,19 @@ def test_invalid_http_is_refused_without_a_traceback(line, caplog, capfd):
 @pytest.mark.parametrize("host", ["127.0.0.1:abc", "[::1", "a:b:c", "127.0.0.1:99999", "%zz", "", "a b"])
 def test_a_malformed_host_is_refused_without_a_traceback(host, caplog):
     with served() as (port, _):
-        with socket.create_connection(("127.0.0.1", port), timeout=5) as line:
+        with socket.create_connection(("127.0.0.1", port), timeout=60) as line:
             line.sendall(f"GET / HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n".encode())
             answer = b"".join(iter(lambda: line.recv(65536), b""))
-        with socket.create_connection(("127.0.0.1", port), timeout=5) as line:
+        with socket.create_connection(("127.0.0.1", port), timeout=60) as line:
             line.sendall(f"GET / HTTP/1.1\r\nHost: localhost:{port}\r\nConnection: close\r\n\r\n".encode())
             assert line.recv(12) == b"HTTP/1.1 200"
     assert answer[:12] in (b"HTTP/1.1 403", b"HTTP/1.1 400")
     assert caplog.text == ""
 
 
-def test_no_handler_is_pending_once_the_page_has_stopped():
+def test_no_handler_is_pending_once_the_page_has_stopped(monkeypatch):
     """Python 3.11 may crash at exit while a handler is pending."""
+    monkeypatch.setattr("runner.page.server.STOP_S", 30)  # enough, however busy the machine is
     hello = f"GET /live?viewer=me HTTP/1.1\r\nHost: localhost:PORT\r\n{UPGRADE}\r\n\r\n"
     with socket.socket() as line:
         with served() as (port, _):
@@ -277,7 +282,7 @@ def test_hello_describes_each_cameras_pose_and_optics():
     async def first_message(port):
         own = f"http://localhost:{port}"
         async with aiohttp.ClientSession() as session, session.ws_connect(f"{own}/live?viewer=me", origin=own) as ws:
-            return await ws.receive_json(timeout=5)
+            return await ws.receive_json(timeout=60)
 
     native = "{width_px: 1920, height_px: 1080, left_px: 0, top_px: 30}"
     words = (
@@ -331,7 +336,7 @@ def test_the_drivers_attention_is_reported_to_the_station():
                 await attention_becomes(station, "slow")
                 for invalid in ("absent", "asleep", 1, None):
                     await driver.send_json({"attention": invalid, "id": "1"})
-                    while (reply := await driver.receive_json(timeout=5))["kind"] != "reply":
+                    while (reply := await driver.receive_json(timeout=60))["kind"] != "reply":
                         pass
                     assert reply["result"] == "refused"
             assert station.attention == "slow"
@@ -361,7 +366,7 @@ class Windows:
 
 async def received(ws, kind, **wanted):
     """The next message of a kind with these values."""
-    while (message := await ws.receive_json(timeout=5))["kind"] != kind or not wanted.items() <= message.items():
+    while (message := await ws.receive_json(timeout=60))["kind"] != kind or not wanted.items() <= message.items():
         pass
     return message
 

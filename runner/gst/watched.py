@@ -17,6 +17,7 @@ from runner.system.backoff import pause_s
 
 CHECK_MS = 100
 FIRST_FRAME_S = 10.0  # a UDP source may take 5 s to fail, and the first keyframe may be late
+HELD_UP_S = 0.5  # between two checks: on a busy machine the time of one that came late proves nothing
 IN_FLIGHT = 5  # frames that may still pass after an error that stops the source
 LONGEST_START_S = 300.0  # a start that hangs is abandoned then; its thread remains
 BACKOFF_S = (1.0, 10.0)  # between the starts of two attempts: doubled from the first value up to the second
@@ -55,6 +56,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         self._started = 0.0  # when it began
         self._error: tuple[str, int] | None = None  # the source's own error, and frames before it; set from its threads
         self._progress = (0, 0.0)  # frames at the last change of the counter, and when
+        self._watched = 0.0  # when it was last checked
         self._attempts = 0  # in this outage
         self._last_attempt = (0, 0.0)  # frames when the last attempt began, and when
 
@@ -71,7 +73,8 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         if transition == Gst.StateChange.READY_TO_PAUSED:
             with self._lock:
                 self._add_child()
-            self._progress = (self._frames(), time.monotonic())
+            self._watched = time.monotonic()
+            self._progress = (self._frames(), self._watched)
             self._timer = GLib.timeout_add(CHECK_MS, self._watch)
         elif transition == Gst.StateChange.PAUSED_TO_READY:
             self._end()
@@ -111,7 +114,8 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
 
     def _watch(self) -> bool:
         now, frames = time.monotonic(), self._frames()
-        if frames != self._progress[0] or not self._is_playing():
+        held_up, self._watched = now - self._watched > HELD_UP_S, now  # this thread, and the source perhaps with it
+        if frames != self._progress[0] or held_up or not self._is_playing():
             self._progress = (frames, now)
             if self._error and frames > self._error[1] + IN_FLIGHT:
                 self._error = None  # it does not stop the video

@@ -3,10 +3,10 @@
 The process between vehicle and operator. It listens on two ports of its own, named in its first line of output:
 `media` for the operator's RTSP, forwarded to the vehicle's server, and `control` for the vehicle's MQTT, forwarded to
 the broker. In RTSP's SETUP it replaces both sides' UDP ports with its own, so that RTP and RTCP pass through it.
-Traffic from vehicle to operator shares one `Bucket`; UDP packets that find it full are dropped, TCP waits and takes the
-next room. Packets count as IP packets: payload plus 28 bytes (UDP), plus 52 bytes for each 1448 (TCP). RTSP messages and
-interleaved packets are never split. The other direction has a `Bucket` of its own if `down` is given, otherwise it is
-unlimited. Losses and delay follow the queue; only UDP packets are lost.
+Traffic from vehicle to operator shares one `Bucket`; UDP packets that find it full are dropped, TCP waits and takes
+the next room. Packets count as IP packets: payload plus 28 bytes (UDP), plus 52 bytes for each 1448 (TCP). RTSP
+messages and interleaved packets are never split. The other direction has a `Bucket` of its own if `down` is given,
+otherwise it is unlimited. Losses and delay follow the queue; only UDP packets are lost.
 
 Each line of input sets the rates, see `take_rates`; the relay ends with its input.
 """

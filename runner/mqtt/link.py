@@ -28,7 +28,7 @@ RETRY_S = (0.25, 1.0)  # between attempts, initially and at most
 STALLED_S = 1.5  # a connection without progress for this long is dropped
 KEEPALIVE_S = 1  # s without a message before a ping; the broker publishes a will after one and a half of these
 LOOP_S = 0.25  # how often the keepalive is checked
-CLOSE_S = 2.0  # for signing off
+CLOSE_S, CLOSING_S = 2.0, 0.1  # for signing off, and between two looks at whether the connection is still there
 PERIODIC = {"telemetry", "reception", "clock", "advice", "steering"}  # the next one follows soon: QoS 0
 SUPERSEDED = PERIODIC | {"state"}  # replaced by a later message, and so not sent ...
 UNSENT_BYTES = 4096  # ... while this much is queued: after an outage it would delay current messages
@@ -117,13 +117,17 @@ class ControlLink:
     def close(self, *goodbye: tuple[str, JsonObject]) -> None:
         """Disconnect after sending final messages, such as that of the last will."""
         self._closing.set()
-        for topic, message in goodbye if self._listening.is_set() else ():
+        end = time.monotonic() + CLOSE_S / 2
+        for topic, message in goodbye:
             with suppress(ValueError, RuntimeError):  # the connection has just been lost
-                self._send(topic, message).wait_for_publish(CLOSE_S / 2)
+                sent = self._send(topic, message) if self._listening.is_set() else None
+                while sent and not sent.is_published() and self._listening.is_set() and time.monotonic() < end:
+                    sent.wait_for_publish(CLOSING_S)
         self._client.disconnect()
         ending = threading.Thread(target=self._client.loop_stop, daemon=True)  # waits without a timeout
         ending.start()
-        ending.join(CLOSE_S)
+        # Without a connection it sleeps until its next attempt to connect.
+        ending.join(CLOSE_S if self._listening.is_set() else CLOSING_S)
 
     def is_behind(self) -> bool:
         """Whether the kernel has UNSENT_BYTES or more queued for sending."""

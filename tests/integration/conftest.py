@@ -44,6 +44,13 @@ LONGEST = (
 DRIVES = {"test_link": "1", "test_feedback": "1", "test_live": "2", "test_page_sides": "2"}
 
 
+@pytest.fixture(autouse=True)
+def patient_server(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In this process a camera may take long to open: otherwise 503 on a busy machine, after which few tests retry."""
+    if request.node.get_closest_marker("gst"):
+        monkeypatch.setattr("runner.gst.server.OPEN_S", 5.0)
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     if config.getvalue("dist") != "loadgroup":

@@ -14,12 +14,14 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from runner.errors import RunError
+from runner.graph import Plan
 from runner.link.netns import _check_allowed
 from runner.operator.station import Listener
 from runner.records import Note, Sample, VehicleState, state_to_json, to_json
@@ -190,6 +192,12 @@ def _is_free(port: int) -> bool:
     return True
 
 
+def over_tcp(plan: Plan) -> Plan:
+    """The plan with an operator that receives RTSP over TCP, which loses nothing on a busy machine."""
+    client, *rest = plan.operator
+    return replace(plan, operator=(replace(client, properties={**client.properties, "protocols": "tcp"}), *rest))
+
+
 def children_named(parent: int, name: str) -> list[int]:
     """Children of a process, by a word of their command lines."""
     files = Path(f"/proc/{parent}/task").glob("*/children")
@@ -273,8 +281,8 @@ class Operator:
     def _on_telemetry(self, message: Any) -> None:
         from runner.mqtt.messages import read_telemetry
 
-        self.telemetry.append(to_json(read_telemetry(message.payload)))
         self._telemetry_at = time.monotonic()
+        self.telemetry.append(to_json(read_telemetry(message.payload)))
 
     def as_of(self) -> float:
         """The vehicle's current time, estimated from its telemetry."""

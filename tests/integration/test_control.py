@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import socket
 import subprocess
@@ -20,7 +21,7 @@ from runner.configuration.config import configuration
 from runner.core.model import Endpoint
 from runner.mqtt.broker import find_mosquitto, private_broker
 from runner.mqtt.link import ControlLink
-from runner.mqtt.messages import OFFLINE, topic
+from runner.mqtt.messages import MAX_ROUND_TRIP_S, OFFLINE, topic
 from runner.operator.station import Station
 from runner.vehicle.operators import SILENT_S
 
@@ -133,7 +134,8 @@ def test_a_late_request_is_not_executed(broker, vehicle):
     operator.ask("2", event="total_set", kbps=1000)
     late = operator.ask("3", event="total_set", kbps=9000, as_of=operator.as_of() - 2.5)
     assert late["result"] == "expired"
-    assert late["reason"].endswith(" s old, limit 1.00 s") or " s old, limit 1.0" in late["reason"]
+    limit = float(re.search(r" s old, limit (\d+\.\d+) s$", late["reason"])[1])
+    assert 1 <= limit <= 1 + MAX_ROUND_TRIP_S
     vehicle.send_signal(signal.SIGSTOP)
     operator.send("stalled", event="total_set", kbps=9000)
     time.sleep(2.5)
@@ -208,7 +210,7 @@ def test_a_flood_of_one_operator_does_not_delay_others(broker, vehicle):
     print(f"{len(waits)} requests, {max(waits) * 1000:.0f} ms at most")
     assert sorted(waits)[len(waits) * 9 // 10] < 0.5
     assert max(waits) < 1  # when the flood begins, everything on the machine is delayed
-    assert until(lambda: good.telemetry[-1]["refused"]) > 10_000
+    until(lambda: good.telemetry[-1]["refused"] > 10_000)
 
 
 # --- broker -----------------------------------------------------------------------------------------------------------
@@ -514,9 +516,11 @@ def test_periodic_messages_are_not_queued_on_a_stalled_link(broker, stack):
 
     until(lambda: publish(0) or seen)
     link_there.carries.clear()
-    for number in range(1, 200):  # for 1 s: a longer stall would end the connection
-        publish(number)
+    number, end = 0, time.monotonic() + 0.8  # a longer stall would end the connection
+    while time.monotonic() < end:
+        publish(number := number + 1)
         time.sleep(0.005)
     link_there.carries.set()
     until(lambda: publish(1000) or 1000 in seen)
+    assert number > 40
     assert len([number for number in seen if 0 < number < 1000]) < 20

@@ -56,7 +56,7 @@ def test_a_slow_program_gets_the_newest_and_ends_when_it_is_closed(robot):
     with live_frames(overrides, cameras=["rear"]) as frames:
         first = until(frames.next)
         time.sleep(1)
-        assert frames.next().captured - first.captured > 0.7
+        assert frames.next().captured - first.captured > 0.2  # the next one in a queue is 0.07 s newer
         assert first.camera == "rear"
     assert list(frames) == []
 

@@ -91,8 +91,8 @@ def test_a_flood_of_reports_is_not_answered_with_a_flood(broker):
                 operator.link.publish(topic("delivery_robot", "reception", sender), report | {"sent": number})
         until(lambda: answers)
         operator.ask("2", event="operator_connected")
-        took = time.monotonic() - began
         link.close(("tod/test", {}))
+        took = time.monotonic() - began
     assert len(answers) <= 1 + took / 0.1
     assert {answer.topic for answer in answers} == {topic("delivery_robot", "clock", operator.name)}
 

@@ -118,7 +118,7 @@ def reconnects(page):
     back = time.monotonic()
     until(lambda: page.locator("#banner").is_hidden())
     all_live(page)
-    assert time.monotonic() - back < 5
+    assert time.monotonic() - back < 10
 
 
 def test_an_operator_that_joins_a_watched_stream_shows_pictures(chromium):
@@ -163,9 +163,13 @@ def test_ages_are_right_although_the_vehicles_clock_is_ahead(chromium, tmp_path)
     with sides(log=log) as (url, vehicle, operator), vehicle(env=ahead), opened(chromium, url) as page:
         all_live(page)
         shown = partial(page.locator("[data-camera=front] .form").inner_text)
-        age = until(lambda: re.search(r" (\d+) ± (\d+) ms", shown()))
-        assert 0 <= int(age[1]) < 500, age  # and not 3700
-        assert int(age[2]) < 100, age
+
+        def is_right():
+            """Not the 3700 ms by which the clock is ahead, once the clocks have been compared well."""
+            age = re.search(r" (\d+) ± (\d+) ms", shown())
+            return age and int(age[1]) < 500 and int(age[2]) < 100
+
+        until(is_right)
         time.sleep(2.5)  # by then the page warns of an unknown clock offset
         assert page.locator("#warning").is_hidden()
         shot(page, "clock-ahead")

@@ -204,7 +204,7 @@ def test_a_receiver_that_locks_up_does_not_delay_the_others(monkeypatch):
                 more(30)  # both: another receiver replaces the stuck one
                 until(lambda: any(aside.HUNG in what for what in messages))
                 began = time.monotonic()
-            assert time.monotonic() - began < 3
+            assert time.monotonic() - began < 10  # 30 s if it waited for the stuck one
         finally:
             freed.set()
     assert messages[0] == "front: locked up"
@@ -229,10 +229,10 @@ def test_calls_run_although_timers_keep_gstreamer_s_thread_busy():
 def test_work_that_hangs_in_gstreamer_s_thread_is_reported(monkeypatch):
     from runner import apply
 
-    monkeypatch.setattr(apply, "CALL_S", 0.2)
     glib, freed = apply._Glib(), threading.Event()
     try:
-        with pytest.raises(RunError) as raised:
+        with monkeypatch.context() as patch, pytest.raises(RunError) as raised:
+            patch.setattr(apply, "CALL_S", 0.2)
             glib.call("reading the counters", lambda: freed.wait(30))
         assert str(raised.value) == "GStreamer hangs: reading the counters takes more than 0.2 s"
     finally:

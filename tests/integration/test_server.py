@@ -151,12 +151,13 @@ def test_opening_a_camera_in_any_state_is_answered_immediately(state, udp):
 
 
 @pytest.mark.alone
-def test_a_camera_that_delivers_nothing_is_answered_503_and_opens_when_it_delivers():
+def test_a_camera_that_delivers_nothing_is_answered_503_and_opens_when_it_delivers(monkeypatch):
+    monkeypatch.setattr("runner.gst.server.OPEN_S", 0.9)
     with serving("source=appsrc") as vehicle, asking_options(vehicle, CAMERA) as took:
         with RtspClient(vehicle.url()) as client:
             began = time.monotonic()
             assert client.open() == [503]
-            assert time.monotonic() - began < 3  # after OPEN_S, 0.9 s
+            assert time.monotonic() - began < 3
         assert max(took) < 0.2
         frame = bytes(1920 * 1040 * 3 // 2)
         until(lambda: vehicle.side.push(CAMERA, frame))
@@ -192,7 +193,7 @@ def test_a_viewer_cannot_seek_a_shared_stream(source, header):
             assert client.open(**header) == [200, 200, 200]
         seen = viewer.frames
         until(lambda: viewer.frames > seen + 10)
-        assert vehicle.frames() - viewer.frames <= first + 1
+        until(lambda: vehicle.frames() - viewer.frames <= first + 1)  # the viewer's thread may lag
 
 
 @pytest.mark.parametrize("transport", ["tcp", "udp"])
@@ -588,8 +589,9 @@ def test_an_ended_pipeline_leaves_no_watched_source():
     ],
     ids=["delivers nothing", "does not start"],
 )
-def test_a_camera_that_never_delivers_leaves_nothing(dead):
+def test_a_camera_that_never_delivers_leaves_nothing(dead, monkeypatch):
     """Viewers try again for as long as it is dead."""
+    monkeypatch.setattr("runner.gst.server.OPEN_S", 0.9)
     with serving(*SMALL, *dead, cameras=(SMALL_CAMERA,)) as vehicle:
         for _ in range(3):
             with RtspClient(vehicle.url(SMALL_CAMERA)) as viewer:
@@ -608,7 +610,7 @@ def test_the_reason_of_a_source_that_fails_is_reported():
         " {name: fails, element: identity, properties: {error-after: 12}},"
         ' {name: raw, element: capsfilter, properties: {caps: "{raw_caps}"}}]'
     )
-    with serving(*SMALL, elements, "source.frozen_s=0.5", cameras=(SMALL_CAMERA,)) as vehicle:
+    with serving(*SMALL, elements, "source.frozen_s=2", cameras=(SMALL_CAMERA,)) as vehicle:
         with watched(vehicle, SMALL_CAMERA):
             until(lambda: any("source: " in report for report in vehicle.reported))
         reason = next(report for report in vehicle.reported if "source: " in report)

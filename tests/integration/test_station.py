@@ -171,9 +171,16 @@ def test_a_silent_vehicle_is_offline_until_its_next_message(both):
     assert (sample.predicted_kbps, sample.allocated_kbps) == (2000, 1500)
 
 
-def report_until(station, done):
+def report_until(station, vehicle, done):
     """Report reception repeatedly, as an operator's side does."""
-    until(lambda: [station.report_reception(Arrivals({}, {})), station.take(fresh()), done()][-1], every_s=0.04)
+
+    def is_done():
+        vehicle.publish("telemetry", TELEMETRY)  # or it would be offline
+        station.report_reception(Arrivals({}, {}))
+        station.take(fresh())
+        return done()
+
+    until(is_done, every_s=0.04)
 
 
 def test_latencies_are_right_though_the_vehicles_clock_is_ahead(both):
@@ -183,10 +190,10 @@ def test_latencies_are_right_though_the_vehicles_clock_is_ahead(both):
     assert station.headline() == "delivery_robot, mode automatic, total 1500 kbit/s, latencies still unknown"
     assert station.captured_here("front", 1000.0) is None
     vehicle.clock_ahead_s = 3.7
-    report_until(station, lambda: station.clock)
+    report_until(station, vehicle, lambda: station.clock)
     clock = station.clock
     assert abs(clock.ahead_s - 3.7) <= clock.bound_s
-    report_until(station, lambda: station.samples["front"].latency_ms is not None)
+    report_until(station, vehicle, lambda: station.samples["front"].latency_ms is not None)
     clock, sample = station.clock, listener.received[-1][1]
     for camera in sample.cameras.values():
         assert abs(camera.latency_ms - 40) <= sample.clock_bound_ms + 1
@@ -207,7 +214,7 @@ def test_a_steering_angle_is_passed_on_with_its_time_by_this_machines_clock(both
     station.listeners.append(Steered())
     vehicle.clock_ahead_s = 3.7
     vehicle.publish("steering", {"at": time.time() + 3.7, "rad": 0.1})
-    report_until(station, lambda: station.clock)
+    report_until(station, vehicle, lambda: station.clock)
     at = time.time()
     vehicle.publish("steering", {"at": at + 3.7 + 60, "rad": 0.2})
     vehicle.publish("steering", {"at": at + 3.7, "rad": 0.3})
@@ -282,7 +289,7 @@ def test_the_latency_of_a_source_without_capture_times_is_unknown(both):
 
 def test_duplicate_or_unrequested_clock_answers_are_ignored(both):
     station, vehicle, _ = both
-    report_until(station, lambda: station.clock)
+    report_until(station, vehicle, lambda: station.clock)
     before, answer = station.clock, vehicle.answers[-1]
     vehicle.publish("clock", {**answer, "received": answer["received"] + 9, "answered": answer["answered"] + 9})
     vehicle.publish("clock", {"sent": 12.5, "received": 99.0, "answered": 99.0, "set_s": 0.0, "error_s": None})
@@ -296,7 +303,7 @@ def test_duplicate_or_unrequested_clock_answers_are_ignored(both):
 def test_a_vehicle_that_stops_stating_its_clock_is_reported_once(both, monkeypatch):
     monkeypatch.setattr("runner.system.clocks.KEPT_S", 0.3)
     station, vehicle, listener = both
-    report_until(station, lambda: station.clock)
+    report_until(station, vehicle, lambda: station.clock)
     vehicle.states_clock = False
     until(lambda: [vehicle.publish("telemetry", TELEMETRY), station.take(fresh()), not station.clock][-1])
     station.take(fresh())

@@ -8,6 +8,7 @@ import resource
 import socket
 import subprocess
 import time
+from collections import Counter
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from itertools import pairwise
@@ -23,6 +24,7 @@ from runner.errors import ConfigError
 from runner.gst import Gst, video_files
 from runner.gst.caps import structure
 from runner.gst.clocks import captured_at
+from runner.gst.supervised import SupervisedPipeline
 from runner.plans import compile_plans
 
 CAMERAS = ("front", "rear")
@@ -179,11 +181,13 @@ def test_an_existing_file_is_never_overwritten(sides, tmp_path):
     assert old.read_bytes() == b"another drive"
 
 
-def test_an_operator_without_a_vehicle_leaves_no_files(tmp_path):
+def test_an_operator_without_a_vehicle_leaves_no_files(tmp_path, monkeypatch):
+    starts, start = Counter(), SupervisedPipeline.start
+    monkeypatch.setattr(SupervisedPipeline, "start", lambda self: (starts.update([self]), start(self)))
     sides = Sides(tmp_path)
     sides.stop()
     with sides.receiving() as operator:
-        until(lambda: all(r._supervised._attempt > 2 for r in operator._receivers.values()))
+        until(lambda: all(starts[receiver._supervised] > 2 for receiver in operator._receivers.values()))
     assert sides.first_frames == []
     assert list(tmp_path.iterdir()) == []
 
