@@ -7,7 +7,7 @@ Compares output that must not change, byte for byte, with copies beside this scr
   drives     replays of three recorded drives
   validate   output of `validate` for a hundred broken files
   keys       keys of events, of lines of drive logs and of messages of the control link
-  mutations  file and path of the problems `validate` finds in 200 mutations of packaged files; only if named, as in `make soak`
+  mutations  file and path of the problems `validate` finds in 200 mutations of packaged files; only if named
 
 With --update the sections are rewritten; run it without --update first to see what changes.
 """

@@ -87,8 +87,10 @@ def test_a_change_sets_only_what_differs(streaming, writes):
         writes.clear()
         side.turn(Command(name, knob, value) for name in vehicle.cameras)
         until(lambda: all(knobs.get(knob) == value for knobs in side.applied().values()))
-        return Counter(writes)
+        return Counter(key for key in writes if key.partition(".")[0] in own)
 
+    # A viewer's jitter buffers are set as well, whenever the library adds one.
+    own = {element.name for camera in vehicle.cameras.values() for element in camera.graph.vehicle}
     cameras = len(vehicle.cameras)
     assert turned("bitrate", 540) == {"encoder.bitrate": cameras}
     assert turned("bitrate", 540) == {}

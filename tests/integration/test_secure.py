@@ -303,7 +303,7 @@ def test_a_vehicle_with_revoked_keys_is_disconnected(keys):
 
 def test_connections_survive_the_expiry_of_certificates(keys):
     """Certificates of both sides expire while they stream; nobody new is admitted."""
-    ends = datetime.now(UTC) + timedelta(seconds=8)
+    ends = datetime.now(UTC) + timedelta(seconds=12)
     for name in (NAME, "alice"):
         changed(keys, "rotate", name, lambda: ends - timedelta(days=365))
     with sending(keys) as (plans, _), watching(plans, keys / "alice") as (seen, messages):
