@@ -83,8 +83,8 @@ SCHEMA: Mapping[str, Sequence[Edit]] = {
         ("workers: threads", "workers: fibres"),
         ("narrowest: 1.25", "narrowest: wide"),
     ],
-    "link/relay": [
-        ("kind: relay", "kind: modem"),
+    "link/netns": [
+        ("kind: netns", "kind: modem"),
         ("queue_ms: 200", "queue_ms: -1"),
         ("share: 1.1 ", "share: 0 "),
     ],
@@ -141,7 +141,7 @@ COMPOSED: Mapping[str, Mapping[str, Sequence[Edit]]] = {
     },
     "pqos": {"pqos/map": [("maps/demo_loop.csv", "maps/demo_lop.csv")], "pqos/trace": [("demo_dips", "dips")]},
     "recording": {"recording/ffv1": [("name: mux", "name: encoder")]},
-    "link": {"link/relay": [("file: null ", "file: nowhere.csv ")]},
+    "link": {"link/netns": [("file: null ", "file: nowhere.csv ")]},
     "experiment": {
         "experiment/bottleneck": [
             ("equal: [modes=equal]", "equal: [modes=equl]"),
