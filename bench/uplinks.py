@@ -13,6 +13,7 @@ otherwise idle machine.
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import re
 import shutil
@@ -134,15 +135,21 @@ def measured_drive(path: Path, words: Sequence[str]) -> None:
 
 
 def ensure_drive(path: Path, words: Sequence[str]) -> None:
-    """Drive, unless the drive exists; one that was cut short, or had other overrides, is repeated."""
-    done, overrides = path / "done", "\n".join(words)
-    if done.exists() and done.read_text() == overrides:
+    """Drive, unless the drive exists; one that was cut short, or had other overrides or traces, is repeated."""
+    done, driven = path / "done", "\n".join([*words, *map(_digest, words)])
+    if done.exists() and done.read_text() == driven:
         return
     shutil.rmtree(path, ignore_errors=True)
     run = [sys.executable, "-m", "runner", "demo", *words, "page.serve=false", f"log={path}"]
     subprocess.run(run, check=True, stdout=subprocess.DEVNULL)
     _check_replay(path)
-    done.write_text(overrides)
+    done.write_text(driven)
+
+
+def _digest(word: str) -> str:
+    """Of the file that an override names; "" if it names none."""
+    file = Path(word.partition("=")[2])
+    return hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else ""
 
 
 def _check_replay(path: Path) -> None:
