@@ -14,6 +14,7 @@ from runner.apply import OperatorSide, VehicleSide, check_plan
 from runner.configuration.config import configuration
 from runner.core.commands import Command
 from runner.gst import Gst
+from runner.gst.buffer_probe import BufferProbe
 from runner.plans import compile_plans
 
 pytestmark = pytest.mark.gst
@@ -25,7 +26,7 @@ BUFFERS = Gst.PadProbeType.BUFFER | Gst.PadProbeType.BUFFER_LIST
 @pytest.fixture
 def calls(monkeypatch):
     """How often each probe of buffers was called."""
-    counted, add_probe = Counter(), Gst.Pad.add_probe
+    counted, add_probe, handle = Counter(), Gst.Pad.add_probe, BufferProbe.handle
 
     def add_counted(pad, mask, callback, *data):
         def on_buffer(*words):
@@ -35,7 +36,12 @@ def calls(monkeypatch):
 
         return add_probe(pad, mask, on_buffer, *data)
 
+    def handle_counted(probe, address):
+        counted[probe._on_buffer().__qualname__] += 1
+        return handle(probe, address)
+
     monkeypatch.setattr(Gst.Pad, "add_probe", add_counted)
+    monkeypatch.setattr(BufferProbe, "handle", handle_counted)
     return counted
 
 
