@@ -156,6 +156,38 @@ def test_who_joins_after_a_long_pause_is_not_shown_an_old_picture_in_part(waves)
     assert recent.add(unit(60.2)).whole
 
 
+@pytest.mark.parametrize("joined", ["late", "grey"])
+def test_pauses_and_slow_frames_refresh_nothing(joined):
+    recent = RecentUnits(refresh_s=1.0)
+    if joined == "grey":
+        sps = bytes.fromhex("6742c015a681e08fe7c05a83008320000003002000000303d1e2c5d4")
+        recent.add(AccessUnit(b"\0\0\0\1" + sps + PPS + SLICE, None, 0.0, False))
+        times = [tenth / 10 for tenth in range(1, 10)]
+    else:
+        recent.add(unit(0, key=True))
+        times = [tenth / 10 for tenth in range(1, 51)]
+    for t in times:
+        recent.add(unit(t, recovery=9 if joined == "late" and round(10 * t) % 10 == 0 else None))
+    # After the pause a frame takes 0.3 s, so that a wave of ten takes 3 s, longer than two periods.
+    shown = [recent.add(unit(30 + number * 0.3, recovery=9 if number % 10 == 5 else None)) for number in range(40)]
+    first = next(number for number, u in enumerate(shown) if u.exact and u.whole)
+    assert first == 14, "the end of the first whole wave"
+    assert all(u.exact and u.whole for u in shown[first:])
+    if joined == "late":
+        assert all(u.exact for u in shown)
+
+
+def test_a_second_pause_is_no_refresh_either():
+    recent = RecentUnits(refresh_s=1.0)
+    recent.add(unit(0, key=True))
+    for tenth in range(1, 40):
+        recent.add(unit(tenth / 10))
+    times = [30.0, 30.1, *(31.8 + tenth / 10 for tenth in range(40))]
+    whole = {round(t, 1): recent.add(unit(t)).whole for t in times}
+    assert not whole[31.8]
+    assert next(t for t in whole if whole[t]) == pytest.approx(32.7, abs=0.15)
+
+
 def test_who_joins_after_a_short_pause_starts_with_the_units_before_it():
     recent = RecentUnits(refresh_s=1.0)
     recent.add(unit(0, key=True))

@@ -493,8 +493,9 @@ class CameraServer:
     def _on_teardown(self, client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext) -> None:
         connection = self._connection(client)
         if connection:
+            is_held = _is_held(client, context.sessmedia)  # the session that ended may be another connection's
             with self._changed:
-                if not _is_held(client, context.sessmedia):  # the session may be another connection's
+                if not is_held:
                     connection.cameras.pop(_camera_name(context), None)
                 self._note_left((_camera_name(context),))
 

@@ -17,7 +17,7 @@ from runner.system.backoff import pause_s
 
 CHECK_MS = 100
 FIRST_FRAME_S = 10.0  # a UDP source may take 5 s to fail, and the first keyframe may be late
-HELD_UP_S = 0.5  # between two checks: on a busy machine the time of one that came late proves nothing
+HELD_UP_S = 0.5  # between two checks; that time does not count
 IN_FLIGHT = 5  # frames that may still pass after an error that stops the source
 LONGEST_START_S = 300.0  # a start that hangs is abandoned then; its thread remains
 BACKOFF_S = (1.0, 10.0)  # between the starts of two attempts: doubled from the first value up to the second
@@ -114,8 +114,10 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
 
     def _watch(self) -> bool:
         now, frames = time.monotonic(), self._frames()
-        held_up, self._watched = now - self._watched > HELD_UP_S, now  # this thread, and the source perhaps with it
-        if frames != self._progress[0] or held_up or not self._is_playing():
+        gap_s, self._watched = now - self._watched, now
+        if gap_s > HELD_UP_S and not self._error:  # this thread was held up, and the source perhaps with it
+            self._progress = (self._progress[0], self._progress[1] + gap_s - CHECK_MS / 1000)
+        if frames != self._progress[0] or not self._is_playing():
             self._progress = (frames, now)
             if self._error and frames > self._error[1] + IN_FLIGHT:
                 self._error = None  # it does not stop the video

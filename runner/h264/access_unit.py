@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
+from math import inf
 from typing import NamedTuple
 
 from runner.h264.keyframe import Bits, grey_idr
@@ -14,6 +15,7 @@ H265_VCL, H265_IRAP = range(32), range(16, 24)  # NAL unit types (ITU-T H.265, t
 PERIODS = 2  # of refresh until any picture is exact: they contain a whole wave, whenever it began
 CODECS = ("h264", "h265")
 LATE = 4  # factor by which a wave may take longer than stated
+REFRESHED_S = 1.0  # at most, by one unit
 LONGEST_S = 20.0  # kept of a stream without further keyframes whose refresh period is unknown
 
 
@@ -120,42 +122,54 @@ class RecentUnits:
         self._window = LONGEST_S if refresh_s is None else PERIODS * refresh_s
         self._key: AccessUnit | None = None
         self._since: deque[AccessUnit] = deque()
-        self._exact_from = 0.0  # after a grey start: when two periods have passed
-        self._resumed = 0.0  # when the stream went on after its last long pause
+        self._previous: float | None = None  # arrival of the last unit
+        self._grey_since: float | None = None  # since when grey is being overwritten; None: the picture is exact
+        self._resumed = -inf  # when the stream went on after its last long pause
         self._is_cut = False  # whether units since the last IDR are no longer stored
+        self._has_waves = False  # whether it has announced one since then
 
     def add(self, unit: AccessUnit) -> AccessUnit:
         """Store a received unit; returns it with `exact` set for a decoder that starts from the stored units."""
+        self._follow_clock(unit.arrived)
         if unit.key:
-            self._key, self._exact_from = unit, unit.arrived + (0 if unit.exact else self._window)
+            self._key, self._grey_since = unit, None if unit.exact else unit.arrived
             self._since.clear()
-            self._is_cut = False
+            self._resumed, self._is_cut, self._has_waves = -inf, False, False
             return unit
         if self._key is None and (grey := self._grey(unit.data)):
             self._key = AccessUnit(grey, None, unit.arrived, key=True, exact=False)
-            self._exact_from = unit.arrived + self._window
+            self._grey_since = unit.arrived
         if self._key is None:
             return unit._replace(exact=False)
-        self._follow_clock(unit.arrived)
-        if self._since and unit.arrived - self._since[-1].arrived > self._window:
-            self._resumed = unit.arrived
+        self._has_waves |= unit.recovery is not None
         self._since.append(unit)
         self._forget(unit.arrived)
-        if unit.arrived < self._exact_from and self._wave() is not None:
-            self._exact_from = unit.arrived
-        if unit.arrived < self._exact_from:
+        if self._grey_since is not None and not self._is_refreshing(self._grey_since):
+            self._grey_since = None
+        if self._grey_since is not None:
             self._since[-1] = unit = unit._replace(exact=False)
-        if self._is_cut and unit.arrived - self._resumed < self._window and self._wave() is None:
+        if self._is_cut and self._is_refreshing(self._resumed):
             self._since[-1] = unit = unit._replace(whole=False)
         return unit
 
     def _follow_clock(self, now: float) -> None:
-        """Shift the stored units if the clock was set back: otherwise all are kept until it has caught up."""
-        back = self._since[-1].arrived - now if self._since else 0.0
-        if back > 0:
-            self._since = deque(each._replace(arrived=each.arrived - back) for each in self._since)
-            self._exact_from -= back
-            self._resumed -= back
+        """Shift times if the clock was set back, or all units would be kept until it has caught up; also after a pause.
+
+        Nothing is refreshed in a pause.
+        """
+        ahead, self._previous = now - (now if self._previous is None else self._previous), now
+        if ahead < 0:
+            self._since = deque(each._replace(arrived=each.arrived + ahead) for each in self._since)
+        shift = ahead if ahead < 0 else max(0.0, ahead - REFRESHED_S)
+        self._resumed = now if ahead > self._window else self._resumed + shift
+        if self._grey_since is not None:
+            self._grey_since += shift
+
+    def _is_refreshing(self, since: float) -> bool:
+        """Whether the newest picture may still show parts that are older, or grey, if its refresh began at `since`."""
+        assert self._previous is not None
+        longest = self._window * (LATE if self._has_waves else 1)
+        return self._previous - since < longest and self._wave() is None
 
     def _forget(self, now: float) -> None:
         """Drop units older than the window, but keep waves whole that take longer because frames are late."""

@@ -50,7 +50,8 @@ class Bridge:
 
     def __init__(self, vehicle: Vehicle, keyring: Keyring | None, on_report: Callable[[str], None]) -> None:
         check_names(vehicle)
-        self._vehicle, self._on_report, self._report_fault = vehicle, on_report, LimitedReports(on_report)
+        self._vehicle, self._on_report = vehicle, on_report
+        self._report_refusal, self._report_publisher = LimitedReports(on_report), LimitedReports(on_report)
         login = Login(keyring, on_report) if keyring else None
         self.identity = login.user if login else uuid.uuid4().hex[:12]
         self._vehicle_time = (0.0, -math.inf)  # in the newest telemetry, and when it arrived by time.monotonic
@@ -102,6 +103,7 @@ class Bridge:
         self._node.start()
         for name, url in self._urls.items():
             self._node.publish(name, url)
+        self._node.publish(STATE, OFFLINE)
         self._link.connect()
 
     def close(self) -> None:
@@ -147,7 +149,7 @@ class Bridge:
         if self._pending.pop(reply.id, None) is not None:
             self._answer(reply.id, reply.result, reply.reason, reply.t)
         elif reply.result != "applied":
-            self._report_fault(f"{reply.id.partition(' ')[0]}: {reply.result}: {reply.reason}")
+            self._report_refusal(f"{reply.id.partition(' ')[0]}: {reply.result}: {reply.reason}")
 
     # --- from ROS, in the node's thread -------------------------------------------------------------------------------
 
@@ -183,7 +185,7 @@ class Bridge:
         assert prediction
         if others := [name for name in nodes if name != prediction.node]:
             published = f"is published by {', '.join(others)}, must be by {prediction.node} alone"
-            self._report_fault(f"{prediction.topic} {published}: predictions are left out")
+            self._report_publisher(f"{prediction.topic} {published}: predictions are left out")
         return nodes == [prediction.node]
 
     def _on_request(self, text: str) -> None:

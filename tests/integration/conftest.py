@@ -44,11 +44,15 @@ LONGEST = (
 DRIVES = {"test_link": "1", "test_feedback": "1", "test_live": "2", "test_page_sides": "2"}
 
 
-@pytest.fixture(autouse=True)
-def patient_server(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In this process a camera may take long to open: otherwise 503 on a busy machine, after which few tests retry."""
-    if request.node.get_closest_marker("gst"):
-        monkeypatch.setattr("runner.gst.server.OPEN_S", 5.0)
+@pytest.fixture(scope="session", autouse=True)
+def patient_server() -> Iterator[None]:
+    """In this process a camera may take long to open: otherwise 503 on a busy machine, after which few tests retry.
+
+    How long it really takes is tested where cameras are opened in any state, see test_server.py.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("runner.gst.server.OPEN_S", 5.0)
+        yield
 
 
 @pytest.hookimpl(optionalhook=True)
