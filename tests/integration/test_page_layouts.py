@@ -268,7 +268,8 @@ def test_a_busy_page_delays_neither_pictures_nor_alarms_even_as_webgl_starts(chr
         until(lambda: page.evaluate("tod.birdseye()")["drawn"] == [""])
         page.keyboard.press("v")
         until(lambda: measure(page)["mast"]["straight"])
-        until(lambda: colour_at(page, "mast", 0.02, 0.97) == AMBER)  # the label ESTIMATED
+        is_labelled = passes(lambda: colour_at(page, "mast", 0.02, 0.97) == AMBER)  # ESTIMATED
+        assert is_labelled, (shot(page, "busy-unlabelled"), page.evaluate("tod.measure()"))
 
 
 AMBER = (255, 176, 0)
