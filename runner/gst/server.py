@@ -625,12 +625,7 @@ def _end_other(client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPCont
     that is not being sent may be set up again: ffmpeg does so for each profile in the description, and in a new session
     when it pauses UDP to try TCP.
     """
-    held = [
-        (session, media)
-        for session in client.session_filter(None)
-        for media in session.filter(None)
-        if media.get_media() is context.media
-    ]
+    held = [(session, media) for session, media in _set_up(client) if media.get_media() is context.media]
     sent = context.stream.transport_filter(None)
     if any(transport in sent for _, media in held for transport in _transports(media)):
         return False
@@ -642,8 +637,12 @@ def _end_other(client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPCont
 
 def _is_held(client: GstRtspServer.RTSPClient, ended: GstRtspServer.RTSPSessionMedia) -> bool:
     """Whether a connection has set up the same camera as what has just ended, in a session of its own."""
-    held = [media for session in client.session_filter(None) for media in session.filter(None)]
-    return any(media is not ended and media.get_media() is ended.get_media() for media in held)
+    return any(media is not ended and media.get_media() is ended.get_media() for _, media in _set_up(client))
+
+
+def _set_up(client: GstRtspServer.RTSPClient) -> list[tuple[GstRtspServer.RTSPSession, GstRtspServer.RTSPSessionMedia]]:
+    """What a connection has set up, with the session of each."""
+    return [(session, media) for session in client.session_filter(None) for media in session.filter(None)]
 
 
 def _transports(media: GstRtspServer.RTSPSessionMedia) -> list[GstRtspServer.RTSPStreamTransport]:
