@@ -266,11 +266,12 @@ class CameraServer:
     def _on_error(self, bus: Gst.Bus, message: Gst.Message, camera: _Camera) -> None:
         if concerns_file(message):
             return  # only the file ends, not the stream
-        self._on_report(camera.name, message.parse_error()[0].message)
         with self._changed:
-            if camera.bus is bus:
-                camera.stage = _Stage.ENDING
+            if camera.bus is not bus or camera.stage is _Stage.ENDING:
+                return  # elements fail while the pipeline is being stopped, and after the one that has failed first
+            camera.stage = _Stage.ENDING
             affected = [c for c in self._connections.values() if camera.name in (c.described, *c.cameras)]
+        self._on_report(camera.name, message.parse_error()[0].message)
         # The library ends the pipeline when the last of them has left; until then no new viewer is admitted.
         for connection in affected:
             connection.close()

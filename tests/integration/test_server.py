@@ -14,6 +14,8 @@ import pytest
 from rig import streaming, until
 from rtsp_client import RtspClient
 from runner.core.commands import Command
+from runner.gst import GLib, Gst
+from runner.gst.server import CameraServer
 from runner.gst.viewers import user_agent
 
 CAMERA, OTHER = "front_left", "front_right"
@@ -568,6 +570,24 @@ def test_a_pipeline_that_fails_with_viewers_is_torn_down_and_rebuilt(capfd):
             assert vehicle.pipelines(SMALL_CAMERA) == number
         assert any("Failed after iterations" in report for report in vehicle.reported)
     assert "CRITICAL" not in capfd.readouterr().err
+
+
+def test_an_element_that_fails_while_its_pipeline_stops_is_not_reported(monkeypatch):
+    """Caps that change meanwhile are refused by elements that have already stopped."""
+    inform = CameraServer._on_target_state
+
+    def fail(server, media, state, camera):
+        inform(server, media, state, camera)
+        if state == Gst.State.NULL:
+            error = GLib.Error.new_literal(Gst.StreamError.quark(), "made to fail", Gst.StreamError.FAILED)
+            camera.bus.post(Gst.Message.new_error(media.get_element(), error, "in a test"))
+
+    monkeypatch.setattr(CameraServer, "_on_target_state", fail)
+    with serving(*SMALL, cameras=(SMALL_CAMERA,)) as vehicle:
+        with watched(vehicle, SMALL_CAMERA):
+            pass
+        until(lambda: f"{SMALL_CAMERA}: pipeline stopped" in vehicle.reported)
+        assert vehicle.reported == [f"{SMALL_CAMERA}: pipeline {what}" for what in ("built", "stopped")]
 
 
 def test_an_ended_pipeline_leaves_no_watched_source():
