@@ -23,6 +23,7 @@ from runner.gst.clocks import captured_at
 from runner.gst.credentials import log_in
 from runner.gst.outage import ReportMerger
 from runner.gst.pipeline import CameraPipeline
+from runner.gst.probes import PassingBuffer
 from runner.gst.receiver import OnPicture, OnUnit, Receiver, Reception
 from runner.gst.recorder import Recorded, Recorder, Stage
 from runner.gst.registry import (
@@ -132,7 +133,7 @@ class _Glib:
         load_types()
         self._loop = GLib.MainLoop()
         self._calls: deque[Callable[[], None]] = deque()
-        # One watch for all calls: see runner/gst/buffer_probe.py. Its priority is that of the timers: at a lower one,
+        # One watch for all calls: see runner/gst/probes.py. Its priority is that of the timers: at a lower one,
         # calls would wait for as long as an overloaded loop always has a timer to run.
         self._wakeup = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         self._watch = GLib.unix_fd_add_full(GLib.PRIORITY_DEFAULT, self._wakeup, GLib.IOCondition.IN, self._on_wakeup)
@@ -207,8 +208,8 @@ def _with_video(plans: Sequence[Plan], video: VideoFiles | None, side: str) -> S
     return plans
 
 
-def _captured(pad: Gst.Pad, buffer: Gst.Buffer) -> float:
-    return captured_at(pad, buffer.pts)
+def _captured(pad: Gst.Pad, unit: PassingBuffer) -> float | None:
+    return None if unit.pts is None else captured_at(pad, unit.pts)
 
 
 class VehicleSide:

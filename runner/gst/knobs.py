@@ -12,6 +12,7 @@ from runner.core.commands import KnobValue
 from runner.core.model import Camera
 from runner.graph import Assignment, assignments, text
 from runner.gst.caps import structure
+from runner.gst.probes import IdleProbe
 
 ANOTHER_RATIO = (60001, 60000)  # of 16 bits each; below 30000 px no player rounds it to another pixel
 
@@ -35,6 +36,7 @@ class KnobPanel:
         self._pending: dict[str, KnobValue] = {}
         self.applied: dict[str, KnobValue] = {}
         self.faults: list[str] = []
+        self._between_frames = IdleProbe(self._apply_pending)
 
     def set_now(self, values: Mapping[str, KnobValue]) -> None:
         """Set knobs of a pipeline that is not playing yet."""
@@ -57,7 +59,7 @@ class KnobPanel:
         first = next(element for element in self._elements if element.get_name() in names)
         # Only a source pad knows whether a frame it has pushed is still being processed downstream.
         above = first.get_static_pad("sink").get_peer()
-        above.add_probe(Gst.PadProbeType.IDLE, self._between_frames)
+        self._between_frames.add_to(above)
 
     def restart_encoder(self, knob: str) -> None:
         """Set the caps of a knob again with another pixel aspect ratio, which restarts the encoder.
@@ -72,10 +74,6 @@ class KnobPanel:
                 _, above, below = structure(caps).get_fraction("pixel-aspect-ratio")
                 caps.set_value("pixel-aspect-ratio", Gst.Fraction(*((1, 1) if above != below else ANOTHER_RATIO)))
                 self._by_name[name].set_property("caps", caps)
-
-    def _between_frames(self, _pad: Gst.Pad, _info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
-        self._apply_pending()
-        return Gst.PadProbeReturn.REMOVE
 
     def _apply_pending(self) -> None:
         with self._lock:

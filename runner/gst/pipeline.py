@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import weakref
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +12,7 @@ from runner.errors import RunError
 from runner.graph import Plan
 from runner.gst.arriving import CAPTURE_ID
 from runner.gst.knobs import KnobPanel
+from runner.gst.probes import BufferProbe, PassingBuffer, TypeProbe
 from runner.gst.repeats import RepeatDetector
 from runner.gst.sender_stages import EncoderWatch, SenderStages
 from runner.gst.source import loop_clip
@@ -24,6 +24,13 @@ if TYPE_CHECKING:
 Build = Callable[[Gst.Bin, Plan], "CameraPipeline"]
 SRT_KEY_BYTES = 32  # AES-256
 CAPTURE_TIME = "urn:ietf:params:rtp-hdrext:ntp-64"  # RTP header extension with the capture time (RFC 6051)
+# New caps must not make the source renegotiate: its output does not change. It would query caps between two frames,
+# while the next knobs are being turned, and see only some of them.
+_NOT_RECONFIGURED = TypeProbe(Gst.PadProbeType.EVENT_UPSTREAM, {Gst.EventType.RECONFIGURE: Gst.PadProbeReturn.DROP})
+# A camera is reported as not seekable, by answering the query unchanged. The RTSP server relies on the source's answer:
+# it would seek a clip or a test picture for every PLAY with a Range, Scale or Speed, flush the stream of all viewers,
+# and wait for a frame that a closed gate never passes.
+_NOT_SEEKABLE = TypeProbe(Gst.PadProbeType.QUERY_UPSTREAM, {Gst.QueryType.SEEKING: Gst.PadProbeReturn.HANDLED})
 
 
 class CameraPipeline:
@@ -64,9 +71,9 @@ class CameraPipeline:
         last = next(pad for element in reversed(self._elements) if (pad := element.get_static_pad("src")))
         self._add_capture_time(last.get_parent_element())
         self.knobs.set_now(self._allowed(self._first))
-        packets = Gst.PadProbeType.BUFFER | Gst.PadProbeType.BUFFER_LIST
-        last.add_probe(packets, _on_first_packet, weakref.ref(self))  # weak: there may never be a packet
-        last.add_probe(Gst.PadProbeType.QUERY_UPSTREAM, _refuse_seeks)
+        self._first_packet = BufferProbe(last, self._on_first_packet, in_lists=True)
+        self._first_packet.arm()
+        _NOT_SEEKABLE.add_to(last)
 
     @property
     def source_fault(self) -> str | None:
@@ -161,14 +168,15 @@ class CameraPipeline:
         self._repeats.check_next()
         return self._encoder.take()
 
-    def begin(self) -> None:
-        """The first packet has left. From a streaming thread."""
+    def _on_first_packet(self, _pad: Gst.Pad, _packet: PassingBuffer) -> bool:
+        """From a streaming thread."""
         self._started = True
-        self._elements[0].get_static_pad("sink").add_probe(Gst.PadProbeType.EVENT_UPSTREAM, _drop_reconfigure)
+        _NOT_RECONFIGURED.add_to(self._elements[0].get_static_pad("sink"))
         known: Mapping[str, KnobValue] = {}
         while (wanted := self._wanted()).get("sending") != known.get("sending"):  # `turn` may set a newer one meanwhile
             known = wanted
             self.knobs.turn({"sending": wanted["sending"]})
+        return True
 
     def _add_capture_time(self, payloader: Gst.Element) -> None:
         """Add the capture time of its frame to the header of every packet."""
@@ -176,32 +184,6 @@ class CameraPipeline:
             extension = GstRtp.RTPHeaderExtension.create_from_uri(CAPTURE_TIME)
             extension.set_id(CAPTURE_ID)
             payloader.emit("add-extension", extension)
-
-
-def _on_first_packet(_pad: Gst.Pad, _info: Gst.PadProbeInfo, owner: weakref.ref[CameraPipeline]) -> Gst.PadProbeReturn:
-    """Not a method: the pad would keep the pipeline that contains it."""
-    if pipeline := owner():
-        pipeline.begin()
-    return Gst.PadProbeReturn.REMOVE
-
-
-def _drop_reconfigure(_pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
-    """Keep new caps from making the source renegotiate: its output does not change.
-
-    It would query caps between two frames, while the next knobs are being turned, and see only some of them.
-    """
-    reconfigures = info.get_event().type == Gst.EventType.RECONFIGURE
-    return Gst.PadProbeReturn.DROP if reconfigures else Gst.PadProbeReturn.OK
-
-
-def _refuse_seeks(_pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
-    """Report a camera as not seekable, by answering the query unchanged.
-
-    The RTSP server relies on the source's answer. It would seek a clip or a test picture for every PLAY with a Range,
-    Scale or Speed: flush the stream of all viewers, and wait for a frame that a closed gate never passes.
-    """
-    seeking = info.get_query().type == Gst.QueryType.SEEKING
-    return Gst.PadProbeReturn.HANDLED if seeking else Gst.PadProbeReturn.OK
 
 
 def passed_counts(identity: Gst.Element) -> tuple[int, int]:

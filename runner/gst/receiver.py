@@ -12,8 +12,8 @@ from gi.repository import GObject, Gst, GstSdp
 
 from runner.graph import Plan, video_codec
 from runner.gst.arriving import MAX_FRAMES, NTP_EPOCH_S, RTP_HZ, MediaClock
-from runner.gst.buffer_probe import BufferProbe, PassingBuffer
 from runner.gst.caps import structure
+from runner.gst.probes import BufferProbe, PassingBuffer
 from runner.gst.repair import RepairBuffer
 from runner.gst.sender_filter import SenderFilter
 from runner.gst.supervised import SupervisedPipeline
@@ -314,10 +314,9 @@ class Receiver:
             self._decode.set(1000 * (now - arrived))
         return True
 
-    def _on_arrival(self, _pad: Gst.Pad, buffer: PassingBuffer) -> bool:
+    def _on_arrival(self, pad: Gst.Pad, buffer: PassingBuffer) -> bool:
         """An access unit has arrived; page and log share its times, and over SRT the reception report too."""
-        arrived, monotonic, size, reference_ns = time.time(), time.monotonic(), buffer.size, buffer.reference_ns
-        captured = None if reference_ns is None else unix_s(reference_ns)
+        arrived, monotonic, size, captured = time.time(), time.monotonic(), buffer.size, _captured(pad, buffer)
         self._entered = (buffer.pts, monotonic)
         if captured is not None or self._untimed:
             sampled = self._media_clock.seconds if captured is None else captured
@@ -360,8 +359,9 @@ class Receiver:
         return Gst.FlowReturn.OK
 
 
-def _captured(_pad: Gst.Pad, buffer: Gst.Buffer) -> float | None:
-    return capture_time(buffer)
+def _captured(_pad: Gst.Pad, unit: PassingBuffer) -> float | None:
+    reference_ns = unit.reference_ns
+    return None if reference_ns is None else unix_s(reference_ns)
 
 
 def prefer_feedback(client: Gst.Element, on_profile: Callable[[str], None] = lambda profile: None) -> None:

@@ -8,7 +8,7 @@ from collections import deque
 from gi.repository import GObject, Gst
 
 from runner.gst.arriving import HEADER_BYTES, ArrivingFrames, read_packet
-from runner.gst.buffer_probe import BufferProbe, PassingBuffer
+from runner.gst.probes import BufferProbe, PassingBuffer
 from runner.system.recent import RecentValue
 
 REORDER_MS = 5  # a packet that is missing for longer was lost, not reordered

@@ -8,9 +8,9 @@ from collections.abc import Callable
 
 from gi.repository import Gst
 
-from runner.gst.buffer_probe import BufferProbe, PassingBuffer
 from runner.gst.caps import structure
 from runner.gst.outage import Outage
+from runner.gst.probes import BufferProbe, PassingBuffer
 
 SLICES, SLICE_BYTES = 16, 8192  # compared parts of a picture: sensor noise is everywhere
 CHECKS = 4  # consecutive identical checks before a picture counts as repeated

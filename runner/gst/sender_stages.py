@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 from gi.repository import Gst
 
-from runner.gst.buffer_probe import BufferProbe, PassingBuffer
 from runner.gst.clocks import captured_at
+from runner.gst.probes import BufferProbe, PassingBuffer
 from runner.system.recent import RecentValue
 
 SAME_S = 1e-4  # capture times of the same picture before and after the encoder differ by less

@@ -608,13 +608,13 @@ class CameraServer:
         return pipeline is not None and (pipeline.paused or bool(pipeline.source_fault))
 
 
-def _on_media_error(media: GstRtspServer.RTSPMedia, _message: Gst.Message, camera: _Camera) -> bool:
-    """Let the library see only errors of a pipeline that is being opened, which then fails.
+def _on_media_error(media: GstRtspServer.RTSPMedia, message: Gst.Message, camera: _Camera) -> bool:
+    """Let the library see only errors of a stream that is being opened, which then fails.
 
     For a later error, it (1.22) would leave the viewers' transports and the stream's elements behind, and end a second
     time what has ended meanwhile.
     """
-    if camera.media is not media or camera.prepared:
+    if camera.media is not media or camera.prepared or concerns_file(message):
         GObject.signal_stop_emission_by_name(media, MEDIA_ERROR)
     return True
 

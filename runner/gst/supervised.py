@@ -12,10 +12,11 @@ from gi.repository import GLib, Gst
 
 from runner.graph import Plan
 from runner.gst.aside import HUNG, set_state_in_thread
-from runner.gst.buffer_probe import BufferProbe, PassingBuffer
 from runner.gst.outage import Outage
 from runner.gst.pipeline import Build, CameraPipeline, encrypt
+from runner.gst.probes import BufferProbe, PassingBuffer
 from runner.gst.timers import Delayed, every, later
+from runner.gst.video_files import concerns_file
 
 RETRY_S = 1.0  # minimum time between the starts of two attempts
 STOPPED_S = 2.0  # how long the next pipeline waits for the previous one to release its port
@@ -97,6 +98,8 @@ class SupervisedPipeline:
         self.start()
 
     def _on_failed(self, _bus: Gst.Bus, message: Gst.Message) -> None:
+        if concerns_file(message):
+            return
         failed = message.type == Gst.MessageType.ERROR
         self.restart(message.parse_error()[0].message if failed else "the stream ended")
 

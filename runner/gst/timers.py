@@ -25,7 +25,7 @@ class Delayed:
 
 
 class _Delays:
-    """Calls that are due later. They share one timer, since each would leak memory: runner/gst/buffer_probe.py."""
+    """Calls that are due later. They share one timer, since each would leak memory: runner/gst/probes.py."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()

@@ -11,12 +11,23 @@ from pathlib import Path
 
 from gi.repository import Gst
 
+from runner.gst.probes import BufferProbe, PassingBuffer, TypeProbe
+
 DIRECTORY = "video"  # below the drive's directory
 SHIFT_S = 0.0005  # tolerance for times in the file
-NO_TIME: int = Gst.CLOCK_TIME_NONE  # the largest number
 _MARK = "video-"  # prefix of the names of the elements that write the file, see runner/graph.py
 
-Captured = Callable[[Gst.Pad, Gst.Buffer], float | None]  # when a frame was captured, s since 1970; None: unknown
+# The file's branch accepts any stream, and must not influence its format or latency. Otherwise an encoder would choose
+# the format that the file prefers, and the stream's sink would hold packets back until the slowest branch is ready.
+_NOT_ASKED = TypeProbe(
+    Gst.PadProbeType.QUERY_DOWNSTREAM | Gst.PadProbeType.QUERY_UPSTREAM,
+    {
+        Gst.QueryType.CAPS: Gst.PadProbeReturn.DROP,  # without an answer the element assumes no limit
+        Gst.QueryType.LATENCY: Gst.PadProbeReturn.HANDLED,  # answered unchanged: no latency
+    },
+)
+
+Captured = Callable[[Gst.Pad, PassingBuffer], float | None]  # when a frame was captured, s since 1970; None: unknown
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,8 +49,8 @@ class VideoFiles:
 class VideoFile:
     """The file of one pipeline. It begins with the first frame: a pipeline without frames leaves none.
 
-    Any failure here ends the file, is reported once, and does not affect the stream. Elements are looked up when
-    needed: an object that a probe keeps alive must not keep the pipeline alive.
+    Any failure here ends the file, is reported once, and does not affect the stream. The pipeline's bus keeps this
+    object, which must not keep the pipeline: elements are looked up when needed.
 
     side       vehicle or operator
     captured   returns a frame's capture time; called between queue and parser
@@ -51,8 +62,9 @@ class VideoFile:
     ) -> None:
         self._files, self._camera, self._side = files, camera, side
         self._captured, self._on_report = captured, on_report
-        self._capture_times: dict[int, float] = {}  # by stream time, ns, until the file begins
-        self._file, self._first = "", 0  # its name, and the stream time of its first frame
+        self._capture_times: dict[int | None, float] = {}  # by stream time, ns, until the file begins
+        self._file = ""  # its name
+        self._first: int | None = None  # the stream time of its first frame
         self._ahead = 0.0  # s by which capture times exceed times in the file
         self._begun = self._failed = self._overran = False
 
@@ -60,30 +72,34 @@ class VideoFile:
         """Watch a newly built pipeline of a plan with `video`."""
         elements = {name: pipeline.get_by_name(f"{_MARK}{name}") for name in ("gate", "queue", "parser", "file")}
         elements["file"].set_locked_state(True)  # not opened with the pipeline, so that it cannot fail the pipeline
-        queries = Gst.PadProbeType.QUERY_DOWNSTREAM | Gst.PadProbeType.QUERY_UPSTREAM
-        elements["gate"].get_static_pad("sink").add_probe(queries, _on_query)
+        _NOT_ASKED.add_to(elements["gate"].get_static_pad("sink"))
         elements["queue"].connect("overrun", self._on_overrun)
-        elements["queue"].get_static_pad("src").add_probe(Gst.PadProbeType.BUFFER, self._on_unit)
-        elements["parser"].get_static_pad("src").add_probe(Gst.PadProbeType.BUFFER, self._on_first_parsed)
-        _outermost(pipeline).get_bus().set_sync_handler(self._on_message)
+        self._probes = (
+            BufferProbe(elements["queue"].get_static_pad("src"), self._on_unit),
+            BufferProbe(elements["parser"].get_static_pad("src"), self._on_first_parsed),
+        )
+        for probe in self._probes:
+            probe.arm()
+        bus = _outermost(pipeline).get_bus()
+        bus.enable_sync_message_emission()
+        bus.connect("sync-message::error", self._on_error)
 
-    def _on_unit(self, pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+    def _on_unit(self, pad: Gst.Pad, unit: PassingBuffer) -> bool:
         """From the queue's thread. The parser outputs nothing before parameter sets."""
-        buffer = info.get_buffer()
-        captured = self._captured(pad, buffer)
+        captured, pts = self._captured(pad, unit), unit.pts
         if not self._begun:
-            self._capture_times[buffer.pts] = time.time() if captured is None else captured
-        elif captured is not None and self._file and not self._failed and self._first <= buffer.pts < NO_TIME:
-            after_s = (buffer.pts - self._first) / Gst.SECOND
-            if abs(captured - after_s - self._ahead) > SHIFT_S:
+            self._capture_times[pts] = time.time() if captured is None else captured
+        elif self._file and not self._failed and captured is not None and pts is not None and self._first is not None:
+            after_s = (pts - self._first) / Gst.SECOND
+            if after_s >= 0 and abs(captured - after_s - self._ahead) > SHIFT_S:
                 self._ahead = captured - after_s
                 self._files.on_shift(self._camera, self._file, after_s, captured)
-        return Gst.PadProbeReturn.OK
+        return False
 
-    def _on_first_parsed(self, pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+    def _on_first_parsed(self, pad: Gst.Pad, unit: PassingBuffer) -> bool:
         """From the queue's thread: open the file, just before its first frame."""
         self._begun = True
-        first = info.get_buffer().pts
+        first = unit.pts
         captured = self._capture_times.get(first) or max(self._capture_times.values(), default=time.time())
         self._capture_times.clear()
         parts = pad.get_parent_element().get_parent()
@@ -91,7 +107,7 @@ class VideoFile:
             path = _new_file(self._files.directory / DIRECTORY, self._camera, self._side)
         except OSError as error:
             self._fail(parts, str(error))
-            return Gst.PadProbeReturn.REMOVE
+            return True
         sink = parts.get_by_name(f"{_MARK}file")
         sink.set_property("location", str(path))
         sink.set_locked_state(False)
@@ -99,16 +115,13 @@ class VideoFile:
             self._file, self._first = str(path.relative_to(self._files.directory)), first
             self._ahead = captured
             self._files.on_video(self._camera, self._file, captured)
-        return Gst.PadProbeReturn.REMOVE
+        return True
 
-    def _on_message(self, _bus: Gst.Bus, message: Gst.Message) -> Gst.BusSyncReply:
-        """From any thread, before the pipeline handles it."""
-        if message.type != Gst.MessageType.ERROR or not concerns_file(message):
-            return Gst.BusSyncReply.PASS
+    def _on_error(self, _bus: Gst.Bus, message: Gst.Message) -> None:
+        """From the thread in which it occurred, which is still blocked."""
         # A bin that fails to start resets all elements, even locked ones; a file sink without a name then fails.
-        if self._begun or message.src.get_name() != f"{_MARK}file":
+        if concerns_file(message) and (self._begun or message.src.get_name() != f"{_MARK}file"):
             self._fail(message.src.get_parent(), message.parse_error()[0].message)
-        return Gst.BusSyncReply.DROP
 
     def _fail(self, parts: Gst.Bin, why: str) -> None:
         """Close the gate, which discards all further frames and hides the failure of the frame in flight."""
@@ -144,20 +157,6 @@ def _new_file(directory: Path, camera: str, side: str) -> Path:
             continue
         return path
     raise AssertionError("numbers never end")
-
-
-def _on_query(_pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
-    """The file branch accepts any stream, and must not influence its format or latency.
-
-    Otherwise an encoder would choose the format that the file prefers, and the sink of the stream would hold packets
-    back until the slowest branch is ready.
-    """
-    query = info.get_query().type
-    if query == Gst.QueryType.CAPS:
-        return Gst.PadProbeReturn.DROP  # without an answer the element assumes no limit
-    if query == Gst.QueryType.LATENCY:
-        return Gst.PadProbeReturn.HANDLED  # answered unchanged: no latency
-    return Gst.PadProbeReturn.OK
 
 
 def _outermost(element: Gst.Element) -> Gst.Element:

@@ -14,7 +14,7 @@ from runner.apply import OperatorSide, VehicleSide, check_plan
 from runner.configuration.config import configuration
 from runner.core.commands import Command
 from runner.gst import Gst
-from runner.gst.buffer_probe import BufferProbe
+from runner.gst.probes import BufferProbe
 from runner.plans import compile_plans
 
 pytestmark = pytest.mark.gst

@@ -10,11 +10,12 @@ from pathlib import Path
 import pytest
 
 from rig import SMALL_ROBOT, free_port, until
-from runner.apply import OperatorSide, VehicleSide
+from rtsp_client import RtspClient
+from runner.apply import OperatorSide, VehicleSide, VideoFiles
 from runner.configuration.config import configuration
 from runner.core.commands import Command
 from runner.gst import GLib, Gst, supervised
-from runner.gst.buffer_probe import BufferProbe
+from runner.gst.probes import BufferProbe
 from runner.gst.supervised import SupervisedPipeline
 from runner.plans import compile_plans
 
@@ -176,12 +177,15 @@ def made(monkeypatch):
     return counted
 
 
-def test_attempts_to_reach_a_vehicle_that_is_away_make_no_callback(made, monkeypatch):
+@pytest.mark.parametrize("stored", [False, True])
+def test_attempts_to_reach_a_vehicle_that_is_away_make_no_callback(stored, made, monkeypatch, tmp_path):
     starts = Counter()
     monkeypatch.setattr(supervised, "RETRY_S", 0.05)
     monkeypatch.setattr(SupervisedPipeline, "start", counting(starts, "start", SupervisedPipeline.start))
-    vehicle = configuration([*SMALL_ROBOT, f"media.port={free_port()}"], runnable=False).vehicle()
-    viewer = OperatorSide(compile_plans(vehicle), lambda *_: None)
+    words = [*SMALL_ROBOT, f"media.port={free_port()}", f"log.video={str(stored).lower()}"]
+    vehicle = configuration(words, runnable=False).vehicle()
+    files = VideoFiles(tmp_path, lambda *_: None, lambda *_: None) if stored else None
+    viewer = OperatorSide(compile_plans(vehicle), lambda *_: None, video=files)
     try:
         until(lambda: starts["start"] > 10)
         made.clear()
@@ -189,6 +193,27 @@ def test_attempts_to_reach_a_vehicle_that_is_away_make_no_callback(made, monkeyp
         assert not made
     finally:
         viewer.stop()
+
+
+def test_a_pipeline_that_is_built_again_makes_no_callback(made):
+    words = [*SMALL_ROBOT, "source=test", f"media.port={free_port()}"]
+    vehicle = configuration(words).vehicle()
+    reported = []
+    side = VehicleSide(compile_plans(vehicle), vehicle.media, lambda camera, what: reported.append(what))
+    camera = next(iter(vehicle.cameras))
+    try:
+        for number in range(1, 4):
+            side.turn([Command(camera, "bitrate", 500 + number), Command(camera, "size", (160, 90))])
+            with RtspClient(f"rtsp://127.0.0.1:{vehicle.media.port}/{camera}") as client:
+                assert client.open() == [200, 200, 200]
+                client.read()
+                until(lambda c=client: c.frames > 5)
+                side.turn([Command(camera, "bitrate", 600), Command(camera, "size", (320, 180))])
+                until(lambda c=client: side.applied()[camera]["size"] == (320, 180))
+            until(lambda n=number: reported.count("pipeline stopped") == n)
+        assert not made
+    finally:
+        side.stop()
 
 
 def test_sides_that_are_sampled_make_no_callback(made):

@@ -1,4 +1,4 @@
-"""Probes that see buffers of a pad without leaking memory: single ones, at no cost for the others, or all.
+"""Pad probes that leak no memory.
 
 PyGObject before 3.44.2 (Debian 12, Ubuntu 22.04) leaks 130 bytes for each callback passed to C, such as a probe or a
 timer. Latencies of eight cameras are sampled 80 times a second, and an operator's side tries once a second to reach
@@ -11,7 +11,8 @@ from __future__ import annotations
 import ctypes
 import itertools
 import traceback
-from collections.abc import Callable
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
 from ctypes import CFUNCTYPE, POINTER, Structure, c_char_p, c_int, c_size_t, c_uint, c_uint64, c_ulong, c_void_p
 from typing import Any
 from weakref import WeakMethod, WeakValueDictionary
@@ -27,6 +28,12 @@ class _MiniObject(Structure):
         ("private_number", c_uint),
         ("private", c_void_p),
     )
+
+
+class _Typed(Structure):
+    """The beginning of an event, and of a query."""
+
+    _fields_ = (("object", _MiniObject), ("type", c_uint))
 
 
 class _Buffer(Structure):
@@ -99,44 +106,98 @@ class PassingBuffer:
         return data.raw[:copied]
 
 
-class BufferProbe:
+class _Probe(ABC):
+    """Known to C by a number. A pad does not keep it alive: once deleted, it is removed."""
+
+    def __init__(self) -> None:
+        self._key = next(_keys)
+        _probes[self._key] = self
+
+    def _add(self, pad: Gst.Pad, kinds: Gst.PadProbeType) -> None:
+        _add_probe(int(_pointer(pad.__gpointer__, None)), kinds, _on_probe, self._key, None)
+
+    @abstractmethod
+    def handle(self, address: int | None) -> Gst.PadProbeReturn:
+        """Called with the address of what passes; None while nothing does."""
+
+
+class BufferProbe(_Probe):
     """A probe that can be armed repeatedly. While it is not armed, buffers cost nothing. It ends with its owner.
 
     on_buffer  method of the owner, which it does not keep alive: called in the streaming thread with the pad and each
                buffer, until it returns True
+    in_lists   whether buffers may come in lists, of which nothing can be read
     armed      whether it waits for a buffer
     """
 
-    def __init__(self, pad: Gst.Pad, on_buffer: Callable[[Gst.Pad, PassingBuffer], bool]) -> None:
+    def __init__(
+        self, pad: Gst.Pad, on_buffer: Callable[[Gst.Pad, PassingBuffer], bool], *, in_lists: bool = False
+    ) -> None:
+        super().__init__()
         self._pad, self._on_buffer = pad, WeakMethod(on_buffer)
-        self._key = next(_keys)
+        self._kinds = Gst.PadProbeType.BUFFER | (Gst.PadProbeType.BUFFER_LIST if in_lists else 0)
         self.armed = False
-        _probes[self._key] = self
 
     def arm(self) -> None:
         """Wait for the next buffer, unless already armed. To be called by one thread at a time."""
         if not self.armed:
             self.armed = True
-            address = int(_pointer(self._pad.__gpointer__, None))
-            _add_probe(address, Gst.PadProbeType.BUFFER, _on_probe, self._key, None)
+            self._add(self._pad, self._kinds)
 
-    def handle(self, address: int) -> int:
+    def handle(self, address: int | None) -> Gst.PadProbeReturn:
         on_buffer = self._on_buffer()
+        assert address
         if on_buffer and not on_buffer(self._pad, PassingBuffer(address)):
-            return int(Gst.PadProbeReturn.OK)
+            return Gst.PadProbeReturn.OK
         self.armed = False
-        return int(Gst.PadProbeReturn.REMOVE)
+        return Gst.PadProbeReturn.REMOVE
+
+
+class IdleProbe(_Probe):
+    """Calls a method of its owner, which it does not keep alive, between two buffers of a pad."""
+
+    def __init__(self, on_idle: Callable[[], None]) -> None:
+        super().__init__()
+        self._on_idle = WeakMethod(on_idle)
+
+    def add_to(self, pad: Gst.Pad) -> None:
+        """Have it called once: immediately if nothing passes the pad, otherwise in the streaming thread."""
+        self._add(pad, Gst.PadProbeType.IDLE)
+
+    def handle(self, address: int | None) -> Gst.PadProbeReturn:
+        if on_idle := self._on_idle():
+            on_idle()
+        return Gst.PadProbeReturn.REMOVE
+
+
+class TypeProbe(_Probe):
+    """Decides by its type what becomes of an event or a query; of any number of pads. A constant of its module.
+
+    kinds    of the events or queries
+    results  by type; the others pass
+    """
+
+    def __init__(self, kinds: Gst.PadProbeType, results: Mapping[Any, Gst.PadProbeReturn]) -> None:
+        super().__init__()
+        self._kinds = kinds
+        self._results = {int(kind): result for kind, result in results.items()}
+
+    def add_to(self, pad: Gst.Pad) -> None:
+        self._add(pad, self._kinds)
+
+    def handle(self, address: int | None) -> Gst.PadProbeReturn:
+        assert address
+        return self._results.get(_Typed.from_address(address).type, Gst.PadProbeReturn.OK)
 
 
 _keys = itertools.count(1)
-_probes: WeakValueDictionary[int, BufferProbe] = WeakValueDictionary()
+_probes: WeakValueDictionary[int, _Probe] = WeakValueDictionary()
 
 
 def _dispatch(_pad: int, info: Any, key: int) -> int:
-    """A pad does not keep its probe alive: an armed probe is removed once its owner is gone."""
     probe = _probes.get(key)
     try:
-        return probe.handle(info.contents.data) if probe else int(Gst.PadProbeReturn.REMOVE)
+        return int(probe.handle(info.contents.data) if probe else Gst.PadProbeReturn.REMOVE)
     except Exception:  # to which ctypes would return 0: drop the buffer
         traceback.print_exc()
         return int(Gst.PadProbeReturn.OK)
