@@ -196,13 +196,13 @@ def test_attempts_to_reach_a_vehicle_that_is_away_make_no_callback(stored, made,
 
 
 def test_a_pipeline_that_is_built_again_makes_no_callback(made):
-    words = [*SMALL_ROBOT, "source=test", f"media.port={free_port()}"]
-    vehicle = configuration(words).vehicle()
+    vehicle = configuration([*SMALL_ROBOT, "source=test", f"media.port={free_port()}"]).vehicle()
     reported = []
     side = VehicleSide(compile_plans(vehicle), vehicle.media, lambda camera, what: reported.append(what))
     camera = next(iter(vehicle.cameras))
     try:
         for number in range(1, 4):
+            made.clear()  # those of the first pipeline include the server's own
             side.turn([Command(camera, "bitrate", 500 + number), Command(camera, "size", (160, 90))])
             with RtspClient(f"rtsp://127.0.0.1:{vehicle.media.port}/{camera}") as client:
                 assert client.open() == [200, 200, 200]
