@@ -8,8 +8,8 @@ thousands of changes that must leak nothing.
     make soak PARTS="stalls hostile"    some parts only
     KEYS=1 make soak                    encrypted: TLS, passwords and SRTP for video, TLS 1.3 for control
 
-Parts run one after the other in two lanes: one for the parts with time limits, the other for those that only repeat or
-wait. Every part prints its steps and figures; the exit status is 1 if anything failed.
+The tests run alone, then the parts in two lanes: one for those with time limits, the other for those that only repeat
+or wait. Every part prints its steps and figures; the exit status is 1 if anything failed.
 """
 
 from __future__ import annotations
@@ -70,6 +70,7 @@ PARTS: dict[str, Part] = {
 }
 
 
+ALONE = ("tests",)  # they measure how soon a driver sees something
 SECOND_LANE = ("clocks", "churn")
 BACKGROUND = str(CHECKOUT / "scripts" / "background")
 BEFORE = {"churn": [BACKGROUND]}  # it uses all the processor time that it gets
@@ -86,9 +87,13 @@ def main(chosen: Sequence[str]) -> int:
     print(f"seed {seed}, scale {scale:g}", flush=True)
     # For the parts, whose lines must appear immediately.
     os.environ |= {"SOAK_SEED": str(seed), "PYTHONUNBUFFERED": "1"}
-    lanes = [[name for name in chosen or PARTS if (name in SECOND_LANE) == second] for second in (False, True)]
+    names = chosen or tuple(PARTS)
+    lanes = [
+        [name for name in names if name not in ALONE and (name in SECOND_LANE) == second] for second in (False, True)
+    ]
+    failed = _run_each([name for name in names if name in ALONE])
     with ThreadPoolExecutor(len(lanes)) as pool:
-        failed = [name for names in pool.map(_run_each, lanes) for name in names]
+        failed += [name for found in pool.map(_run_each, lanes) for name in found]
     print(f"failed: {', '.join(failed)}" if failed else "no problems")
     return 1 if failed else 0
 
