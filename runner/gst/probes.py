@@ -109,6 +109,8 @@ class PassingBuffer:
 class _Probe(ABC):
     """Known to C by a number. A pad does not keep it alive: once deleted, it is removed."""
 
+    on_fault = Gst.PadProbeReturn.OK  # of its owner; ctypes would return 0, which drops what passes
+
     def __init__(self) -> None:
         self._key = next(_keys)
         _probes[self._key] = self
@@ -156,6 +158,8 @@ class BufferProbe(_Probe):
 class IdleProbe(_Probe):
     """Calls a method of its owner, which it does not keep alive, between two buffers of a pad."""
 
+    on_fault = Gst.PadProbeReturn.REMOVE  # until then the pad is blocked
+
     def __init__(self, on_idle: Callable[[], None]) -> None:
         super().__init__()
         self._on_idle = WeakMethod(on_idle)
@@ -190,17 +194,40 @@ class TypeProbe(_Probe):
         return self._results.get(_Typed.from_address(address).type, Gst.PadProbeReturn.OK)
 
 
+class EventProbe(_Probe):
+    """Asks a method of its owner, which it does not keep alive, whether to drop an event.
+
+    kinds    of the events
+    is_dropped  called in the streaming thread with the type of each
+    """
+
+    def __init__(self, kinds: Gst.PadProbeType, is_dropped: Callable[[Gst.EventType], bool]) -> None:
+        super().__init__()
+        self._kinds, self._is_dropped = kinds, WeakMethod(is_dropped)
+
+    def add_to(self, pad: Gst.Pad) -> None:
+        self._add(pad, self._kinds)
+
+    def handle(self, address: int | None) -> Gst.PadProbeReturn:
+        assert address
+        is_dropped = self._is_dropped()
+        dropped = is_dropped and is_dropped(Gst.EventType(_Typed.from_address(address).type))
+        return Gst.PadProbeReturn.DROP if dropped else Gst.PadProbeReturn.OK
+
+
 _keys = itertools.count(1)
 _probes: WeakValueDictionary[int, _Probe] = WeakValueDictionary()
 
 
 def _dispatch(_pad: int, info: Any, key: int) -> int:
     probe = _probes.get(key)
+    if probe is None:
+        return int(Gst.PadProbeReturn.REMOVE)
     try:
-        return int(probe.handle(info.contents.data) if probe else Gst.PadProbeReturn.REMOVE)
-    except Exception:  # to which ctypes would return 0: drop the buffer
+        return int(probe.handle(info.contents.data))
+    except Exception:
         traceback.print_exc()
-        return int(Gst.PadProbeReturn.OK)
+        return int(probe.on_fault)
 
 
 _on_probe = _Callback(_dispatch)

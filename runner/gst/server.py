@@ -256,7 +256,7 @@ class CameraServer:
     def _on_unprepared(self, media: GstRtspServer.RTSPMedia, camera: _Camera, pipeline: CameraPipeline) -> None:
         with self._changed:
             if camera.media is media:
-                camera.media = None
+                camera.media = camera.bus = None
             if self.pipelines.get(camera.name) is pipeline:
                 del self.pipelines[camera.name]
                 camera.stage = _Stage.NONE

@@ -6,16 +6,18 @@ import threading
 import time
 from collections.abc import Callable
 
-from gi.repository import GLib, Gst
+from gi.repository import Gst
 
 from runner.graph import Plan, launch
 from runner.gst.aside import HUNG, HUNG_STARTING, change_in_thread, set_state_in_thread
 from runner.gst.credentials import log_in
 from runner.gst.outage import Outage
+from runner.gst.probes import EventProbe
 from runner.gst.source import fixed_rate
+from runner.gst.timers import Delayed, later
 from runner.system.backoff import pause_s
 
-CHECK_MS = 100
+CHECK_S = 0.1
 FIRST_FRAME_S = 10.0  # a UDP source may take 5 s to fail, and the first keyframe may be late
 HELD_UP_S = 0.5  # between two checks; that time does not count
 IN_FLIGHT = 5  # frames that may still pass after an error that stops the source
@@ -46,12 +48,13 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         self._counter = Gst.ElementFactory.make("identity", "source-frames")
         self.add(self._counter)
         self.add_pad(Gst.GhostPad.new("src", self._counter.get_static_pad("src")))
-        self._counter.get_static_pad("sink").add_probe(Gst.PadProbeType.EVENT_DOWNSTREAM, _on_event)
+        self._events = EventProbe(Gst.PadProbeType.EVENT_DOWNSTREAM, self._ends_here)
+        self._events.add_to(self._counter.get_static_pad("sink"))
         self._lock = (
             threading.Lock()
         )  # for the child: the server's threads start and stop it, GLib's thread replaces it
         self._child: Gst.Bin | None = None
-        self._timer = 0
+        self._next_check: Delayed | None = None
         self._starting: threading.Thread | None = None  # starts the child
         self._started = 0.0  # when it began
         self._error: tuple[str, int] | None = None  # the source's own error, and frames before it; set from its threads
@@ -75,7 +78,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
                 self._add_child()
             self._watched = time.monotonic()
             self._progress = (self._frames(), self._watched)
-            self._timer = GLib.timeout_add(CHECK_MS, self._watch)
+            self._next_check = later(CHECK_S, self._watch)
         elif transition == Gst.StateChange.PAUSED_TO_READY:
             self._end()
         result = Gst.Bin.do_change_state(self, transition)
@@ -85,9 +88,9 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
 
     def _end(self) -> None:
         with self._lock:
-            if self._timer:
-                GLib.source_remove(self._timer)
-            self._timer = 0
+            if self._next_check:
+                self._next_check.cancel()
+            self._next_check = None
             self._remove_child()
             self.outage, self._attempts = Outage(self._on_report), 0
 
@@ -100,9 +103,9 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
                 return
         Gst.Bin.do_handle_message(self, message)
 
-    def has_ended(self) -> bool:
-        """The source sends no more. Returns whether this bin handles that."""
-        if not self._frames():
+    def _ends_here(self, event: Gst.EventType) -> bool:
+        """From a streaming thread. The end of a source that has worked does not end the pipeline."""
+        if event != Gst.EventType.EOS or not self._frames():
             return False
         self._set_error("the stream ended")
         return True
@@ -112,17 +115,21 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
 
     # --- in GLib's thread ---------------------------------------------------------------------------------------------
 
-    def _watch(self) -> bool:
+    def _watch(self) -> None:
+        with self._lock:
+            if not self._next_check:
+                return
+            self._next_check = later(CHECK_S, self._watch)
         now, frames = time.monotonic(), self._frames()
         gap_s, self._watched = now - self._watched, now
         if gap_s > HELD_UP_S and not self._error:  # this thread was held up, and the source perhaps with it
-            self._progress = (self._progress[0], self._progress[1] + gap_s - CHECK_MS / 1000)
+            self._progress = (self._progress[0], self._progress[1] + gap_s - CHECK_S)
         if frames != self._progress[0] or not self._is_playing():
             self._progress = (frames, now)
             if self._error and frames > self._error[1] + IN_FLIGHT:
                 self._error = None  # it does not stop the video
         if not frames:
-            return True
+            return
         if not self._attempts:
             self._check_source(now)
         elif frames > self._last_attempt[0]:
@@ -130,7 +137,6 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
             self.outage.report_recovery(now)
         else:
             self._check_attempt(now)
-        return True
 
     def _check_source(self, now: float) -> None:
         """During normal operation."""
@@ -160,7 +166,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         self._last_attempt = (self._progress[0], now)
         self._attempts += 1
         with self._lock:
-            if not self._timer:
+            if not self._next_check:
                 return
             self._remove_child()
             self._error = None
@@ -212,13 +218,6 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         if not called:
             pad.remove_probe(probe)
         return bool(called)
-
-
-def _on_event(pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
-    """Not a method: the pad would keep its own bin alive forever."""
-    if info.get_event().type == Gst.EventType.EOS and pad.get_parent_element().get_parent().has_ended():
-        return Gst.PadProbeReturn.DROP
-    return Gst.PadProbeReturn.OK
 
 
 def _on_idle(_pad: Gst.Pad, _info: Gst.PadProbeInfo, called: list[bool]) -> Gst.PadProbeReturn:

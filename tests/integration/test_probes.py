@@ -15,7 +15,7 @@ from runner.apply import OperatorSide, VehicleSide, VideoFiles
 from runner.configuration.config import configuration
 from runner.core.commands import Command
 from runner.gst import GLib, Gst, supervised
-from runner.gst.probes import BufferProbe
+from runner.gst.probes import BufferProbe, IdleProbe
 from runner.gst.supervised import SupervisedPipeline
 from runner.plans import compile_plans
 
@@ -147,9 +147,12 @@ def test_a_deleted_owner_is_no_longer_called(playing):
 
 def test_a_fault_of_the_owner_does_not_drop_buffers(playing, capfd):
     pipeline, pad = playing
-    passed = []
+    failed, passed = [], []
 
     def fails(_pad, _buffer):
+        if len(failed) == 3:
+            return True  # nothing may be printed while it is read
+        failed.append(1)
         raise ValueError("a fault")
 
     owner, after = Watcher(pad, fails), Watcher(pad, lambda _pad, _buffer: passed.append(1))
@@ -157,6 +160,30 @@ def test_a_fault_of_the_owner_does_not_drop_buffers(playing, capfd):
     after.probe.arm()
     pipeline.set_state(Gst.State.PLAYING)
     until(lambda: len(passed) > 3)
+    assert capfd.readouterr().err.count("ValueError: a fault") == 3
+
+
+class FailingOwner:
+    def __init__(self):
+        self.called = 0
+        self.probe = IdleProbe(self.on_idle)
+
+    def on_idle(self):
+        self.called += 1
+        raise ValueError("a fault")
+
+
+def test_a_fault_between_two_buffers_does_not_block_them(playing, capfd):
+    pipeline, pad = playing
+    passed, owner = [], FailingOwner()
+    after = Watcher(pad, lambda _pad, _buffer: passed.append(1))
+    after.probe.arm()
+    pipeline.set_state(Gst.State.PLAYING)
+    until(lambda: passed)
+    owner.probe.add_to(pad)
+    until(lambda: owner.called)
+    seen = len(passed)
+    until(lambda: len(passed) > seen + 3)
     assert "ValueError: a fault" in capfd.readouterr().err
 
 
@@ -195,8 +222,9 @@ def test_attempts_to_reach_a_vehicle_that_is_away_make_no_callback(stored, made,
         viewer.stop()
 
 
-def test_a_pipeline_that_is_built_again_makes_no_callback(made):
-    vehicle = configuration([*SMALL_ROBOT, "source=test", f"media.port={free_port()}"]).vehicle()
+@pytest.mark.parametrize("source", [(), ("source.frozen_s=1",)], ids=["plain", "watched"])
+def test_a_pipeline_that_is_built_again_makes_no_callback(source, made):
+    vehicle = configuration([*SMALL_ROBOT, "source=test", *source, f"media.port={free_port()}"]).vehicle()
     reported = []
     side = VehicleSide(compile_plans(vehicle), vehicle.media, lambda camera, what: reported.append(what))
     camera = next(iter(vehicle.cameras))
