@@ -155,6 +155,7 @@ _PORTS = itertools.cycle(range(10_000, 30_000))
 next(itertools.islice(_PORTS, random.SystemRandom().randrange(20_000), None))  # other processes start elsewhere
 
 WAIT_S = 60.0  # a demo starts in 3 s, and in 15 if five such tests run in parallel
+ANSWERED_S = 10.0  # before a request is sent again
 
 
 def _has_ipv6() -> bool:
@@ -266,7 +267,7 @@ class Operator:
         self.last: Any = None  # state
         self.replies: dict[str, Any] = {}
         self.telemetry: list[Any] = []
-        self._telemetry_at = 0.0
+        self._clock: tuple[float, float] | None = None  # the vehicle's time, and when it arrived
         self.requests = topic(vehicle, "request", self.name)
         listen = {
             topic(vehicle, "state"): lambda message: self.states.put(state_to_json(read_state(message.payload))),
@@ -281,19 +282,28 @@ class Operator:
     def _on_telemetry(self, message: Any) -> None:
         from runner.mqtt.messages import read_telemetry
 
-        self._telemetry_at = time.monotonic()
-        self.telemetry.append(to_json(read_telemetry(message.payload)))
+        arrived, telemetry = time.monotonic(), read_telemetry(message.payload)
+        if not message.retained:
+            self._clock = (telemetry.t, arrived)
+        self.telemetry.append(to_json(telemetry))
 
     def as_of(self) -> float:
         """The vehicle's current time, estimated from its telemetry."""
-        return float(until(lambda: self.telemetry)[-1]["t"]) + time.monotonic() - self._telemetry_at
+        vehicle, arrived = until(lambda: self._clock)
+        return float(vehicle) + time.monotonic() - arrived
 
     def send(self, identity: str, **event: Any) -> None:
+        until(lambda: self.link.wait_connected(0.1))  # a link that is down sends nothing
         self.link.publish(self.requests, {"id": identity, "as_of": self.as_of(), **event})
 
     def ask(self, identity: str, **event: Any) -> Any:
-        self.send(identity, **event)
-        return until(lambda: self.replies.get(identity))
+        """Sends it again if nothing answers: a request or its answer may be lost with the connection."""
+
+        def asked() -> Any:
+            self.send(identity, **event)
+            return passes(lambda: self.replies.get(identity), ANSWERED_S) and self.replies[identity]
+
+        return until(asked)
 
     def state(self, wanted: Callable[[Any], bool]) -> Any:
         """The next state that fulfils a condition."""
@@ -379,6 +389,10 @@ class Client:
         self.times: list[float] = []
         self.errors: list[str] = []
         self.pipeline = Gst.parse_launch(line)
+        for element in plan.operator[:1]:
+            client = self.pipeline.get_by_name(element.name)
+            if client and client.find_property("tcp-timeout"):  # as patient as the server: it does not reconnect
+                client.set_property("tcp-timeout", 20_000_000)
         self._sink = self.pipeline.get_by_name("sink")
         self._sink.get_static_pad("sink").add_probe(Gst.PadProbeType.BUFFER, self._on_frame)
         self.pipeline.get_bus().set_sync_handler(self._on_message)

@@ -149,7 +149,7 @@ def rear(address, *words):
 
 def test_a_camera_that_asks_for_a_password_gets_it_from_a_file(credentials):
     with ip_camera(free_port(), "viewer", "se:same7") as (address, _):
-        words = rear(address, f'source.credentials="{credentials}"')
+        words = rear(address, f'source.credentials="{credentials}"', "source.frozen_s=10")
         with streaming(*words, cameras=("rear",)) as (side, _, (plan,), reported), watching(plan) as client:
             knobs = {"sending": True, "size": (424, 240), "bitrate": 500}
             side.turn([Command("rear", knob, value) for knob, value in knobs.items()])

@@ -74,7 +74,7 @@ def test_a_camera_that_froze_comes_back_and_viewers_keep_their_session(frozen_s)
         time.sleep(frozen_s - 1)
         frozen = counts()
         camera.send_signal(signal.SIGCONT)
-        until(lambda: not side.sources(), seconds=12)  # at most 10 s between two attempts
+        until(lambda: not side.sources())
         until(lambda: all(now > then + 10 for now, then in zip(counts(), frozen, strict=True)))
         assert client.errors == []
         messages = [line.removeprefix("rear: ") for line in reported]
@@ -93,7 +93,7 @@ def test_frames_keep_the_times_of_a_camera_that_is_faster_or_slower(fps_max):
     def noting(times):
         return lambda _, info: times.append(info.get_buffer().pts) or Gst.PadProbeReturn.OK
 
-    with driving(f"fps_max={fps_max}") as (_, side, _, plan, reported), watching(plan) as client:
+    with driving(f"fps_max={fps_max}", "source.frozen_s=10") as (_, side, _, plan, reported), watching(plan) as client:
         until(lambda: len(client.sizes) > 10)
         source = side._pipeline("rear")._pipeline
         source.get_by_name("rate").get_static_pad("src").add_probe(Gst.PadProbeType.BUFFER, noting(sent))
@@ -110,11 +110,11 @@ def test_frames_keep_the_times_of_a_camera_that_is_faster_or_slower(fps_max):
 
 
 def test_a_camera_that_is_off_is_still_monitored():
-    with driving() as (camera, side, _, plan, reported), watching(plan) as client:
+    with driving("source.frozen_s=3") as (camera, side, _, plan, reported), watching(plan) as client:
         until(lambda: len(client.sizes) > 10)
         knobs(side, sending=False)
         until(lambda: side.applied()["rear"]["sending"] is False)
-        time.sleep(2)  # twice the limit for a frozen source
+        time.sleep(5)  # more than the limit for a frozen source
         assert side.sources() == {}
         camera.kill()
         until(side.sources)
@@ -125,11 +125,11 @@ def test_a_camera_that_is_off_is_still_monitored():
 def test_frames_blocked_downstream_are_no_fault_of_the_source():
     from runner.gst import Gst
 
-    with driving() as (_, side, _, plan, reported), watching(plan) as client:
+    with driving("source.frozen_s=3") as (_, side, _, plan, reported), watching(plan) as client:
         until(lambda: len(client.sizes) > 10)
         below = side._pipeline("rear")._pipeline.get_by_name("gate").get_static_pad("src")
         held = below.add_probe(Gst.PadProbeType.BLOCK_DOWNSTREAM, lambda *_: Gst.PadProbeReturn.OK)
-        time.sleep(2)  # twice the limit for a frozen source
+        time.sleep(5)  # more than the limit for a frozen source
         assert side.sources() == {}
         before = len(client.sizes)
         below.remove_probe(held)
@@ -152,7 +152,7 @@ def test_a_camera_that_restarts_is_connected_again():
         stack.enter_context(ip_camera(port))
         until(lambda: len(client.sizes) > before + 10)
         assert client.errors == []
-        assert side.sources() == {}
+        until(lambda: not side.sources())
         assert reported.count("rear: pipeline built") == 1
 
 
@@ -165,7 +165,7 @@ def test_a_viewer_of_a_missing_camera_is_refused_and_served_when_it_is_back():
         until(lambda: "rear: pipeline stopped" in reported)
         with watching(plan) as client:
             until(lambda: len(client.sizes) > 10)
-        assert side.sources() == {}
+            until(lambda: not side.sources())
 
 
 def test_a_paused_pipeline_is_neither_a_fault_nor_a_recovery():

