@@ -22,6 +22,7 @@ from runner.gst.viewers import user_agent
 from runner.h264.access_unit import AccessUnit, read_unit
 from runner.h264.damage import HEAD_BYTES, Damage
 from runner.records import Arrival
+from runner.system.held_up import LateCheck
 from runner.system.recent import RecentValue
 
 if TYPE_CHECKING:
@@ -105,6 +106,7 @@ class Receiver:
         self._client_name, self._sink_name = plan.operator[0].name, plan.operator[-1].name
         self._arrivals: deque[tuple[float, float | None]] | None = deque() if arrivals else None
         self._sampled = 0  # arrivals that have been read
+        self._late = LateCheck()
         self._unread: deque[Arrival] = deque(maxlen=MAX_FRAMES)  # access units, if there is no jitter buffer
         self._packets = (0, 0)  # received and missing, as last read
         self._newest: Arrival | None = None
@@ -161,6 +163,7 @@ class Receiver:
             self._foreign_reported = True
             self._on_report(self._name, "packets from hosts other than the vehicle are dropped")
         now = time.monotonic()
+        is_excused = self._late.is_excused(now)
         if self._login and (withdrawn := self._login.withdrawn()):
             self._supervised.restart(withdrawn)
         expected = self._was_expected = self._is_expected()
@@ -168,13 +171,16 @@ class Receiver:
             self._last_unexpected = now
         if received.frames != self._progress[0] or self.should_send is False:
             self._progress = (received.frames, now)
-        elif expected and now - self._progress[1] > self._stall_s and now - self._last_unexpected > GRACE_S:
+        elif expected and not is_excused and self._has_stalled(now):
             self._progress = (received.frames, now)
             self._supervised.restart(f"no frame for {self._stall_s:g} s")
         else:
             return received
         self._next_picture.arm()
         return received
+
+    def _has_stalled(self, now: float) -> bool:
+        return now - self._progress[1] > self._stall_s and now - self._last_unexpected > GRACE_S
 
     def _is_expected(self) -> bool:
         """Whether frames should arrive.

@@ -53,6 +53,7 @@ from runner.records import (
 )
 from runner.security.keyring import Keyring
 from runner.system.clocks import KEPT_S, MOST_DRIFT, STEP_S, ClockComparison, ClockDifference, Exchange, latency
+from runner.system.held_up import LateCheck
 from runner.system.kernel_clock import clock_error_s, wall_ahead_s
 from runner.system.recent import CURRENT_S
 
@@ -138,6 +139,7 @@ class Station:
         self._rates: dict[str, MeasuredRates] = {}
         self._newest: Mapping[str, Arrival] = {}  # by camera
         self._sampled = 0.0  # time.monotonic of `samples`
+        self._late = LateCheck()
         self._delay_s: float | None = None  # of the first access unit: reported delays are relative to it
         self._run = secrets.randbits(32)  # identifies the reports of this process
         listen = {
@@ -234,7 +236,8 @@ class Station:
     def take(self, samples: Mapping[str, StreamCounters]) -> None:
         """Process a sample of all counters; to be called a few times a second, since it also checks timeouts."""
         now = time.monotonic()
-        if self.state and now - self._last_message > SILENT_S:
+        is_excused = self._late.is_excused(now)
+        if self.state and now - self._last_message > SILENT_S and not is_excused:
             self._vehicle_lost(f"the vehicle has been silent for {SILENT_S:g} s")
         self._time_out(now)
         self._check_vehicle_name(now)

@@ -237,11 +237,12 @@ BUSY = """([keys, seconds]) => {
 def drawn_while_busy(page, keys, seconds):
     """Press keys, and keep the page's main thread busy.
 
-    Returns the names of the cameras whose pictures were drawn in the last second of that time, and when it ended.
+    Returns the names of the cameras whose pictures were drawn in the second half of that time, and when it ended.
     """
     ended = page.evaluate(BUSY, [keys, seconds])
     drawn = {name: [times[-1] for times in stages] for name, stages in page.evaluate("tod.stages()").items()}
-    return {name for name, times in drawn.items() if any(ended - 1000 < time <= ended for time in times)}, ended
+    begun = ended - 500 * seconds
+    return {name for name, times in drawn.items() if any(begun < time <= ended for time in times)}, ended
 
 
 def test_a_busy_page_delays_neither_pictures_nor_alarms_even_as_webgl_starts(chromium, picture):
@@ -254,7 +255,7 @@ def test_a_busy_page_delays_neither_pictures_nor_alarms_even_as_webgl_starts(chr
         server.silent.add("mast")
         until(lambda: station.attention in ("watching", "unfocused"))
         station.seen.clear()
-        drawn, ended = drawn_while_busy(page, "", 4)  # the GPU is detected 3 s after the start
+        drawn, ended = drawn_while_busy(page, "", 8)  # the GPU is detected 3 s after the start
         assert "slow" in station.seen, "keys do nothing meanwhile"
         until(lambda: station.attention in ("watching", "unfocused"))
         assert drawn == {"front", "rear"}
@@ -264,12 +265,18 @@ def test_a_busy_page_delays_neither_pictures_nor_alarms_even_as_webgl_starts(chr
         assert marks[-1] == "lost"
         server.silent.clear()
         until(lambda: measure(page)["mast"]["status"] == "live")
-        assert {"front", "rear"} <= drawn_while_busy(page, "e3l", 2.5)[0]
+        assert {"front", "rear"} <= drawn_while_busy(page, "e3l", 5)[0]
         until(lambda: page.evaluate("tod.birdseye()")["drawn"] == [""])
         page.keyboard.press("v")
-        until(lambda: measure(page)["mast"]["straight"])
-        is_labelled = passes(lambda: colour_at(page, "mast", 0.02, 0.97) == AMBER)  # ESTIMATED
-        assert is_labelled, (shot(page, "busy-unlabelled"), page.evaluate("tod.measure()"))
+
+        def is_labelled():
+            """ESTIMATED: its plate, beside the letters. The frame of a picture that is not live covers it."""
+            mast = measure(page)["mast"]
+            return mast["straight"] and mast["status"] == "live" and colour_at(page, "mast", 0.005, 0.985) == AMBER
+
+        if not passes(is_labelled):
+            said = page.inner_text("#toasts"), page.evaluate("[localStorage['tod-straight'], tod.measure()]")
+            pytest.fail(f"{said} {shot(page, 'busy-unlabelled')}")
 
 
 AMBER = (255, 176, 0)

@@ -1,7 +1,7 @@
 /** Drawing by another worker: without a GPU, how often and how large. */
 
 import assert from "node:assert/strict";
-import { test } from "node:test";
+import { mock, test } from "node:test";
 
 import { setGpu } from "../../runner/page/static/picture.js";
 import { RemoteWarp } from "../../runner/page/static/remote_warp.js";
@@ -43,6 +43,19 @@ test("a moving picture is due 200 ms after the last one without a GPU, with one 
   setGpu(false);
   warp.drawn_at -= 200;
   assert.equal(warp.isDue, true);
+});
+
+test("a drawing without an answer for 10 s has failed, and a late answer changes nothing", async () => {
+  mock.timers.enable({ apis: ["setTimeout"] });
+  const warp = new RemoteWarp(null);
+  const drawing = warp.draw({ width: 8, height: 8 }, FRAME, []);
+  mock.timers.tick(9999);
+  assert.equal(warp.isBusy, true);
+  mock.timers.tick(1);
+  await assert.rejects(drawing, { message: "nothing was drawn for 10 s" });
+  assert.equal(warp.isBusy, false);
+  answer();
+  mock.timers.reset();
 });
 
 test("a drawing that fails states why, as does every one after the context was lost", async () => {

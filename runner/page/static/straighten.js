@@ -1,6 +1,6 @@
 /** Which fisheye pictures are straightened: the operator's choice per camera. The worker straightens them. */
 
-import { camera, listen, publish, store } from "./store.js";
+import { camera, listen, note, publish, store } from "./store.js";
 import { canStraighten } from "./straight.js";
 import { showStraight } from "./link.js";
 
@@ -32,7 +32,9 @@ function applyChoice() {
 function onStraightenFailed({ camera: name, why }) {
   chosen.delete(name);
   applyChoice();
-  publish("toast", { text: `${name}: the picture cannot be straightened: ${why}`, level: "problem" });
+  const problem = { text: `${name}: the picture cannot be straightened: ${why}`, level: "problem" };
+  publish("toast", problem);
+  note(problem);
 }
 
 export function startStraight() {
