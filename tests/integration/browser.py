@@ -60,14 +60,22 @@ def opened(browser, url, width=1280, height=800, refused=False, script="", **con
 
 
 def visit(page, url):
-    def visited():
+    _load(lambda: page.goto(url))
+
+
+def visit_again(page):
+    _load(page.reload)
+
+
+def _load(load):
+    def is_loaded():
         try:
-            return page.goto(url) or True
+            return load() or True
         except sync_api.Error as error:
             if NETWORK_CHANGED not in error.message:
                 raise
 
-    until(visited)
+    until(is_loaded)
 
 
 # Of a page that loads again, as when an address is added to this machine: while it does, and before its module has run.
@@ -131,11 +139,12 @@ def all_live(page, seconds=rig.WAIT_S):
 
 
 def state(page):
-    return page.evaluate("tod.state")
+    """The vehicle's state, once it is online: a machine that was held up may show it offline for a moment."""
+    return state_when(page, lambda now: True)
 
 
 def state_when(page, wanted, seconds=rig.WAIT_S):
-    return until(lambda: (now := state(page)) and now["online"] and wanted(now) and now, seconds)
+    return until(lambda: (now := page.evaluate("tod.state")) and now["online"] and wanted(now) and now, seconds)
 
 
 def luma(page, camera):

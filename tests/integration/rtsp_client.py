@@ -182,6 +182,8 @@ class RtspClient:
             return f"{profile}/TCP;unicast;interleaved=0-1"
         for _ in range(2):
             self._rtp.append(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+            # A reader that a busy machine delays must not lose packets.
+            self._rtp[-1].setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4_000_000)
             self._rtp[-1].bind((self.tcp.getsockname()[0], 0))
         ports = [sock.getsockname()[1] for sock in self._rtp]
         return f"{profile};unicast;client_port={ports[0]}-{ports[1]}"

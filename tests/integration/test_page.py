@@ -32,6 +32,8 @@ from browser import (
     take_control,
     until,
     viewing,
+    visit,
+    visit_again,
 )
 from rig import WAIT_S, answers, free_port, needs_browser, process
 from runner.page.server import EVENTS
@@ -167,7 +169,7 @@ def test_a_button_released_outside_the_picture_leaves_no_drag_behind(page):
     choose(page, "single")
     tile = page.locator("[data-camera=front_center] canvas[role=img]").bounding_box()
     x, y = tile["x"] + tile["width"] / 2, tile["y"] + 2
-    before = page.evaluate("tod.state.cameras.front_center.roi")
+    before = state(page)["cameras"]["front_center"]["roi"]
     page.mouse.move(x, y)
     page.mouse.down()
     page.mouse.move(x, tile["y"] - 100)
@@ -188,7 +190,7 @@ def test_single_numbers_and_sliders_set_one_camera(page):
     state_when(page, lambda now: now["cameras"]["top_left"]["applied"].get("bitrate") == 777)
     page.keyboard.press("1")  # is no further digit of the number
     assert page.evaluate("tod.selected") == TUM[0]
-    before = field.input_value()
+    before = until(field.input_value)  # empty while the vehicle is offline
     field.fill("999")
     field.press("Escape")
     assert page.evaluate("document.activeElement.tagName") == "BODY"
@@ -314,7 +316,7 @@ def decoded(units, shape):
 def test_a_reload_keeps_control_history_and_mode(page):
     choose(page, "collective")
     before = page.evaluate("tod.history.time.length")
-    page.reload()
+    visit_again(page)
     until(lambda: page.evaluate("window.tod !== undefined && tod.state && tod.history"))
     all_live(page)
     assert page.evaluate("tod.history.time.length") >= before
@@ -465,7 +467,7 @@ def test_without_webcodecs_a_message_names_the_requirement(chromium, demo):
     with chromium.new_context() as tab:
         tab.add_init_script("delete window.VideoDecoder")
         blind = tab.new_page()
-        blind.goto(demo)
+        visit(blind, demo)
         until(lambda: "WebCodecs" in blind.inner_text("body"))
         assert "Chromium" in blind.inner_text("body")
 

@@ -28,6 +28,7 @@ from browser import (
     until,
     viewing,
     visit,
+    visit_again,
 )
 from rig import SMALL_ROBOT, WAIT_S, answers, free_port, needs_browser, passes, process
 from runner.configuration.config import configuration
@@ -173,7 +174,7 @@ def test_a_layout_is_dragged_moved_by_keys_saved_and_reset(chromium, picture, tm
         assert wrong == {"outside": [], "cut": [], "low": [], "scrolls": False}
         assert set(pictures) == set(CAMERAS)
         shot(page, "layout")
-        page.reload()
+        visit_again(page)
         until(lambda: page.evaluate("window.tod?.control") == "you")
         until(lambda: edges(page) == large)
         page.click("#edit-layout")
@@ -583,7 +584,7 @@ def test_monitors_share_selection_control_and_attention_with_their_page(chromium
         monitor.close()
         until(lambda: station.attention in ("watching", "unfocused"))
         wrong = page.context.new_page()
-        wrong.goto(f"{server.url}?show=front,raer")
+        visit(wrong, f"{server.url}?show=front,raer")
         wrong.wait_for_selector("#no-such-camera")
         assert wrong.inner_text("#no-such-camera") == "delivery_robot has no camera raer; cameras are front, rear, mast"
 
@@ -744,7 +745,7 @@ def test_every_text_is_readable_by_day_and_by_night(chromium, picture, tmp_path)
         page.keyboard.press("d")
         look("drawer")
         monitor = page.context.new_page()
-        monitor.goto(f"{server.url}?show=front,rear")
+        visit(monitor, f"{server.url}?show=front,rear")
         assert passes(lambda: has_started(monitor)), loaded(monitor)
         all_live(monitor)
         look("monitor", on=monitor)

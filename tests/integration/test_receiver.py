@@ -9,6 +9,8 @@ import threading
 import time
 from collections import Counter
 from contextlib import ExitStack, contextmanager
+from itertools import pairwise
+from statistics import median
 
 import pytest
 
@@ -110,6 +112,8 @@ def test_packets_of_other_senders_are_dropped_and_counted():
                 packet = struct.pack(">BBHII", 0x80, 0x80 | 96, number, 3000 * number, 0xBAD) + b"\x41" * 100
                 for port in ports:
                     stranger.sendto(packet, ("127.0.0.1", port))
+                if number % 50 == 0:
+                    side.sample(SENDING)  # other sockets of this machine may drop packets, too
         more(20)
         samples = side.sample(SENDING)
         assert sum(received.foreign for received in samples.values()) == 500 * len(ports)
@@ -129,7 +133,7 @@ def test_an_unresponsive_server_is_retried_every_two_seconds():
                 connections.enter_context(server.accept()[0])
                 connected.append(time.monotonic())
             assert messages == []
-    assert connected[-1] - connected[0] < 3 * 2.0
+    assert median(after - before for before, after in pairwise(connected)) < 2.0
 
 
 def test_loss_during_a_rebuild_shows_until_a_wave_is_complete():

@@ -71,24 +71,35 @@ def watched(vehicle, camera=CAMERA, *, udp=True):
 
 @contextmanager
 def asking_options(vehicle, camera):
-    """Send OPTIONS repeatedly, each on its own connection; yields the response times, s."""
-    took, done = [], threading.Event()
+    """Send OPTIONS repeatedly, each on its own connection; yields the response times, s.
+
+    Without the longest time by which this process was held up meanwhile, as on a busy machine.
+    """
+    took, held_up, done = [], [0.0], threading.Event()
 
     def ask():
         while not done.is_set():
-            began = time.monotonic()
+            began, held_up[:] = time.monotonic(), [0.0]
             with RtspClient(vehicle.url(camera)) as client:
                 assert client.ask("OPTIONS") == 200
-            took.append(time.monotonic() - began)
+            took.append(time.monotonic() - began - max(held_up))
             time.sleep(0.02)
 
-    thread = threading.Thread(target=ask)
-    thread.start()
+    def notice():
+        while not done.is_set():
+            began = time.monotonic()
+            time.sleep(0.01)
+            held_up.append(time.monotonic() - began - 0.01)
+
+    threads = [threading.Thread(target=each) for each in (ask, notice)]
+    for thread in threads:
+        thread.start()
     try:
         yield took
     finally:
         done.set()
-        thread.join()
+        for thread in threads:
+            thread.join()
 
 
 # --- opening ----------------------------------------------------------------------------------------------------------
@@ -140,7 +151,7 @@ def test_opening_a_camera_in_any_state_is_answered_immediately(state, udp):
         with asking_options(vehicle, OTHER) as took, RtspClient(vehicle.url()) as client:
             began = time.monotonic()
             assert client.open(udp=udp, Range="npt=0.000-") == [200, 200, 200]
-            assert time.monotonic() - began < 1
+            assert time.monotonic() - began < 4  # the library would answer after 20 s
             until(lambda: len(took) > 5)
         assert max(took) < 0.2
         if state != "sending":
@@ -159,7 +170,7 @@ def test_a_camera_that_delivers_nothing_is_answered_503_and_opens_when_it_delive
         with RtspClient(vehicle.url()) as client:
             began = time.monotonic()
             assert client.open() == [503]
-            assert time.monotonic() - began < 3
+            assert time.monotonic() - began < 9
         assert max(took) < 0.2
         frame = bytes(1920 * 1040 * 3 // 2)
         until(lambda: vehicle.side.push(CAMERA, frame))

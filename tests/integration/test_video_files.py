@@ -98,20 +98,21 @@ def test_both_sides_store_what_they_send_and_receive(sides, tmp_path):
             sides.resize(*size)
             before = operator.sample({})
             until(lambda b=before: all(c.frames > b[n].frames + 20 for n, c in operator.sample({}).items()))
-        received, sent = operator.sample({}), sides.sending.sent()
+        received, sent, counted = operator.sample({}), sides.sending.sent(), time.monotonic()
     until(lambda: "front: pipeline stopped" in sides.reported or sides.plans[0].server is None)
     sides.stop()
+    more = 10 + 30 * (time.monotonic() - counted)  # frames continue while both sides stop
     for name in CAMERAS:
         sizes = [(320, 180), (160, 90), (640, 360), (320, 180)]
         found, count = decoded(tmp_path / f"video/{name}.vehicle.0.ts")
         assert found[-4:] == sizes  # a caller sends before any knob is turned
-        assert sent[name][0] - 2 <= count <= sent[name][0] + 40  # frames continue while both sides stop
+        assert sent[name][0] - 2 <= count <= sent[name][0] + more
         # On a busy machine packets get lost on loopback, too; what arrives is stored unchanged.
         whole = received[name].decoded >= received[name].frames - 1 and received[name].lost == 0
         found, count = decoded(tmp_path / f"video/{name}.operator.0.ts", whole)
         # A receiver that joins a running stream begins with the next parameter sets.
         assert found == sizes or (not whole and found == sizes[1:])
-        assert received[name].decoded - 2 <= count <= received[name].decoded + 40
+        assert received[name].decoded - 2 <= count <= received[name].decoded + more
     assert not [line for line in sides.reported if "kept" in line or "slow" in line]
 
 
