@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import os
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
@@ -53,7 +53,11 @@ def opened(browser, url, width=1280, height=800, refused=False, script="", **con
         page = tab.new_page()
         visit(page, url)
         assert rig.passes(lambda: has_started(page)), (wrong, loaded(page))
-        yield page
+        try:
+            yield page
+        finally:  # pytest prints it of a test that fails
+            with suppress(sync_api.Error):
+                print(page.evaluate("[tod.measure(), tod.birdseye()]"))
         expected = ("WebSocket connection", "net::ERR_" if refused else NETWORK_CHANGED)
         unexpected = [text for text in wrong if not any(each in text for each in expected)]
         assert not unexpected, unexpected
