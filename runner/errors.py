@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from runner.redact import printable
 
@@ -29,6 +30,17 @@ class UserError(Exception):
 
     def __init__(self, file: str, path: str, found: str | None, rule: str) -> None:
         super().__init__(str(Problem(file, path, found, rule)))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Also raised in processes of their own, which send it to this one: its text suffices."""
+        return _restored, (type(self), self.args, self.__dict__)
+
+
+def _restored(kind: type[UserError], arguments: tuple[Any, ...], state: dict[str, Any]) -> UserError:
+    error = kind.__new__(kind, *arguments)
+    error.args = arguments
+    error.__dict__.update(state)
+    return error
 
 
 class ConfigError(UserError):

@@ -56,6 +56,9 @@ def test_help_of_a_verb_shows_examples(tod: Command, verb: str) -> None:
             "command line: drives: 'b': names a directory for each drive, so log= must not be given",
         ),
         (["report", "drive", "output="], "command line: output: '': must not be empty"),
+        (["validate", "conf="], "command line: conf: '': must not be empty"),
+        (["model", "camera=", "output=models"], "command line: camera: '': must not be empty"),
+        (["keys", "output=keys", "revoke="], "command line: revoke: '': must not be empty"),
     ],
 )
 def test_invalid_commands(tod: Command, words: list[str], expected: str) -> None:

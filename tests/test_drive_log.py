@@ -226,6 +226,14 @@ def test_a_log_that_never_begins_leaves_no_file(tmp_path: Path) -> None:
     assert len(written(tmp_path)) == 2
 
 
+def test_a_side_that_never_began_does_not_hide_the_other(tmp_path: Path) -> None:
+    begun(tmp_path).close()
+    (tmp_path / "operator.jsonl").touch()
+    drive = read_drive(tmp_path)
+    assert [*drive.sides] == ["vehicle"]
+    assert drive.warnings == [f"{tmp_path / 'operator.jsonl'}: is empty: nothing was logged"]
+
+
 def test_the_callback_for_a_full_disk_may_write_to_the_log(tmp_path: Path) -> None:
     """As the operator's station does: it writes the message to the log that reported it."""
     code = (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import stat
 import subprocess
 import sys
@@ -144,10 +145,12 @@ def test_srt_gets_a_new_secret_with_the_keys_that_reveal_it(authority, action, n
     assert passphrase.decode() == keyring.srt_passphrase(secret, "truck")
 
 
-def test_hosts_that_no_certificate_can_name_change_nothing(authority):
+@pytest.mark.parametrize("host", ["münchen.example", "10.0.0.1:8883", "car.example:8554", "a,b", "a b", "-a", ""])
+def test_hosts_that_no_certificate_can_name_change_nothing(authority, host):
     before = certificate(authority, "car").serial_number
-    with pytest.raises(UserError, match=r"host: münchen\.example: must be addresses or names in ASCII"):
-        authority.issue("car", Role.VEHICLE, ["münchen.example"])
+    rule = "must be addresses or names without a port, in ASCII: an international one begins with xn--"
+    with pytest.raises(UserError, match=rf"^command line: host: (.*: )?{rule}$"):
+        authority.issue("car", Role.VEHICLE, ["10.0.0.1", host])
     assert certificate(authority, "car").serial_number == before
     assert [each.revoked for each in authority.holders() if each.name == "car"] == [None]
 
@@ -263,6 +266,12 @@ def test_one_command_makes_what_a_vehicle_and_an_operator_need(tmp_path, capsys)
 def test_mistakes_are_named(tmp_path, capsys, words, message):
     assert main(["keys", *(word.format(tmp_path / "keys") for word in words)]) == 2
     assert capsys.readouterr().err.startswith(message)
+
+
+def test_an_expired_certificate_is_listed_as_such(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("runner.security.authority.VALID", timedelta(minutes=-30))
+    assert main(["keys", f"output={tmp_path / 'keys'}", "watcher=bob"]) == 0
+    assert re.search(r"bob +expired \d{4}-\d\d-\d\d, rotate=bob renews it\n", capsys.readouterr().out)
 
 
 def test_a_directory_with_other_files_is_not_touched(tmp_path, capsys):

@@ -244,8 +244,10 @@ def test_without_a_source_on_the_command_line_the_events_own_predictions_count(t
     own = tod("replay", *PAPER, f"input={events_file}").out
     assert "source" not in json.loads(own.splitlines()[0])
     for word in ("pqos=constant", "pqos.off_map_kbps=700"):
-        decisions = [json.loads(line) for line in tod("replay", *PAPER, f"input={events_file}", word).out.splitlines()]
+        result = tod("replay", *PAPER, f"input={events_file}", word)
+        decisions = [json.loads(line) for line in result.out.splitlines()]
         assert {line.get("source") for line in decisions} <= {"pqos"}
+        assert ("predicted nothing" in result.err) is (word != "pqos=constant")
     assert (
         tod("replay", *PAPER, f"input={events_file}", "pqos=map", "pqos.file=no.csv")
         .problems[0]

@@ -433,6 +433,13 @@ def test_without_its_libraries(tmp_path: Path, drive: Path, monkeypatch: pytest.
     assert err == "the Python modules matplotlib are not installed: extra report, see docs/install.md\n"
 
 
+def test_charts_of_many_drives_have_letters_of_their_own(drive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("runner.drive.print.ascii_lowercase", "a")
+    sheet = drawn(defined(drive)["bitrates"])
+    titles = [axes.get_title(loc="left") or axes.get_title() for axes in sheet.axes]
+    assert [title.split()[0] for title in titles if title.startswith("(")] == ["(a)", "(aa)"]
+
+
 def test_it_needs_neither_gstreamer_nor_opencv(drive: Path, tmp_path: Path) -> None:
     program = (
         "import sys\n"

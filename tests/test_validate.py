@@ -288,6 +288,13 @@ def test_a_file_is_checked_with_those_that_build_on_it(tod: Command, conf: UserC
     assert [problem.split(": ")[0] for problem in tod("validate", *names).problems] == sorted(names)
 
 
+def test_a_file_is_found_from_inside_its_folder(tod: Command, conf: UserConf, monkeypatch: pytest.MonkeyPatch) -> None:
+    conf.write("modes/a.yaml", "defaults: [paper, _self_]\n")
+    monkeypatch.chdir(conf.path / "modes")
+    result = tod("validate", "a.yaml")
+    assert (result.status, result.out.splitlines()[0]) == (0, "valid: 1 file, 1 configuration")
+
+
 def test_a_file_that_the_command_line_chooses_is_checked(tod: Command, conf: UserConf) -> None:
     van = "# @package _global_\ndefaults: [/cameras@cameras.front: missing, _self_]\nname: van\n"
     conf.write("vehicle/van.yaml", van).write("modes/mine.yaml", "defaults: [paper, _self_]\n")

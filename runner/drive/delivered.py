@@ -181,12 +181,12 @@ def _camera(
     numbers = displayed_units(moments, units, round(DEADLINE_S * SECOND_NS))
     pairs = [(moment, units[number].captured) for moment, number in zip(moments, numbers, strict=True) if number >= 0]
     pairs = [(moment, displayed) for moment, displayed in pairs if is_whole(displayed)]
-    scenes = _scenes(camera, videos, exact, [moment for moment, _ in pairs], clip)
+    scene_at = _lookup(_scenes(camera, videos, exact, [moment for moment, _ in pairs], clip))
     size = (camera.width, camera.height)
     meter = metric().meter(size, camera.fps)
     for number, picture in _displayed(pairs, videos.pictures(shown, size) if pairs else ()):
-        if pairs[number][0] in scenes:
-            meter.add(number, scenes[pairs[number][0]], picture)
+        if (scene := scene_at(pairs[number][0])) is not None:
+            meter.add(number, scene, picture)
     scores = meter.close()
     began = round(vehicle.began.time * SECOND_NS)
     stale = [moment - displayed > SAME_NS for moment, displayed in pairs]
@@ -246,14 +246,15 @@ def _scenes(
     sent: Sequence[FileTimes],
     moments: Sequence[int],
     clip: Path | None,
-) -> dict[int, Luma]:
-    """The scene at each moment."""
+) -> Iterator[tuple[int, Luma]]:
+    """Moments and their scenes, in the order of capture. All scenes of a drive would not fit into memory."""
     times = set(moments)
     if not times:
-        return {}
+        return
     if clip is None:
         size = (camera.width, camera.height)
-        return {ns: picture for ns, picture in videos.pictures(sent, size) if ns in times}
+        yield from ((ns, picture) for ns, picture in videos.pictures(sent, size) if ns in times)
+        return
     crop = camera.in_source
     width, height = camera.source_size
     window = np.s_[crop.y : crop.y + crop.height, crop.x : crop.x + crop.width]
@@ -263,9 +264,24 @@ def _scenes(
         for ns, picture in videos.pictures(sent, (camera.width, camera.height))
         if ns in times
     }
-    needed = set(numbers.values())  # a whole clip would not fit into memory
+    needed = set(numbers.values())
     scenes = {n: p[window] for n, (_, p) in enumerate(videos.decode(clip, width, height)) if n in needed}
-    return {ns: scenes[number] for ns, number in numbers.items()}
+    yield from ((ns, scenes[number]) for ns, number in numbers.items())
+
+
+def _lookup(scenes: Iterator[tuple[int, Luma]]) -> Callable[[int], Luma | None]:
+    """A function that returns the scene at a moment, None if it is missing; moments must not decrease."""
+    current: tuple[int, Luma] | None = None
+
+    def at(moment: int) -> Luma | None:
+        nonlocal current
+        while current is None or current[0] < moment:
+            current = next(scenes, None)
+            if current is None:
+                return None
+        return current[1] if current[0] == moment else None
+
+    return at
 
 
 def _thumbnail(picture: Luma) -> NDArray[np.float32]:

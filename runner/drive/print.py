@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterable, Sequence
-from itertools import zip_longest
+from itertools import count, product, zip_longest
 from math import ceil
 from pathlib import Path
 from string import ascii_lowercase
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
 WIDTH_IN = 3.5  # a column of an IEEE paper
 FORMATS = ("png", "pdf")
+MOST_PX = 65_000  # of an image's height: matplotlib draws fewer than 2^16
 STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 7,
@@ -89,7 +90,9 @@ def write_figures(figures: Sequence[Figure], directory: Path, progress: Progress
 def _rendered(sheet: Sheet, form: str) -> bytes:
     buffer = io.BytesIO()
     # Without a date, the same drive gives the same file.
-    sheet.savefig(buffer, format=form, metadata={"CreationDate": None} if form == "pdf" else None)
+    metadata = {"CreationDate": None} if form == "pdf" else None
+    dpi = min(mpl.rcParams["savefig.dpi"], MOST_PX / sheet.get_figheight())
+    sheet.savefig(buffer, format=form, metadata=metadata, dpi=dpi)
     return buffer.getvalue()
 
 
@@ -104,7 +107,7 @@ def draw_sheet(figure: Figure) -> Sheet:
     sheet = Sheet(figsize=(WIDTH_IN, sum(heights) + sum(strips) + sum(texts)), layout="constrained")
     ratios = [each for pair in zip(heights, strips, strict=True) for each in pair if each]
     grid = iter(sheet.subplots(len(ratios), columns, squeeze=False, height_ratios=ratios))
-    letter = iter(ascii_lowercase * 8)
+    letter = ("".join(letters) for length in count(1) for letters in product(ascii_lowercase, repeat=length))
     for row, end, strip in zip(rows, last, strips, strict=True):
         above = next(grid)
         below = next(grid) if strip else above

@@ -31,6 +31,7 @@ from runner.system.clocks import KEPT_S
 T = TypeVar("T")
 REPORTS = KINDS[ReceptionReported]
 # Kinds of lines in a vehicle's log, except events, reception reports and the first line.
+DRIVEN = {"vehicle", "operator"}  # sides without which a directory holds no drive
 OTHER_KINDS = ("decision", "telemetry", "note", "video", "video_shift", "ended")
 LONGEST_LINE = 1 << 24  # characters; the longest real line, the configuration, has a thousandth of that
 
@@ -88,8 +89,14 @@ def read_drive(directory: Path) -> Drive:
         raise UserError(where, "", None, rule)
     warnings: list[str] = []
     files = {side: directory / name for side, name in FILES.items()}
-    sides = {side: _side(side, path, warnings) for side, path in files.items() if path.is_file()}
-    if not sides.keys() & {"vehicle", "operator"}:
+    present = {side: path for side, path in files.items() if path.is_file()}
+    logged = {side: path for side, path in present.items() if path.stat().st_size}
+    if logged.keys() & DRIVEN:  # a side that was killed before it began leaves an empty file
+        empty = [path for side, path in present.items() if side not in logged]
+        warnings += [f"{path}: is empty: nothing was logged" for path in empty]
+        present = logged
+    sides = {side: _side(side, path, warnings) for side, path in present.items()}
+    if not sides.keys() & DRIVEN:
         raise UserError(where, "", None, f"contains no drive log: neither {FILES['vehicle']} nor {FILES['operator']}")
     return Drive(directory, sides, warnings)
 

@@ -254,9 +254,10 @@ def live_operator(
         )
 
     operator = LiveOperator(vehicle, station, drive, build, requests)
-    metrics = metrics_of(vehicle.name, vehicle.metrics.operator_port, log)
-    station.listeners.append(_MetricsListener(metrics))
     with ExitStack() as ending:  # in reverse order
+        ending.callback(drive.close)
+        metrics = metrics_of(vehicle.name, vehicle.metrics.operator_port, log)
+        station.listeners.append(_MetricsListener(metrics))
         ending.callback(metrics.close)
         if pictures:
             ending.callback(pictures.close)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
 from runner.core.model import Roi
+from runner.errors import RunError
 from runner.graph import Plan
 from runner.lanes import Lane, compile_lanes, fragment
 from runner.rate_quality.cache import Cache, digest, point_from_json, point_to_json
@@ -79,7 +80,11 @@ class Sweep:
                 ended, waiting = wait(waiting, return_when=FIRST_COMPLETED)
                 for future in ended:
                     number = futures.pop(future)  # a cluster frees results that nobody references
-                    yield from future.result()
+                    try:
+                        yield from future.result()
+                    except BrokenExecutor:
+                        rule = "it may have run out of memory: choose a smaller `parallel`, or workers=threads"
+                        raise RunError(f"a worker process ended without a result; {rule}") from None
                     done.update(number, 1.0)
         finally:
             done.cancelled = True

@@ -175,7 +175,7 @@ class Authority:
         # Listed before anybody has it: a serial number unknown to the authority could never be revoked.
         serial, until = secrets.randbits(159) | 1, self.now() + VALID
         if not all(map(is_host, hosts)):
-            rule = "must be addresses or names in ASCII: an international one begins with xn--"
+            rule = "must be addresses or names without a port, in ASCII: an international one begins with xn--"
             raise UserError("command line", "host", ", ".join(hosts), rule)
         pair = new_certificate(self._pair, name, role, hosts, serial, self.now(), VALID)
         if any(issued.name == name for issued in self.holders()):

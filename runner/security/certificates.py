@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import ipaddress
+import re
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from datetime import datetime, timedelta
 from typing import NamedTuple
 
@@ -14,6 +16,8 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from runner.core.roles import Role
 
+LABEL = r"[A-Za-z0-9_](?:[A-Za-z0-9_-]*[A-Za-z0-9_])?"
+DNS_NAME = re.compile(rf"(?:\*\.)?{LABEL}(?:\.{LABEL})*\.?")
 BACKDATED = timedelta(hours=1)  # a holder's clock may be behind when it gets its certificate
 AUTHORITY_YEARS = 20
 YEAR = timedelta(days=365)
@@ -133,12 +137,10 @@ def _usage(*, digital_signature: bool = False, key_cert_sign: bool = False, crl_
 
 
 def is_host(host: str) -> bool:
-    """Whether a certificate can name a host: by an address, or a name in ASCII."""
-    try:
-        _general_name(host)
-    except ValueError:
-        return False
-    return True
+    """Whether a certificate can name a host: by an address, or a DNS name in ASCII, without a port."""
+    with suppress(ValueError):
+        return bool(ipaddress.ip_address(host))
+    return bool(DNS_NAME.fullmatch(host))
 
 
 def _general_name(host: str) -> x509.GeneralName:

@@ -14,6 +14,8 @@ from typing import TextIO
 from runner.errors import RunError, UserError
 from runner.system.signals import urgent
 
+MAX_LINKS = 40  # as the kernel follows
+
 
 @contextmanager
 def unfinished(path: Path) -> Iterator[Path]:
@@ -44,16 +46,21 @@ def unfinished_directory(path: Path) -> Iterator[Path]:
 def whole_file(path: Path, argument: str = "output", *, partly: bool = False) -> Iterator[TextIO]:
     """A text file for `argument` of the command line, written atomically.
 
-    An existing path that is not a file, such as /dev/null, is written to directly. An existing file is kept if writing
-    ends early.
+    An existing path that is not a file, such as /dev/null, is written to directly, and one that names an open file of
+    this process, such as /dev/stdout, from that file's position on. An existing file is kept if writing ends early; a
+    symbolic link leads to the file that is replaced.
 
     partly  keep the output written before a UserError, an error in the input
     raises  UserError if it cannot be opened, RunError if it cannot be written
     """
     user_error = None
     try:
-        special = path.exists() and not path.is_file()
-        with nullcontext(path) if special else unfinished(path) as part, _opened(part, path, argument) as file:
+        descriptor = _descriptor(path)
+        special = descriptor is not None or (path.exists() and not path.is_file())
+        with (
+            nullcontext(path) if special else unfinished(path.resolve()) as part,
+            _opened(part, path, argument, descriptor) as file,
+        ):
             try:
                 yield file
             except UserError as error:
@@ -68,8 +75,21 @@ def whole_file(path: Path, argument: str = "output", *, partly: bool = False) ->
         raise user_error
 
 
-def _opened(part: Path, path: Path, argument: str) -> TextIO:
+def _descriptor(path: Path) -> int | None:
+    """The number of this process's open file that a path names; None: it names none."""
+    for _ in range(MAX_LINKS):
+        if not path.is_symlink():
+            break
+        if path.parent.absolute() in map(Path, ("/proc/self/fd", f"/proc/{os.getpid()}/fd")):
+            return int(path.name)
+        path = path.parent / path.readlink()
+    return None
+
+
+def _opened(part: Path, path: Path, argument: str, descriptor: int | None) -> TextIO:
     try:
+        if descriptor is not None:
+            return os.fdopen(os.dup(descriptor), "w", encoding="utf-8")
         return part.open("w", encoding="utf-8")
     except OSError as error:
         raise UserError("command line", argument, repr(str(path)), (error.strerror or "").lower()) from None

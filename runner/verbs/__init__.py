@@ -179,7 +179,8 @@ class Arguments:
     def parse(verb: str, words: Sequence[str]) -> Arguments:
         """Parse the words. A path given to an argument may contain any character, since Hydra never sees it.
 
-        raises  UserError for a flag other than -m, and for a name that only another verb takes or that is misspelt
+        raises  UserError for a flag other than -m, for a name that only another verb takes or that is misspelt, and for
+                an argument without a value
         """
         own = (*VERBS[verb].arguments, "conf")
         sweeps = VERBS[verb].sweeps and "-m" in words
@@ -189,6 +190,8 @@ class Arguments:
         for word in words:
             key, equals, value = word.partition("=")
             if equals and key in own:
+                if not value:  # from an unset variable of the shell
+                    raise UserError("command line", key, "''", "must not be empty")
                 values[key] = value
             elif word.startswith("-"):
                 raise unknown_flag(word)
@@ -248,8 +251,6 @@ class Arguments:
 
     def path(self, key: str) -> Path | None:
         """A file or directory; None if not given."""
-        if self.values.get(key) == "":  # an unset shell variable, which would mean the current directory
-            raise UserError("command line", key, "''", "must not be empty")
         return Path(self.values[key]) if key in self.values else None
 
     def drive(self) -> Path | None:

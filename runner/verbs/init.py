@@ -5,7 +5,8 @@ GitHub Actions and for pre-commit, and in DIR/.schemas the schemas with which yo
 keys. It passes `validate` unchanged. Existing files are never overwritten: if there are any, nothing is written and
 each is listed. A new directory appears only when it is complete.
 
-With files=schemas only the schemas are written: for an existing directory, and after an update.
+With files=schemas only the schemas are written: for an existing directory, or, after an update, once you have removed
+DIR/.schemas.
 
   tod-runner init my_fleet
   tod-runner validate conf=my_fleet

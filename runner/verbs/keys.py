@@ -22,6 +22,8 @@ directory has been copied there; the last line of the output lists these directo
 
 from __future__ import annotations
 
+from datetime import datetime
+
 from runner.core.roles import PEOPLE, Role
 from runner.errors import UserError
 from runner.security.authority import Authority, Issued
@@ -51,7 +53,7 @@ def run(arguments: Arguments) -> int:
                 action(name)
                 changed.append(name)
         for issued in authority.holders():
-            print(_described(issued))
+            print(_described(issued, authority.now()))
         to_copy = sorted({*changed, *(each.name for each in authority.holders() if changed)} & set(_active(authority)))
     if changed:
         print(f"copy to their machines: {', '.join(f'{output}/{name}' for name in to_copy)}")
@@ -67,6 +69,11 @@ def _active(authority: Authority) -> list[str]:
     return [issued.name for issued in authority.holders() if not issued.revoked]
 
 
-def _described(issued: Issued) -> str:
-    state = f"revoked {issued.revoked:%Y-%m-%d}" if issued.revoked else f"valid until {issued.until:%Y-%m-%d}"
+def _described(issued: Issued, now: datetime) -> str:
+    if issued.revoked:
+        state = f"revoked {issued.revoked:%Y-%m-%d}"
+    elif issued.until <= now:
+        state = f"expired {issued.until:%Y-%m-%d}, rotate={issued.name} renews it"
+    else:
+        state = f"valid until {issued.until:%Y-%m-%d}"
     return f"{issued.role:11}{issued.name:20}{state}{'  ' if issued.hosts else ''}{', '.join(issued.hosts)}"

@@ -101,6 +101,10 @@ def _targets(arguments: Arguments) -> tuple[Vehicle, Study, list[str]]:
         config = configuration(words, arguments.conf, runnable=False, check=check_plan)
         study, vehicle = config.study(), config.vehicle()
     names = [requested] if requested else list(vehicle.cameras)
+    for name in names:
+        own, used = config.document["cameras"][name]["fps"], vehicle.cameras[name].fps
+        if float(used) < own - 1e-6:  # not 30000/1001, which is written as 29.97...
+            say(f"{name}: fps_max limits its {own:g} Hz to {float(used):g}, which its file will state")
     try:
         check_cameras(study, names)
     except ModelError as error:

@@ -64,6 +64,10 @@ if TYPE_CHECKING:
     from runner.vehicle.uplink import MeasuredUplink
 
 InputEvent = tuple[dict[str, Any], Event]  # an event, as JSON and parsed
+NOTHING_PREDICTED = (
+    "the source of predictions on the command line has predicted nothing from this input, which needs positions for a"
+    " map; the input's own predictions are left out"
+)
 
 _encode = json.JSONEncoder(ensure_ascii=False, check_circular=False).encode
 
@@ -227,12 +231,16 @@ def _with_positions(inputs: Iterable[InputEvent], recorded: RecordedPositions, b
 
 def _with_predictions(inputs: Iterable[InputEvent], pqos: Pqos) -> Iterator[InputEvent]:
     """The events with the predictions of another source in place of their own."""
+    found = False
     for document, event in inputs:
         if not isinstance(event, BitratePredicted):
             yield document, event
         prediction = pqos.observe(event)
         if prediction is not None:
+            found = True
             yield to_json(prediction) | {"source": "pqos"}, prediction
+    if not found:
+        print(NOTHING_PREDICTED, file=sys.stderr)
 
 
 class _Answers:

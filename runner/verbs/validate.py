@@ -146,7 +146,7 @@ def _directories(arguments: Arguments) -> dict[Path | None, list[Path] | None]:
             raise UserError("command line", "", word, "must be NAME=VALUE, or a file that ends in .yaml or .yml")
         if not file.is_file():
             raise UserError("command line", "", word, "no such file")
-        inside = [arguments.conf] if arguments.conf else list(file.parents)
+        inside = [arguments.conf] if arguments.conf else [*file.parents, *file.absolute().parents]
         above = [conf for conf in inside if file.resolve().is_relative_to(conf.resolve()) and _has_groups(conf)]
         if not above:
             rule = "is in no configuration directory: none above it has vehicle/, cameras/, ..."

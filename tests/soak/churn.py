@@ -88,7 +88,8 @@ RESOURCES = (
 
 def soak(seed: int, scale: float) -> list[str]:
     rng, problems = random.Random(seed), []
-    with running("mode=single", "page.serve=false") as (system, operator):
+    # It uses only the processor time that others leave: requests may wait.
+    with running("mode=single", "page.serve=false", "control.expires_s=10") as (system, operator):
         problems += _measured(system, "resizes", round(RESIZES * scale), _resize(operator, rng))
         problems += system.tracebacks()
     with running("mode=single", "page.serve=false") as (system, _):
