@@ -57,7 +57,7 @@ def opened(browser, url, width=1280, height=800, refused=False, script="", **con
             yield page
         finally:  # pytest prints it of a test that fails
             with suppress(sync_api.Error):
-                print(page.evaluate("[tod.measure(), tod.birdseye()]"))
+                print(page.evaluate("Promise.all([tod.measure(), tod.birdseye()])"))
         expected = ("WebSocket connection", "net::ERR_" if refused else NETWORK_CHANGED)
         unexpected = [text for text in wrong if not any(each in text for each in expected)]
         assert not unexpected, unexpected

@@ -31,7 +31,8 @@ def station(tmp_path_factory):
     paint(place / "world", ALL_AROUND)
     cameras = {"front": FRONT, **TOP_CAMERAS}
     pictures = dict(native_pictures(place / "world", cameras, FINER))
-    return Station(place, cameras, pictures, TOP_SIZE, estimated=["top_rear"])
+    # Without a GPU it is drawn 5 times a second, and all pictures come together: some wait 0.2 s for the next drawing.
+    return Station(place, cameras, pictures, TOP_SIZE, estimated=["top_rear"], words=["page.late_ms=2000"])
 
 
 @pytest.fixture

@@ -276,7 +276,7 @@ def test_a_busy_page_delays_neither_pictures_nor_alarms_even_as_webgl_starts(chr
             return mast["straight"] and mast["status"] == "live" and colour_at(page, "mast", 0.005, 0.985) == AMBER
 
         if not passes(is_labelled):
-            said = page.inner_text("#toasts"), page.evaluate("[localStorage['tod-straight'], tod.measure()]")
+            said = page.inner_text("#toasts"), page.evaluate("Promise.all([localStorage['tod-straight'], tod.measure()])")
             pytest.fail(f"{said} {shot(page, 'busy-unlabelled')}")
 
 
