@@ -276,8 +276,9 @@ def test_a_busy_page_delays_neither_pictures_nor_alarms_even_as_webgl_starts(chr
             return mast["straight"] and mast["status"] == "live" and colour_at(page, "mast", 0.005, 0.985) == AMBER
 
         if not passes(is_labelled):
-            said = page.inner_text("#toasts"), page.evaluate("Promise.all([localStorage['tod-straight'], tod.measure()])")
-            pytest.fail(f"{said} {shot(page, 'busy-unlabelled')}")
+            shot(page, "busy-unlabelled")
+            said = page.evaluate("Promise.all([localStorage['tod-straight'], tod.measure()])")
+            pytest.fail(f"{page.inner_text('#toasts')} {said}")
 
 
 AMBER = (255, 176, 0)
@@ -587,6 +588,33 @@ def test_monitors_share_selection_control_and_attention_with_their_page(chromium
         visit(wrong, f"{server.url}?show=front,raer")
         wrong.wait_for_selector("#no-such-camera")
         assert wrong.inner_text("#no-such-camera") == "delivery_robot has no camera raer; cameras are front, rear, mast"
+
+
+def test_a_monitor_in_the_tab_of_a_page_has_no_control(chromium, picture):
+    """The page that had it is gone; it has it again when the operator goes back."""
+    with served(picture, None) as (server, _), opened(chromium, server.url) as page:
+        controlling(page)
+        visit(page, f"{server.url}?show=front")
+        until(lambda: page.evaluate("window.tod?.control") == "nobody")
+        time.sleep(0.5)
+        assert page.evaluate("tod.control") == "nobody"
+        visit(page, server.url)
+        until(lambda: page.evaluate("window.tod?.control") == "you")
+
+
+def test_an_enlarged_picture_hides_no_alarm(chromium, picture):
+    with served(picture, None) as (server, _), opened(chromium, server.url) as page:
+        all_live(page)
+        page.locator("[data-camera=front]").dblclick()
+        until(lambda: page.locator("[data-camera=rear]").is_hidden())
+        assert page.locator("#hidden-alarms").is_hidden()
+        server.silent.update(["rear", "front"])
+        until(lambda: page.locator("#hidden-alarms").inner_text() == "✕ LOST rear")
+        shot(page, "enlarged-alarm")
+        box, tile = (page.locator(each).bounding_box() for each in ("#hidden-alarms", "[data-camera=front]"))
+        assert tile["y"] + tile["height"] <= box["y"], "it covers the line"
+        page.locator("[data-camera=front]").dblclick()
+        until(page.locator("#hidden-alarms").is_hidden)
 
 
 def test_a_layout_survives_a_restart_of_the_operators_process(broker, tmp_path):

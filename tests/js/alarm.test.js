@@ -37,6 +37,17 @@ test("a picture that recovers and fails again for good sounds once two seconds a
   assert.deepEqual([1999, 2000, 2250, 9000].map((now) => alarm.overdue(now)), [null, "lost", null, null]);
 });
 
+test("a picture that moves again damaged or late, and stalls again for good, sounds once two seconds are over", () => {
+  for (const status of ["damaged", "late"]) {
+    const alarm = new Alarm();
+    assert.equal(alarm.due("front", "frozen", 0), "lost");
+    assert.equal(alarm.due("front", status, 300), null);
+    assert.equal(alarm.due("front", "frozen", 600), null);
+    assert.equal(alarm.due("front", "lost", 1500), null);
+    assert.deepEqual([alarm.overdue(1900), alarm.overdue(2000), alarm.overdue(4500)], [null, "lost", null]);
+  }
+});
+
 test("a picture that recovers again, or never did, sounds no more", () => {
   for (const changes of [[[200, "live"], [420, "frozen"], [900, "live"]], [[900, "lost"]]]) {
     const alarm = new Alarm();

@@ -99,6 +99,19 @@ test("notes are newest first and bounded", () => {
   assert.deepEqual(published.at(-1), { time: 100.5, text: "late", level: "note" });
 });
 
+test("a hello replaces the station's notes only, and the status of cameras that are no longer those", () => {
+  Object.assign(store, { notes: [], status: {} });
+  onStationMessage({ ...HELLO });
+  onStationMessage({ kind: "note", time: 1, text: "of the station", level: "note" });
+  note({ time: 2, text: "gamepad disconnected", level: "problem" });
+  store.status.front = "lost";
+  onStationMessage({ ...HELLO });
+  assert.deepEqual(store.notes.map(({ text }) => text), ["gamepad disconnected"]);
+  assert.deepEqual(store.status, { front: "lost" });
+  onStationMessage({ ...HELLO, cameras: [{ name: "front", width_px: 1 }] });
+  assert.deepEqual(store.status, {});
+});
+
 test("the series restarts when the station's clock is set back", () => {
   for (const time of [100, 101, 50, 51]) onStationMessage(sample(time));
   assert.deepEqual(store.series.time, [50, 51]);

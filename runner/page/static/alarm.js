@@ -9,6 +9,7 @@ const never = () => ({ lost: -Infinity, late: -Infinity });
  * @property {number} lost when its last tone of this kind was due
  * @property {number} late
  * @property {boolean} recovered whether there was no reason for a tone since
+ * @property {boolean} moved whether it has not stood still since its last tone for that
  * @property {"lost"|"late"|null} waiting kind of its present status, if that came too soon after a tone to sound
  */
 
@@ -34,12 +35,13 @@ export class Alarm {
    */
   due(camera, status, now) {
     const kind = KINDS[status];
-    const own = (this.#ofCamera[camera] ??= { ...never(), recovered: false, waiting: null });
+    const own = (this.#ofCamera[camera] ??= { ...never(), recovered: false, moved: false, waiting: null });
     own.waiting = null;
     own.recovered ||= !kind;
+    own.moved ||= kind !== "lost";
     if (!kind) return null;
     if (now - latest(own, kind) < REPEAT_MS) {
-      if (own.recovered) own.waiting = kind;
+      if (own.recovered || (kind === "lost" && own.moved)) own.waiting = kind;
       return null;
     }
     return this.#sound(own, kind, now);
@@ -56,7 +58,7 @@ export class Alarm {
   #sound(own, kind, now) {
     const tone = latest(this.#last, kind);
     const announced = now - tone < TOGETHER_MS;
-    Object.assign(own, { [kind]: announced ? tone : now, recovered: false, waiting: null });
+    Object.assign(own, { [kind]: announced ? tone : now, recovered: false, moved: own.moved && kind !== "lost", waiting: null });
     if (announced) return null;
     this.#last[kind] = now;
     return kind;

@@ -49,7 +49,7 @@ function browserId() {
  * tab copies the storage, and the copy must not take control as well.
  */
 function viewerToken() {
-  const key = "tod-viewer";
+  const key = shown ? "tod-monitor" : "tod-viewer"; // a monitor opened in a page's tab must not inherit its control
   const id = sessionStorage.getItem(key) ?? randomId();
   sessionStorage.removeItem(key);
   addEventListener("pagehide", () => sessionStorage.setItem(key, id));

@@ -31,11 +31,11 @@ const names = () => (store.hello?.cameras ?? []).map(({ name }) => name);
 const isOnline = () => store.connected && store.state?.online;
 
 function refresh() {
+  refreshAlarms();
   if (store.view !== "drive") return;
   refreshLatency();
   refreshSpeed();
   setText(byId("line"), [MODES[mode() ?? ""] ?? "no mode", totalWords(), linkWords()].join(" · "));
-  refreshAlarms();
   refreshControl();
   const text = words.textContent;
   if (text !== fitted) fitWords();
@@ -76,12 +76,20 @@ function linkWords() {
   return reason ? `limited: ${reason.slice(reason.indexOf(": ") + 2)}` : "connected";
 }
 
-/** The pictures that are not live, by status: FROZEN front left, rear. */
+/** The pictures that are not live; in the Configure view, those that the enlarged one hides. */
 function refreshAlarms() {
-  const found = ALARMS.map((status) => ({ status, cameras: names().filter((name) => store.status[name] === status) })).filter(({ cameras }) => cameras.length);
-  const texts = found.map(({ status, cameras }) => `${SHAPES[status]} ${WORDS[status] ?? status.toUpperCase()} ${cameras.map(displayName).join(", ")}`);
-  setText(byId("alarms"), texts.join("  "));
-  setAttribute(byId("alarms"), "data-level", found.some(({ status }) => STALLED.includes(status)) ? "late" : "near");
+  showAlarms(byId("alarms"), names());
+  const hidden = store.view === "configure" && store.enlarged ? names().filter((name) => name !== store.enlarged) : [];
+  byId("hidden-alarms").hidden = !showAlarms(byId("hidden-alarms"), hidden);
+}
+
+/** Show pictures by status: FROZEN front left, rear. Returns whether there are any. */
+function showAlarms(element, cameras) {
+  const found = ALARMS.map((status) => ({ status, own: cameras.filter((name) => store.status[name] === status) })).filter(({ own }) => own.length);
+  const texts = found.map(({ status, own }) => `${SHAPES[status]} ${WORDS[status] ?? status.toUpperCase()} ${own.map(displayName).join(", ")}`);
+  setText(element, texts.join("  "));
+  setAttribute(element, "data-level", found.some(({ status }) => STALLED.includes(status)) ? "late" : "near");
+  return found.length > 0;
 }
 
 /** Make the words smaller where they would be cut off. */
@@ -150,7 +158,7 @@ export function startDrive() {
   });
   document.addEventListener("visibilitychange", updateAttention);
   new ResizeObserver(fitWords).observe(words);
-  listen("hello state sample ages status control socket requests view", refresh);
+  listen("hello state sample ages status control socket requests view enlarged", refresh);
   listen("control socket view ages", updateAttention);
   listen("hello view", refreshGuides);
   addEventListener("storage", refreshGuides); // chosen in another window

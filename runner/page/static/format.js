@@ -65,9 +65,10 @@ export function setText(element, text) {
 /** Have a screen reader speak a text, also one that it has just spoken: it speaks what is added. @param {string} text */
 export const announce = (text) => byId("announcer").replaceChildren(make("span", {}, text));
 
-/** Set or remove an attribute, only if it differs. */
+/** Set or remove an attribute, only if it differs. Those of ARIA state false, too. */
 export function setAttribute(element, name, value) {
-  const text = value === false || value === null || value === undefined ? null : String(value);
+  const isAbsent = value === null || value === undefined || (value === false && !name.startsWith("aria-"));
+  const text = isAbsent ? null : String(value);
   if (element.getAttribute(name) === text) return;
   if (text === null) element.removeAttribute(name);
   else element.setAttribute(name, text);

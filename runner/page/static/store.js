@@ -61,7 +61,7 @@ const listeners = new Map();
  * @property {number|null} clock_bound_ms error bound of the latencies; null: they are unknown
  * @property {number|null} speed_factor advised share of full speed
  * @property {Record<string, CameraSample>} cameras
- * @typedef {{time: number, text: string, level: string}} Note
+ * @typedef {{time: number, text: string, level: string, own: boolean}} Note own: the page's, not the station's
  */
 
 /** @typedef {(number|null)[]} Column */
@@ -127,14 +127,16 @@ export function onStationMessage(message) {
   else if (kind === "layout" && store.hello) store.hello.layout = message;
   else if (kind === "selection") return setSelected(message.camera);
   else if (kind === "history") onHistory(message);
-  else if (kind === "note") return note(message);
+  else if (kind === "note") return note({ ...message, own: false });
   if (kind === "sample") appendSample(message);
   publish(kind, message);
 }
 
 function onHello(message) {
+  const mounted = ({ cameras, dimensions }) => JSON.stringify([cameras, dimensions]); // for which the worker makes new streams
+  if (store.hello && mounted(store.hello) !== mounted(message)) Object.assign(store, { status: {}, refused: {} });
   store.hello = message;
-  store.notes = [];
+  store.notes = store.notes.filter(({ own }) => own); // the station sends its own again
   const names = message.cameras.map(({ name }) => name);
   store.series = emptySeries(names);
   const own = store.view === "monitor" || names.includes(store.selected) ? store.selected : (names[0] ?? null);
@@ -144,10 +146,10 @@ function onHello(message) {
 
 /**
  * Add a line of news, from the station or from the page itself; newest first.
- * @param {{time?: number, text: string, level?: string}} note
+ * @param {{time?: number, text: string, level?: string, own?: boolean}} note own: the page's
  */
-export function note({ time = Date.now() / 1000, text, level = "note" }) {
-  store.notes = [{ time, text, level }, ...store.notes].sort((a, b) => b.time - a.time).slice(0, 200);
+export function note({ time = Date.now() / 1000, text, level = "note", own = true }) {
+  store.notes = [{ time, text, level, own }, ...store.notes].sort((a, b) => b.time - a.time).slice(0, 200);
   publish("note", { time, text, level });
 }
 

@@ -5,7 +5,8 @@ import { canStraighten } from "./straight.js";
 import { showStraight } from "./link.js";
 
 const CHOICE = "tod-straight";
-const chosen = new Set(localStorage.getItem(CHOICE)?.split(" "));
+const stored = () => new Set(localStorage.getItem(CHOICE)?.split(" "));
+let chosen = stored();
 
 /** @param {string|null} name */
 export function isStraight(name) {
@@ -18,20 +19,25 @@ export function toggleStraight(name = store.selected) {
   const info = camera(name);
   if (!info) return;
   if (!canStraighten(info)) return publish("toast", { text: `${info.name}: lines are already straight; only a fisheye bends them`, level: "hint" });
-  if (!chosen.delete(info.name)) chosen.add(info.name);
+  change((choice) => choice.delete(info.name) || choice.add(info.name));
+}
+
+/** Change the choice, which other windows may have changed. @param {(choice: Set<string>) => void} by */
+function change(by) {
+  chosen = stored();
+  by(chosen);
+  localStorage.setItem(CHOICE, [...chosen].join(" "));
   applyChoice();
 }
 
 function applyChoice() {
-  localStorage.setItem(CHOICE, [...chosen].join(" "));
   showStraight([...chosen]);
   publish("straight");
 }
 
 /** The worker could not straighten a picture. */
 function onStraightenFailed({ camera: name, why }) {
-  chosen.delete(name);
-  applyChoice();
+  change((choice) => choice.delete(name));
   const problem = { text: `${name}: the picture cannot be straightened: ${why}`, level: "problem" };
   publish("toast", problem);
   note(problem);

@@ -131,9 +131,9 @@ function buildTile({ name, pose }) {
 /** A name that may be broken into lines after its underscores. @param {string} name */
 const breakable = (name) => name.split(/(?<=_)/).flatMap((part) => [part, make("wbr")]);
 
-/** Request to switch a camera on or off: the opposite of the state that the vehicle reports. */
+/** Request to switch a camera on or off: the opposite of what was requested last, or else of what the vehicle reports. */
 export function switchCamera(name) {
-  const on = !decisionOf(name)?.on;
+  const on = !(pending(`on:${name}`)?.event.on ?? decisionOf(name)?.on);
   request(`on:${name}`, { event: "camera_switched", camera: name, on }, `${name} ${on ? "on" : "off"}`);
 }
 
@@ -224,7 +224,8 @@ function layOutEnlarged() {
     element.classList.toggle("enlarged", large);
     if (!large) continue;
     element.style.width = "";
-    box.style.height = `${scene.clientHeight - chromeHeight()}px`;
+    // What is below stays visible: it may say that sound is blocked, and which other pictures are lost.
+    box.style.height = `${area.clientHeight - chromeHeight()}px`;
   }
   area.classList.toggle("has-enlarged", tiles.has(store.enlarged));
 }
