@@ -340,8 +340,7 @@ def test_a_driver_is_warned_in_either_view(chromium, picture, pressed):
             shot(page, "control-lost-configure")
             page.keyboard.press("v")
             shot(page, "control-lost-drive")
-        take_control_in_drive = page.locator("#drive-control")
-        until(lambda: (take_control_in_drive.click(), page.evaluate("tod.control"))[1] == "you")
+        take_control(page, "#drive-control")
         until(lambda: "CONTROL LOST" not in page.inner_text("#attention"))
 
 
