@@ -32,7 +32,7 @@ class UserError(Exception):
         super().__init__(str(Problem(file, path, found, rule)))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Also raised in processes of their own, which send it to this one: its text suffices."""
+        """Also raised in worker processes, which send it here: its text suffices."""
         return _restored, (type(self), self.args, self.__dict__)
 
 

@@ -29,9 +29,9 @@ from runner.schema import event_problem, log_problem, read_json
 from runner.system.clocks import KEPT_S
 
 T = TypeVar("T")
+DRIVEN = {"vehicle", "operator"}  # sides without which a directory holds no drive
 REPORTS = KINDS[ReceptionReported]
 # Kinds of lines in a vehicle's log, except events, reception reports and the first line.
-DRIVEN = {"vehicle", "operator"}  # sides without which a directory holds no drive
 OTHER_KINDS = ("decision", "telemetry", "note", "video", "video_shift", "ended")
 LONGEST_LINE = 1 << 24  # characters; the longest real line, the configuration, has a thousandth of that
 

@@ -197,7 +197,7 @@ class TypeProbe(_Probe):
 class EventProbe(_Probe):
     """Asks a method of its owner, which it does not keep alive, whether to drop an event.
 
-    kinds    of the events
+    kinds       of the events
     is_dropped  called in the streaming thread with the type of each
     """
 

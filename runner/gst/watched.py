@@ -12,7 +12,7 @@ from runner.graph import Plan, launch
 from runner.gst.aside import HUNG, HUNG_STARTING, change_in_thread, set_state_in_thread
 from runner.gst.credentials import log_in
 from runner.gst.outage import Outage
-from runner.gst.probes import EventProbe
+from runner.gst.probes import EventProbe, IdleProbe
 from runner.gst.source import fixed_rate
 from runner.gst.timers import Delayed, later
 from runner.system.backoff import pause_s
@@ -213,13 +213,16 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
     def _is_idle(self) -> bool:
         """Whether no frame is blocked downstream of the source, for example by a sink that is reconnecting."""
         pad = self._counter.get_static_pad("src")
-        called: list[bool] = []
-        probe = pad.add_probe(Gst.PadProbeType.IDLE, _on_idle, called)
-        if not called:
-            pad.remove_probe(probe)
-        return bool(called)
+        return _IdleCheck(pad).is_idle
 
 
-def _on_idle(_pad: Gst.Pad, _info: Gst.PadProbeInfo, called: list[bool]) -> Gst.PadProbeReturn:
-    called.append(True)
-    return Gst.PadProbeReturn.REMOVE
+class _IdleCheck:
+    """Whether a pad is idle now. Its probe ends with it."""
+
+    def __init__(self, pad: Gst.Pad) -> None:
+        self.is_idle = False
+        self._probe = IdleProbe(self._on_idle)
+        self._probe.add_to(pad)
+
+    def _on_idle(self) -> None:
+        self.is_idle = True

@@ -67,7 +67,17 @@ class Sweep:
         return points
 
     def _run(self, tasks: list[Task], on_progress: Callable[[float], None]) -> Iterator[Point]:
-        """Points as their tasks end."""
+        """Points as their tasks end.
+
+        raises  RunError if a worker process dies
+        """
+        try:
+            yield from self._points(tasks, on_progress)
+        except BrokenExecutor:
+            rule = "it may have run out of memory: choose a smaller `parallel`, or workers=threads"
+            raise RunError(f"a worker process ended without a result; {rule}") from None
+
+    def _points(self, tasks: list[Task], on_progress: Callable[[float], None]) -> Iterator[Point]:
         done = TaskProgress([task.cost for task in tasks], on_progress)
         own_process = isinstance(self.executor, ThreadPoolExecutor)
         futures: dict[Future[list[Point]], int] = {}
@@ -80,11 +90,7 @@ class Sweep:
                 ended, waiting = wait(waiting, return_when=FIRST_COMPLETED)
                 for future in ended:
                     number = futures.pop(future)  # a cluster frees results that nobody references
-                    try:
-                        yield from future.result()
-                    except BrokenExecutor:
-                        rule = "it may have run out of memory: choose a smaller `parallel`, or workers=threads"
-                        raise RunError(f"a worker process ended without a result; {rule}") from None
+                    yield from future.result()
                     done.update(number, 1.0)
         finally:
             done.cancelled = True

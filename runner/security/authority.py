@@ -176,7 +176,8 @@ class Authority:
         serial, until = secrets.randbits(159) | 1, self.now() + VALID
         if not all(map(is_host, hosts)):
             rule = "must be addresses or names without a port, in ASCII: an international one begins with xn--"
-            raise UserError("command line", "host", ", ".join(hosts), rule)
+            argument = "broker" if role is Role.BROKER else "host"
+            raise UserError("command line", argument, ", ".join(hosts), rule)
         pair = new_certificate(self._pair, name, role, hosts, serial, self.now(), VALID)
         if any(issued.name == name for issued in self.holders()):
             self._renew_media_secret(role)

@@ -58,7 +58,7 @@ def whole_file(path: Path, argument: str = "output", *, partly: bool = False) ->
         descriptor = _descriptor(path)
         special = descriptor is not None or (path.exists() and not path.is_file())
         with (
-            nullcontext(path) if special else unfinished(path.resolve()) as part,
+            nullcontext(path) if special else unfinished(Path(os.path.realpath(path))) as part,
             _opened(part, path, argument, descriptor) as file,
         ):
             try:
@@ -80,7 +80,7 @@ def _descriptor(path: Path) -> int | None:
     for _ in range(MAX_LINKS):
         if not path.is_symlink():
             break
-        if path.parent.absolute() in map(Path, ("/proc/self/fd", f"/proc/{os.getpid()}/fd")):
+        if os.path.realpath(path.parent) == f"/proc/{os.getpid()}/fd":  # also as /dev/fd
             return int(path.name)
         path = path.parent / path.readlink()
     return None

@@ -53,6 +53,7 @@ from runner.records import (
 )
 from runner.security.exposure import vehicle_keyring
 from runner.security.keyring import Keyring
+from runner.system.held_up import LateCheck
 from runner.system.kernel_clock import clock_error_s, wall_ahead_s
 from runner.system.service import notify
 from runner.vehicle.access import Access
@@ -65,7 +66,6 @@ if TYPE_CHECKING:
 
 STUCK_S = 2.0  # a thread that finishes nothing for this long is stuck
 WATCH_S = 0.25  # how often that is checked
-HELD_UP_S = 0.5  # by which a check is late if the process, or the machine, stood still
 END_S = 5.0  # a loop that does not end within this is abandoned
 NAME_CHECK_S = 0.5  # telemetry is sent five times a second; without any within this time, the name is free
 CONSOLE_LINES = 1000
@@ -142,11 +142,10 @@ class LiveVehicle:
     def _watch(self) -> None:
         """Report a part that hangs, for example a rule that never returns, and its recovery."""
         before: dict[str, str] = {}
-        due = time.monotonic() + WATCH_S
+        late = LateCheck()
         while not self._ended.wait(WATCH_S):
-            hanging, late_s = self._hanging(), time.monotonic() - due
-            due += late_s + WATCH_S
-            if late_s > HELD_UP_S:  # the whole process was held up; the next check shows which part hangs
+            hanging = self._hanging()
+            if late.is_excused(time.monotonic()):  # the next check shows which part hangs
                 hanging = {part: why for part, why in hanging.items() if part in before}
             for part in hanging.keys() - before.keys():
                 self.loop.on_report(hanging[part])

@@ -9,7 +9,7 @@ const never = () => ({ lost: -Infinity, late: -Infinity });
  * @property {number} lost when its last tone of this kind was due
  * @property {number} late
  * @property {boolean} recovered whether there was no reason for a tone since
- * @property {boolean} moved whether it has not stood still since its last tone for that
+ * @property {boolean} moved whether it has moved since its last tone for standing still
  * @property {"lost"|"late"|null} waiting kind of its present status, if that came too soon after a tone to sound
  */
 

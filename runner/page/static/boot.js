@@ -49,10 +49,13 @@ function browserId() {
  * tab copies the storage, and the copy must not take control as well.
  */
 function viewerToken() {
-  const key = shown ? "tod-monitor" : "tod-viewer"; // a monitor opened in a page's tab must not inherit its control
-  const id = sessionStorage.getItem(key) ?? randomId();
-  sessionStorage.removeItem(key);
-  addEventListener("pagehide", () => sessionStorage.setItem(key, id));
-  addEventListener("pageshow", () => sessionStorage.removeItem(key));
-  return id;
+  const keys = ["tod-viewer", "tod-monitor"];
+  const own = keys[shown ? 1 : 0]; // a monitor opened in a page's tab must not inherit its control
+  const ids = Object.fromEntries(keys.map((key) => [key, sessionStorage.getItem(key)]));
+  ids[own] ??= randomId();
+  const clear = () => keys.forEach((key) => sessionStorage.removeItem(key));
+  clear();
+  addEventListener("pagehide", () => keys.forEach((key) => ids[key] && sessionStorage.setItem(key, ids[key])));
+  addEventListener("pageshow", clear);
+  return ids[own];
 }

@@ -7,7 +7,7 @@ import { groundOf, groundPlacement, latticeOf, outline, sharesOf, sightOf, trian
 import { clearTo, COLOURS, ESTIMATED, labelPicture, STEERING_STEP_RAD } from "./guide_layer.js";
 import { pathGuides } from "./guides.js";
 import { AMBER, frame, RED } from "./overlay.js";
-import { RemoteWarp } from "./remote_warp.js";
+import { RemoteWarp, UNANSWERED } from "./remote_warp.js";
 import { MOVING, STALLED } from "./status.js";
 
 const DISTANCES_M = [1, 2, 5]; // from the vehicle
@@ -137,7 +137,8 @@ export class GroundView {
       this.drawn_labels = parts.map(({ label }) => label);
       for (const [i, { newest, picture }] of parts.entries()) streams[i].onComposed(newest, picture !== null, warp?.fps ?? Infinity);
     } catch (error) {
-      this.fail(error instanceof Error ? error.message : String(error));
+      const why = error instanceof Error ? error.message : String(error);
+      this.fail(why === UNANSWERED ? `${why}; reload the page` : why);
     }
   }
 

@@ -8,6 +8,7 @@ import { hasGpu, setGpu } from "./picture.js";
 
 const STARTED_MS = 3000; // after the page was opened: starting WebGL takes a while, and the first pictures do not wait for it
 const ANSWER_MS = 10_000; // WebGL that does not answer for this long has failed
+export const UNANSWERED = `nothing was drawn for ${ANSWER_MS / 1000} s`;
 // Without a GPU a picture of a million px would occupy a processor for a fifth of a second.
 const SOFTWARE = { every_ms: 200, max_px: 200_000 };
 
@@ -34,8 +35,9 @@ const handlers = {
   drawn({ id, image, why }) {
     const drawing = drawings.get(id);
     drawings.delete(id);
-    if (why) drawing?.reject(new Error(why));
-    else drawing?.resolve(image);
+    if (!drawing) image?.close?.(); // it came too late
+    else if (why) drawing.reject(new Error(why));
+    else drawing.resolve(image);
   },
 };
 
@@ -141,7 +143,7 @@ export class RemoteWarp {
     this.count++;
     this.drawn_at = now();
     post({ order: "draw", target: this.id, id, size, frame, drawn }, copies.flatMap((copy) => (copy ? [copy.transferred] : [])));
-    const timer = setTimeout(() => handlers.drawn({ id, image: null, why: `nothing was drawn for ${ANSWER_MS / 1000} s` }), ANSWER_MS);
+    const timer = setTimeout(() => handlers.drawn({ id, image: null, why: UNANSWERED }), ANSWER_MS);
     try {
       return await new Promise((resolve, reject) => drawings.set(id, { resolve, reject }));
     } finally {

@@ -19,7 +19,8 @@ export function toggleStraight(name = store.selected) {
   const info = camera(name);
   if (!info) return;
   if (!canStraighten(info)) return publish("toast", { text: `${info.name}: lines are already straight; only a fisheye bends them`, level: "hint" });
-  change((choice) => choice.delete(info.name) || choice.add(info.name));
+  const isOn = chosen.has(info.name); // as shown here; another window may have chosen it meanwhile
+  change((choice) => (isOn ? choice.delete(info.name) : choice.add(info.name)));
 }
 
 /** Change the choice, which other windows may have changed. @param {(choice: Set<string>) => void} by */

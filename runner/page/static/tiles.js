@@ -336,7 +336,8 @@ export function startTiles() {
     wasHinted = true;
   });
   if (!canShowVideo) showNoVideo();
-  new ResizeObserver(layOut).observe(scene);
+  const resized = new ResizeObserver(layOut);
+  for (const element of [scene, area]) resized.observe(element); // alarms below the area may need a second line
   watchPixelRatio();
 }
 
