@@ -37,6 +37,7 @@ WAIT_S = 60.0
 FAIL_AFTER = 12  # frames after which a source or a sender of this part fails
 RESIZE_S = 0.08  # between two sizes: longer than a frame, so that each is sent
 RECONNECT_S = 0.15  # between two viewers: those that leave without TEARDOWN are dropped after some seconds
+QUIET_EVERY, QUIET_S = 50, 5.0  # viewers, then a pause: how long those that left linger depends on the load
 BREAK_S = 0.4  # mean time between two connections that break
 # front's source, and rear's pipeline after its encoder, fail again as soon as they work.
 SOURCE = f"""\
@@ -186,6 +187,9 @@ def _reconnect(system: System, rng: random.Random, problems: list[str]) -> Itera
                 until(lambda v=viewer: v.packets, WAIT_S)
             if rng.random() < 0.5:
                 viewer.leave()
+        if number % QUIET_EVERY == 0:
+            time.sleep(QUIET_S)
+            began += QUIET_S
         yield number
 
 
