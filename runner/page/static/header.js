@@ -16,7 +16,6 @@ const HOLDERS = { you: "You are in control", another: "Another page is in contro
 let clockKnownAt = performance.now(); // when the clock offset was last known, or could not be measured
 
 export const holding = new Holding();
-let isReleasing = false; // until the station names another holder
 const buttons = [...byId("modes").querySelectorAll("button")];
 
 /** Request another mode. The mode that the vehicle reports stays highlighted. */
@@ -27,9 +26,10 @@ export function selectMode(selected) {
 
 /** This page has lost control without releasing it: the driver must know, and other pages may drive. */
 function onControl() {
-  if (store.holder !== "you") isReleasing = false;
-  else if (isReleasing) send({ release_control: true }); // the first one was lost with its connection
-  if (store.view === "monitor" || !holding.update(store.holder)) return;
+  if (store.view === "monitor") return;
+  const isLost = holding.update(store.holder);
+  if (holding.isReleasing) send({ release_control: true }); // the first one may have been lost with its connection
+  if (!isLost) return;
   const text = `CONTROL LOST: ${HOLDERS[store.holder].toLowerCase()}`;
   note({ text, level: "problem" });
   showProblem(text);
@@ -41,9 +41,9 @@ export function toggleControl() {
   if (store.view === "monitor") return showProblem("only the page can take or release control, not its monitors");
   if (store.holder === "you") {
     holding.onRelease();
-    isReleasing = true;
     return send({ release_control: true });
   }
+  holding.onTake();
   if (store.holder === "nobody") return send({ take_control: true });
   setText(byId("confirm-text"), "Another page is in control of this vehicle. Take control from it?");
   byId("confirm", HTMLDialogElement).showModal();
