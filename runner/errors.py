@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copyreg import __newobj__  # type: ignore[attr-defined]
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,14 +34,7 @@ class UserError(Exception):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Also raised in worker processes, which send it here: its text suffices."""
-        return _restored, (type(self), self.args, self.__dict__)
-
-
-def _restored(kind: type[UserError], arguments: tuple[Any, ...], state: dict[str, Any]) -> UserError:
-    error = kind.__new__(kind, *arguments)
-    error.args = arguments
-    error.__dict__.update(state)
-    return error
+        return __newobj__, (type(self), *self.args), self.__dict__
 
 
 class ConfigError(UserError):

@@ -107,16 +107,19 @@ class PassingBuffer:
 
 
 class _Probe(ABC):
-    """Known to C by a number. A pad does not keep it alive: once deleted, it is removed."""
+    """Known to C by a number. A pad does not keep it alive: once deleted, it is removed.
+
+    kinds  of what passes a pad
+    """
 
     on_fault = Gst.PadProbeReturn.OK  # of its owner; ctypes would return 0, which drops what passes
 
-    def __init__(self) -> None:
-        self._key = next(_keys)
+    def __init__(self, kinds: Gst.PadProbeType) -> None:
+        self._key, self._kinds = next(_keys), kinds
         _probes[self._key] = self
 
-    def _add(self, pad: Gst.Pad, kinds: Gst.PadProbeType) -> None:
-        _add_probe(int(_pointer(pad.__gpointer__, None)), kinds, _on_probe, self._key, None)
+    def add_to(self, pad: Gst.Pad) -> None:
+        _add_probe(int(_pointer(pad.__gpointer__, None)), self._kinds, _on_probe, self._key, None)
 
     @abstractmethod
     def handle(self, address: int | None) -> Gst.PadProbeReturn:
@@ -135,16 +138,15 @@ class BufferProbe(_Probe):
     def __init__(
         self, pad: Gst.Pad, on_buffer: Callable[[Gst.Pad, PassingBuffer], bool], *, in_lists: bool = False
     ) -> None:
-        super().__init__()
+        super().__init__(Gst.PadProbeType.BUFFER | (Gst.PadProbeType.BUFFER_LIST if in_lists else 0))
         self._pad, self._on_buffer = pad, WeakMethod(on_buffer)
-        self._kinds = Gst.PadProbeType.BUFFER | (Gst.PadProbeType.BUFFER_LIST if in_lists else 0)
         self.armed = False
 
     def arm(self) -> None:
         """Wait for the next buffer, unless already armed. To be called by one thread at a time."""
         if not self.armed:
             self.armed = True
-            self._add(self._pad, self._kinds)
+            self.add_to(self._pad)
 
     def handle(self, address: int | None) -> Gst.PadProbeReturn:
         on_buffer = self._on_buffer()
@@ -156,17 +158,16 @@ class BufferProbe(_Probe):
 
 
 class IdleProbe(_Probe):
-    """Calls a method of its owner, which it does not keep alive, between two buffers of a pad."""
+    """Calls a method of its owner, which it does not keep alive, between two buffers of a pad.
+
+    Once each time it is added: immediately if nothing passes the pad, otherwise in the streaming thread.
+    """
 
     on_fault = Gst.PadProbeReturn.REMOVE  # until then the pad is blocked
 
     def __init__(self, on_idle: Callable[[], None]) -> None:
-        super().__init__()
+        super().__init__(Gst.PadProbeType.IDLE)
         self._on_idle = WeakMethod(on_idle)
-
-    def add_to(self, pad: Gst.Pad) -> None:
-        """Have it called once: immediately if nothing passes the pad, otherwise in the streaming thread."""
-        self._add(pad, Gst.PadProbeType.IDLE)
 
     def handle(self, address: int | None) -> Gst.PadProbeReturn:
         if on_idle := self._on_idle():
@@ -182,12 +183,8 @@ class TypeProbe(_Probe):
     """
 
     def __init__(self, kinds: Gst.PadProbeType, results: Mapping[Any, Gst.PadProbeReturn]) -> None:
-        super().__init__()
-        self._kinds = kinds
+        super().__init__(kinds)
         self._results = {int(kind): result for kind, result in results.items()}
-
-    def add_to(self, pad: Gst.Pad) -> None:
-        self._add(pad, self._kinds)
 
     def handle(self, address: int | None) -> Gst.PadProbeReturn:
         assert address
@@ -202,11 +199,8 @@ class EventProbe(_Probe):
     """
 
     def __init__(self, kinds: Gst.PadProbeType, is_dropped: Callable[[Gst.EventType], bool]) -> None:
-        super().__init__()
-        self._kinds, self._is_dropped = kinds, WeakMethod(is_dropped)
-
-    def add_to(self, pad: Gst.Pad) -> None:
-        self._add(pad, self._kinds)
+        super().__init__(kinds)
+        self._is_dropped = WeakMethod(is_dropped)
 
     def handle(self, address: int | None) -> Gst.PadProbeReturn:
         assert address
