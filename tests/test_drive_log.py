@@ -115,12 +115,12 @@ def test_a_killed_process_loses_at_most_its_last_line(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_ends_the_log_and_not_the_drive(tmp_path: Path) -> None:
-    """A file size limit acts like a full disk: part of a line is written, then nothing."""
+    """A limit on the size of files acts like a full disk: part of a line is written, then nothing."""
     limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (70_000, 70_000))"
     with child(tmp_path, "100", limit) as process:
         output, _ = process.communicate(timeout=60)
     assert process.returncode == 0
-    first = "the drive continues without its log: drive.jsonl: no space left on device"
+    first = "the drive continues without its log: drive.jsonl: file too large"
     assert re.fullmatch(rf"2 {first} drive.jsonl: \d+ lines were not written\n", output)
     drive = read_drive(tmp_path)
     assert 10 <= len(drive.sides["vehicle"].lines) <= 14
@@ -141,7 +141,7 @@ def test_a_log_continues_when_the_disk_has_room_again(tmp_path: Path) -> None:
     )
     done = run(code, tmp_path)
     assert done.stdout.splitlines() == [
-        "the drive continues without its log: drive.jsonl: no space left on device",
+        "the drive continues without its log: drive.jsonl: file too large",
         "the log continues: drive.jsonl",
     ], done.stderr
     drive = read_drive(tmp_path)

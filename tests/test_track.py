@@ -19,7 +19,7 @@ from runner.core.events import PositionReported
 from runner.core.model import ModelError
 from runner.pqos import build_pqos, build_track
 from runner.pqos.bandwidth_map import EARTH_M, offset
-from runner.pqos.route import route
+from runner.pqos.route import THIN_M, route
 from runner.pqos.table import read_map
 from runner.pqos.track import Track, track_on_map
 
@@ -73,7 +73,9 @@ def test_any_order_gives_the_loop(seed: int, count: int) -> None:
     found = hops(points, order)
     length = hops(oval(count), np.append(np.arange(count), 0)).sum()
     assert order[0] == order[-1] == 0
-    assert found.max() < 20 and found.sum() < 1.1 * length and furthest(points, order) < 8
+    assert found.max() < 20 and found.sum() < 1.1 * length
+    # A point left out is in the cell of another, whose diagonal is so long, which may be as close to the route.
+    assert furthest(points, order) <= (math.sqrt(2) + 1) * THIN_M
 
 
 def test_scattered_laps_give_no_jumps() -> None:

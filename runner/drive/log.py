@@ -178,16 +178,16 @@ class _File:
 
     def append(self, data: bytes) -> str | None:
         """Write a line; returns why it was not written, None if it was."""
+        rest = data
         try:
-            if os.write(self._fd, data) == len(data):
-                self._size += len(data)
-                return None
-            why = "no space left on device"
+            while rest:  # a signal may interrupt a write, and a disk may have space for a part
+                rest = rest[os.write(self._fd, rest) :]
         except OSError as error:
-            why = (error.strerror or str(error)).lower()
-        with suppress(OSError):
-            os.ftruncate(self._fd, self._size)
-        return why
+            with suppress(OSError):
+                os.ftruncate(self._fd, self._size)
+            return (error.strerror or str(error)).lower()
+        self._size += len(data)
+        return None
 
     def close(self, keep: bool) -> None:
         os.close(self._fd)

@@ -30,12 +30,21 @@ CHECKOUT = Path(__file__).resolve().parents[2]
 SHARED = Path(os.environ.get("TOD_SHARED_DATA", CHECKOUT.parent / "shared" / "data"))
 CLIPS = sorted((SHARED / "video").glob("*")) if SHARED.is_dir() else []
 
-# A small robot with pictures of a quarter of its size: the processor has time to spare.
-SMALL_ROBOT = (
-    "vehicle=delivery_robot",
-    *("cameras.front.width_px=320", "cameras.front.height_px=180"),
-    *("cameras.rear.width_px=424", "cameras.rear.height_px=240"),
-    *("cameras.mast.width_px=400", "cameras.mast.height_px=300"),
+ROBOT_SIZES = {"front": (320, 180), "rear": (424, 240), "mast": (400, 300)}
+
+
+def small_robot(*cameras: str) -> tuple[str, ...]:
+    """Words for a robot with these cameras only, and smaller pictures: the processor has time to spare."""
+    absent = [f"~cameras.{name}" for name in ROBOT_SIZES if name not in cameras]
+    sizes = [(f"cameras.{name}", *ROBOT_SIZES[name]) for name in cameras]
+    small = [word for key, width, height in sizes for word in (f"{key}.width_px={width}", f"{key}.height_px={height}")]
+    return ("vehicle=delivery_robot", *absent, *small)
+
+
+SMALL_ROBOT = small_robot(*ROBOT_SIZES)
+# Likewise two cameras of the paper's vehicle.
+SMALL_FRONT = tuple(
+    f"cameras.{name}.{size}" for name in ("front_left", "front_right") for size in ("width_px=480", "height_px=260")
 )
 # Without the measured link: a busy machine delays packets, which would lower the total.
 ROBOT = (

@@ -9,7 +9,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from rig import CHECKOUT, free_port, until
+from rig import CHECKOUT, SMALL_ROBOT, free_port, until
 from runner.apply import OperatorSide, VehicleSide, check_plan
 from runner.configuration.config import configuration
 from runner.core.commands import Command
@@ -18,7 +18,7 @@ from runner.gst.probes import BufferProbe
 from runner.plans import compile_plans
 
 pytestmark = pytest.mark.gst
-ROBOT = ("vehicle=delivery_robot", "source=test", "fps_max=15")
+ROBOT = (*SMALL_ROBOT, "source=test", "fps_max=15")
 FRAMES = 30
 BUFFERS = Gst.PadProbeType.BUFFER | Gst.PadProbeType.BUFFER_LIST
 

@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 
-from rig import LOOPBACK6, streaming, until
+from rig import LOOPBACK6, SMALL_ROBOT, streaming, until
 from runner.core.commands import Command
 from runner.errors import UserError
 from runner.operator.frames import live_frames
@@ -18,14 +18,14 @@ pytestmark = pytest.mark.gst
 @pytest.fixture
 def robot():
     host = f"media.host={LOOPBACK6}"
-    with streaming("vehicle=delivery_robot", "fps_max=15", host, cameras=()) as (side, vehicle, _, _):
+    with streaming(*SMALL_ROBOT, "fps_max=15", host, cameras=()) as (side, vehicle, _, _):
         side.turn(
             [Command(name, *knob) for name in vehicle.cameras for knob in (("size", (450, 260)), ("bitrate", 900))]
         )
         yield (
             side,
             [
-                "vehicle=delivery_robot",
+                *SMALL_ROBOT,
                 "fps_max=15",
                 host,
                 f"media.port={vehicle.media.port}",

@@ -14,13 +14,13 @@ from statistics import median
 
 import pytest
 
-from rig import free_port, until
+from rig import SMALL_ROBOT, free_port, until
 from runner.core.commands import Command
 from runner.errors import RunError
 
 CAMERAS = ("front", "rear")
 SENDING = dict.fromkeys(CAMERAS, True)
-WORDS = ("vehicle=delivery_robot", "source=test", "fps_max=15")
+WORDS = (*SMALL_ROBOT, "source=test", "fps_max=15")
 
 
 def compiled(*words):

@@ -20,7 +20,7 @@ from helpers import out_of_reach
 from mcap.reader import make_reader
 from soak.signals import MARK, marked_processes
 
-from rig import LOOPBACK6, free_port, needs_root, process, run, until
+from rig import LOOPBACK6, free_port, needs_root, process, run, small_robot, until
 from rtsp_client import client_hello
 from runner.core.commands import Command
 from runner.core.model import Endpoint
@@ -40,7 +40,7 @@ from runner.security.keyring import Keyring, mqtt_password, rtsp_password
 
 SECRET_FILES = (keyring.KEY, keyring.SECRET, keyring.MEDIA_SECRET, keyring.PASSPHRASE, keyring.TOKEN)
 CAMERAS = ("front", "rear")
-WORDS = ("vehicle=delivery_robot", "source=test", "fps_max=15", "~cameras.mast", "page.serve=false", "pqos=constant")
+WORDS = (*small_robot(*CAMERAS), "source=test", "fps_max=15", "page.serve=false", "pqos=constant")
 PATIENT = "control.expires_s=10"  # a busy machine delays requests
 NAME = "delivery_robot"
 
@@ -624,7 +624,8 @@ def recognisable(unit):
     if SPS not in units:
         return []
     picture = max(units.values(), key=len)
-    return [units[SPS][:12], *(picture[at : at + 16] for at in (40, 80, 120, 160))]
+    parts = [picture[at : at + 16] for at in (40, 80, 120, 160)]
+    return [units[SPS][:12], *(part for part in parts if len(part) == 16)]
 
 
 @contextmanager

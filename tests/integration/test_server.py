@@ -11,7 +11,7 @@ from contextlib import ExitStack, contextmanager, suppress
 
 import pytest
 
-from rig import streaming, until
+from rig import SMALL_FRONT, streaming, until
 from rtsp_client import RtspClient
 from runner.core.commands import Command
 from runner.gst import GLib, Gst
@@ -49,7 +49,8 @@ class Vehicle:
 
 @contextmanager
 def serving(*overrides, cameras=(CAMERA,)):
-    with streaming(*overrides, cameras=cameras) as (side, vehicle, _, reported):
+    small = [word for word in SMALL_FRONT if word.split(".")[1] in cameras]
+    with streaming(*small, *overrides, cameras=cameras) as (side, vehicle, _, reported):
         served = Vehicle(side, vehicle, reported)
         for camera in cameras:
             served.turn(camera, size=(240, 130), bitrate=500)
@@ -172,7 +173,7 @@ def test_a_camera_that_delivers_nothing_is_answered_503_and_opens_when_it_delive
             assert client.open() == [503]
             assert time.monotonic() - began < 9
         assert max(took) < 0.2
-        frame = bytes(1920 * 1040 * 3 // 2)
+        frame = bytes(480 * 260 * 3 // 2)
         until(lambda: vehicle.side.push(CAMERA, frame))
         with RtspClient(vehicle.url()) as client:
             assert client.open() == [200, 200, 200]
@@ -551,7 +552,7 @@ def test_a_server_that_stops_during_requests_leaves_no_reading_thread(capfd):
                 tcp.recv(65_536)
 
     for _ in range(5):
-        with streaming() as (_, vehicle, _, _):
+        with streaming(*SMALL_FRONT) as (_, vehicle, _, _):
             address = (vehicle.media.host, vehicle.media.port)
             clients = [threading.Thread(target=ask, args=(address,), daemon=True) for _ in range(6)]
             for client in clients:

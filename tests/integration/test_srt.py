@@ -9,11 +9,11 @@ from statistics import median
 
 import pytest
 
-from rig import free_port, until
+from rig import free_port, small_robot, until
 from runner.configuration.config import configuration
 from runner.plans import compile_plans
 
-WORDS = ("vehicle=delivery_robot", "~cameras.front", "~cameras.mast", "source=test", "fps_max=15", "graph=h264_srt")
+WORDS = (*small_robot("rear"), "source=test", "fps_max=15", "graph=h264_srt")
 
 
 @pytest.mark.parametrize(("dscp", "byte"), [(34, 0x88), (0, 0), (-1, 0)])

@@ -15,7 +15,7 @@ from itertools import pairwise
 
 import pytest
 
-from rig import CHECKOUT, free_port, until, watching
+from rig import CHECKOUT, SMALL_ROBOT, free_port, until, watching
 from runner import graph
 from runner.apply import OperatorSide, VehicleSide, VideoFiles, check_plan, read_video
 from runner.configuration.config import configuration
@@ -35,7 +35,7 @@ class Sides:
     def __init__(self, directory, *words, cameras=CAMERAS, conf=None):
         self.first_frames, self.reported = [], []
         ports = [f"media.port={free_port()}", f"graph.first_port={free_port(3)}"]
-        overrides = ["vehicle=delivery_robot", "source=test", "log.video=true", *ports, *words]
+        overrides = [*SMALL_ROBOT, "source=test", "log.video=true", *ports, *words]
         vehicle = configuration(overrides, conf, check=check_plan).vehicle()
         self.vehicle = replace(vehicle, cameras={name: vehicle.cameras[name] for name in cameras})
         self.plans = compile_plans(self.vehicle)
