@@ -559,8 +559,13 @@ def _as_in_url(name: str) -> str:
 
 
 def _recent(camera: Camera) -> RecentUnits:
+    return RecentUnits(_wave_s(camera), video_codec(camera.graph))
+
+
+def _wave_s(camera: Camera) -> float | None:
+    """Length of a refresh wave, or time between key frames; None: unknown."""
     period = camera.graph.settings.get("key_interval_s")
-    return RecentUnits(None if period is None else float(period), video_codec(camera.graph))
+    return None if period is None else float(period)
 
 
 class _FaultHandler(logging.Handler):
@@ -602,6 +607,7 @@ def _introduction(vehicle: Vehicle, shown: Sequence[int]) -> dict[str, Any]:
             "width": camera.width,
             "height": camera.height,
             "fps": float(camera.fps),
+            "wave_s": _wave_s(camera),
             "pose": camera.pose and asdict(camera.pose),
             "fov_deg": camera.fov_deg,
             "lens": camera.lens,

@@ -8,7 +8,7 @@ import { alarmText, judge } from "../../runner/page/static/status.js";
 const NOW = 100_000;
 const LIMITS = { frozen_ms: 120 };
 const LIVE = {
-  connected: true, online: true, on: true, sending: true, refused: "", drawn: true, stood_since: null, damaged: false, faulty: false,
+  connected: true, online: true, on: true, sending: true, refused: "", drawn: true, stood_since: null, wave_s: 1.5, damaged: false, faulty: false,
   arrived: NOW - 20, decoded: NOW - 10, late_until: 0, fps: 40,
 };
 const judged = (more) => judge({ ...LIVE, ...more }, LIMITS, NOW);
@@ -28,7 +28,11 @@ const CASES = [
   ["lost", { refused: "no decoder", arrived: NOW - 1001 }],
   ["synchronising", { drawn: false }],
   ["synchronising", { drawn: false, waits_since: NOW - 4000 }],
-  ["frozen", { drawn: false, waits_since: NOW - 6000 }],
+  ["synchronising", { drawn: false, waits_since: NOW - 5000 }],
+  ["frozen", { drawn: false, waits_since: NOW - 5001 }], // two refresh waves, and 2 s for the decoder
+  ["synchronising", { drawn: false, waits_since: NOW - 12_000, wave_s: 5 }],
+  ["frozen", { drawn: false, waits_since: NOW - 12_001, wave_s: 5 }],
+  ["frozen", { drawn: false, waits_since: NOW - 5001, wave_s: null }],
   ["live", { drawn: false, stood_since: NOW - 120 }], // the decoder restarts: the last picture is still recent,
   ["frozen", { drawn: false, stood_since: NOW - 121 }], // and then it stands, although units arrive
   ["live", { stood_since: NOW - 5000 }], // pictures are drawn again

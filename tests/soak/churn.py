@@ -1,7 +1,7 @@
 """Thousands of size changes, viewers that come and go, and pipelines that fail and are rebuilt.
 
 Meanwhile memory, descriptors and threads of each process are sampled. The slope of each over the number of operations,
-after a warm-up, is printed with its confidence interval: it must be flat.
+after a warm-up, is printed with its confidence interval and that of each half: it must be flat.
 
     resizes     new sizes of all cameras while they play
     reconnects  viewers over TCP and UDP, with and without TEARDOWN
@@ -65,13 +65,18 @@ class Resource(NamedTuple):
 
 
 class Slope(NamedTuple):
-    """Growth per thousand operations, and its error."""
+    """Growth per thousand operations, its error, and the growth in each half of the time."""
 
     value: float
     error: float
+    halves: tuple[float, float]
+
+    def __str__(self) -> str:
+        return f"{self.value:+.2f} ± {self.error:.2f} ({self.halves[0]:+.2f}, {self.halves[1]:+.2f})"
 
     def rises(self, flat: float) -> bool:
-        return self.value > flat and self.value - self.error > 0
+        """Whether it grows all the time: a heap or a pool that grew once is not a leak."""
+        return self.value - self.error > 0 and min(self.value, *self.halves) > flat
 
 
 def _memory_mb(pid: int) -> float:
@@ -129,11 +134,11 @@ def _measured(system: System, what: str, most: int, operations: Iterator[int]) -
     for name in system.processes:
         slopes = {kind: slope([s for s in samples_by_kind[name, kind] if s[0] >= warm]) for kind in RESOURCES}
         last = {kind: samples_by_kind[name, kind][-1][1] for kind in RESOURCES}
-        words = (f"{last[kind]:8.1f} {kind.name} {s.value:+.2f} ± {s.error:.2f}" for kind, s in slopes.items())
+        words = (f"{last[kind]:8.1f} {kind.name} {found}" for kind, found in slopes.items())
         print(f"    {name:9}{''.join(words)}", flush=True)
         for kind, found in slopes.items():
             if found.rises(kind.flat):
-                growth = f"{found.value:.2f} ± {found.error:.2f} {kind.name} per {PER}"
+                growth = f"{found} {kind.name} per {PER}"
                 problems.append(f"{what}: {name} grows by {growth}, flat is {kind.flat:g}")
     return problems
 
@@ -145,9 +150,10 @@ def slope(samples: Sequence[tuple[int, float]]) -> Slope:
     """
     assert len(samples) >= 4, f"{len(samples)} samples are too few: more operations"
     blocks = np.array_split(np.array(samples, float), min(BLOCKS, len(samples)))
-    done, value = np.array([(block[:, 0].mean(), block[:, 1].min()) for block in blocks]).T
-    (rate, _), covariance = np.polyfit(done, value, 1, cov=True)
-    return Slope(PER * float(rate), PER * CONFIDENT * float(np.sqrt(covariance[0, 0])))
+    points = np.array([(block[:, 0].mean(), block[:, 1].min()) for block in blocks])
+    (rate, _), covariance = np.polyfit(*points.T, 1, cov=True)
+    first, second = (PER * float(np.polyfit(*half.T, 1)[0]) for half in np.array_split(points, 2))
+    return Slope(PER * float(rate), PER * CONFIDENT * float(np.sqrt(covariance[0, 0])), (first, second))
 
 
 # --- operations -------------------------------------------------------------------------------------------------------

@@ -4,7 +4,8 @@ export const MOVING = ["live", "late", "damaged"];
 export const STALLED = ["frozen", "lost"]; // no new pictures although they are due
 
 const LOST_MS = 1000;
-const SYNCHRONISED_MS = 5000; // two refresh waves, and time for the decoder
+const WAVE_S = 1.5; // a refresh wave, if its length is unknown
+const DECODER_MS = 2000; // a decoder's time until its first picture
 export const INTERVALS = 1.3; // this many frame intervals without a picture are more than jitter
 
 /**
@@ -16,6 +17,7 @@ export const INTERVALS = 1.3; // this many frame intervals without a picture are
  * @property {string} refused why there is no decoder, "" if there is one
  * @property {boolean} drawn whether a picture was drawn since the stream last started
  * @property {number} [waits_since] page time since which units arrive and none was drawn
+ * @property {number|null} wave_s length of a refresh wave, or time between key frames; null: unknown
  * @property {number|null} stood_since page time of the last picture before the decoder restarted in the middle of the stream; null: it did not
  * @property {boolean} faulty whether the source has a fault: it may repeat old pictures
  * @property {boolean} damaged whether the picture shows that packets were lost
@@ -35,12 +37,15 @@ export function judge(s, limits, now) {
   if (reachable && s.sending === false) return "paused";
   if (!reachable || now - s.arrived > LOST_MS) return "lost";
   if (s.refused) return "unsupported";
-  if (!s.drawn && s.stood_since === null) return now - (s.waits_since ?? now) > SYNCHRONISED_MS ? "frozen" : "synchronising";
+  if (!s.drawn && s.stood_since === null) return now - (s.waits_since ?? now) > synchronisedAfter(s.wave_s) ? "frozen" : "synchronising";
   const limit = frozenAfter(limits, s.fps);
   if (s.faulty || now - Math.min(s.arrived, s.drawn ? s.decoded : (s.stood_since ?? 0)) > limit) return "frozen";
   if (s.damaged) return "damaged";
   return now < s.late_until ? "late" : "live";
 }
+
+/** How long a stream may take to its first picture, ms: two refresh waves, since units of the first may be lost. */
+const synchronisedAfter = (wave_s) => 2000 * (wave_s ?? WAVE_S) + DECODER_MS;
 
 /** How long a picture may stand until it is frozen, ms. @param {{frozen_ms: number}} limits  @param {number} fps */
 export const frozenAfter = (limits, fps) => Math.max(limits.frozen_ms, (INTERVALS * 1000) / fps);

@@ -14,6 +14,7 @@ const listeners = new Map();
  * @property {number} width px
  * @property {number} height px
  * @property {number} fps
+ * @property {number|null} wave_s length of a refresh wave, or time between key frames; null: unknown
  * @property {import("./projection.js").Pose|null} pose
  * @property {number} fov_deg
  * @property {"pinhole"|"fisheye"} lens

@@ -470,7 +470,8 @@ export class Stream {
     const [faulty, isAbove] = [this.failed_at !== null, this.isOnlyInBirdseye];
     const drawn = this.drawn && (!isAbove || this.composed_at > -Infinity);
     const fps = Math.min(this.camera.fps, this.straight?.warp.fps ?? Infinity, isAbove ? this.composed_fps : Infinity);
-    return { connected, online, on, sending, refused, drawn, stood_since, waits_since, damaged, faulty, arrived, decoded, late_until, fps };
+    const { wave_s } = this.camera;
+    return { connected, online, on, sending, refused, drawn, stood_since, waits_since, wave_s, damaged, faulty, arrived, decoded, late_until, fps };
   }
 
   /** Whether too few pictures are drawn; to be called a few times a second. */
