@@ -63,13 +63,13 @@ def measure(
     clips: Mapping[str, Path],
     read_video: ReadVideo,
     decode_video: DecodeVideo,
-    progress: Callable[[float], None] = lambda done: None,
+    on_progress: Callable[[float], None] = lambda done: None,
     on_warning: Callable[[str], None] = lambda what: None,
 ) -> dict[str, DeliveredQuality]:
     """Measure all cameras whose video both sides recorded, on all processors.
 
     clips       by camera, the clip that its source played; cameras not listed are compared with the stream as sent
-    progress    called a few times a second, from this thread, with the share of the cameras done
+    on_progress called a few times a second, from this thread, with the share of the cameras done
     on_warning  called with a line about each camera that is left out: nothing was received, or files cannot be read
     """
     vehicle, operator = drive.sides["vehicle"], drive.sides["operator"]
@@ -86,7 +86,7 @@ def measure(
     try:
         work = {name: pool.submit(one, name) for name in names}
         while not all(each.done() for each in work.values()):
-            progress(sum(each.done() for each in work.values()) / len(work))
+            on_progress(sum(each.done() for each in work.values()) / len(work))
             wait(work.values(), REPORT_S)
     finally:
         pool.shutdown(wait=False, cancel_futures=True)

@@ -63,14 +63,14 @@ def write_all(
     target: ExportTarget,
     read_video: ReadVideo,
     on_warning: Callable[[str], None],
-    progress: Callable[[float], None],
+    on_progress: Callable[[float], None],
     check: Callable[[], None] = lambda: None,
 ) -> int:
     """Write all of a drive in time order.
 
     read_video  yields the pictures of a file
     on_warning  called with a line about each omission
-    progress    called every REPORT_EVERY messages with the share done
+    on_progress called every REPORT_EVERY messages with the share done
     check       called after each message
     returns     number of messages
     """
@@ -81,8 +81,8 @@ def write_all(
         check()
         count += 1
         if count % REPORT_EVERY == 0:
-            progress(min(1.0, (message.ns - first) / max(1, last - first)))
-    progress(1.0)
+            on_progress(min(1.0, (message.ns - first) / max(1, last - first)))
+    on_progress(1.0)
     return count
 
 

@@ -25,14 +25,14 @@ def write_mcap(
     file: BinaryIO,
     read_video: ReadVideo,
     on_warning: Callable[[str], None],
-    progress: Callable[[float], None] = lambda done: None,
+    on_progress: Callable[[float], None] = lambda done: None,
 ) -> int:
     """Write all of a drive in time order, in compressed chunks with checksums.
 
     file        receives the bytes
     read_video  yields the pictures of a file
     on_warning  called with a line about each omission
-    progress    called every few hundred messages with the share done
+    on_progress called every few hundred messages with the share done
     returns     number of messages
     raises      RunError if the file cannot be written
     """
@@ -45,7 +45,7 @@ def write_mcap(
         channels = _Channels(context, cameras_of(drive))
         for name, side in drive.sides.items():
             writer.write_metadata(f"{name} began", _texts(line_to_json(side.began)))
-        count = write_all(drive, channels, read_video, on_warning, progress, out.check)
+        count = write_all(drive, channels, read_video, on_warning, on_progress, out.check)
     out.check()
     return count
 

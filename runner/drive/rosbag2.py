@@ -31,14 +31,14 @@ def write_rosbag2(
     path: Path,
     read_video: ReadVideo,
     on_warning: Callable[[str], None],
-    progress: Callable[[float], None] = lambda done: None,
+    on_progress: Callable[[float], None] = lambda done: None,
 ) -> int:
     """Write all of a drive in time order, into MCAP in the directory of a bag.
 
     path        of the directory, which does not exist yet
     read_video  yields the pictures of a file
     on_warning  called with a line about each omission
-    progress    called every few hundred messages with the share done
+    on_progress called every few hundred messages with the share done
     returns     number of messages
     raises      RunError if the bag cannot be written
     """
@@ -50,7 +50,7 @@ def write_rosbag2(
         with Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as writer:
             for name, side in drive.sides.items():
                 writer.set_custom_data(f"{name} began", json.dumps(line_to_json(side.began), ensure_ascii=False))
-            return write_all(drive, _Topics(writer), read_video, on_warning, progress)
+            return write_all(drive, _Topics(writer), read_video, on_warning, on_progress)
     except OSError as error:
         raise RunError(f"the bag cannot be written: {error.strerror or error}") from None
 

@@ -571,15 +571,15 @@ def _wave_s(camera: Camera) -> float | None:
 class _FaultHandler(logging.Handler):
     """Reports the faults of this server. Invalid HTTP is the client's fault and is answered with 400."""
 
-    def __init__(self, report: Callable[[str], None]) -> None:
+    def __init__(self, on_report: Callable[[str], None]) -> None:
         super().__init__(logging.WARNING)
-        self._report = report
+        self._on_report = on_report
 
     def emit(self, record: logging.LogRecord) -> None:
         error = record.exc_info[1] if record.exc_info else None
         text = f"page: {record.getMessage()}" + (f": {type(error).__name__}: {error}" if error else "")
         if not isinstance(error, HttpProcessingError):
-            self._report(text)
+            self._on_report(text)
 
 
 async def _send(ws: web.WebSocketResponse, viewer: PageViewer) -> None:

@@ -125,7 +125,7 @@ def _measured(
     models: Path | None,
     bases: Sequence[Path],
     read: Callable[[Path], Drive] | None,
-    progress: Callable[[float], None],
+    on_progress: Callable[[float], None],
 ) -> list[DriveStatistics]:
     from dataclasses import replace
 
@@ -137,7 +137,7 @@ def _measured(
 
     drives: list[Drive] = []
     for number, path in enumerate(paths):
-        progress(number / len(paths))
+        on_progress(number / len(paths))
         drives.append((read or read_drive)(path))
     found = []
     for drive, label in zip(drives, labels(drives), strict=True):
@@ -145,7 +145,7 @@ def _measured(
         curves, notes = find_models(over_time.config, models, [*bases, drive.path, Path.cwd()])
         measured = statistics(over_time, curves, read_quality(drive.path))
         found.append(replace(measured, notes=(*measured.notes, *notes)))
-    progress(1.0)
+    on_progress(1.0)
     return found
 
 
