@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import select
 import socket
 import ssl
 import threading
@@ -90,8 +91,11 @@ class RtspClient:
             self.tcp.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
             self.tcp.setsockopt(socket.IPPROTO_TCP, socket.TCP_MAXSEG, 1400)
         self.tcp.connect(at or (host, int(port)))
-        if keys:
-            self.tcp = tls(keys).wrap_socket(self.tcp)
+        self._tls = tls(keys).wrap_socket(self.tcp) if keys else None
+        self.tcp, self._lock = (
+            self._tls or self.tcp,
+            threading.Lock(),
+        )  # OpenSSL's connections serve one thread at a time
         self.session, self.head, self.body = "", "", ""
         self._sequence, self._buffer = 0, b""
         self.packets: list[tuple[float, int, bool]] = []
@@ -122,7 +126,8 @@ class RtspClient:
         headers |= {"User-Agent": self._agent} if self._agent else {}
         lines = [f"{method} {url or self.url} RTSP/1.0", f"CSeq: {self._sequence}"]
         lines += [f"{name.replace('_', '-')}: {value}" for name, value in headers.items()]
-        self.tcp.sendall("\r\n".join([*lines, "", ""]).encode())
+        with self._lock:
+            self.tcp.sendall("\r\n".join([*lines, "", ""]).encode())
 
     def open(self, *, udp: bool = False, **play: object) -> list[int]:
         """Status codes of DESCRIBE, SETUP and PLAY, up to the first failure."""
@@ -167,7 +172,14 @@ class RtspClient:
         return is_closed(self.tcp, time.monotonic() + seconds)
 
     def close(self) -> None:
-        for sock in (self.tcp, *self._rtp):
+        """The reading thread ends first: it would read on from the descriptor, by then perhaps another client's."""
+        sockets = (self.tcp, *self._rtp)
+        for sock in sockets:
+            with suppress(OSError):
+                sock.shutdown(socket.SHUT_RDWR)
+        if self._thread:
+            self._thread.join(10)
+        for sock in sockets:
             sock.close()
 
     def __enter__(self) -> RtspClient:
@@ -209,11 +221,19 @@ class RtspClient:
 
     def _fill(self, size: int) -> bytes:
         while len(self._buffer) < size:
-            data = self.tcp.recv(65536)
+            data = self._receive()
             if not data:
                 raise EOFError("the server closed the connection")
             self._buffer += data
         return self._buffer
+
+    def _receive(self) -> bytes:
+        if not self._tls:
+            return self.tcp.recv(65536)
+        if not self._tls.pending() and not select.select([self._tls], [], [], self._tls.gettimeout())[0]:
+            raise TimeoutError
+        with self._lock:
+            return self._tls.recv(65536)
 
     def _packet(self) -> None:
         """Read one interleaved packet (RFC 2326, 10.12)."""
@@ -235,13 +255,13 @@ class RtspClient:
                     self._answer()
                 if self.delay_s:
                     time.sleep(self.delay_s)
-        except (OSError, EOFError):
+        except (OSError, EOFError, ValueError):  # ValueError: TLS has been shut down
             return
 
     def _read_udp(self) -> None:
         try:
-            while True:
-                self._keep(self._rtp[0].recv(2048))
+            while data := self._rtp[0].recv(2048):
+                self._keep(data)
         except OSError:
             return
 
