@@ -1,7 +1,6 @@
 /**
  * The guides of one camera, drawn by the worker into a canvas of its own above the picture's: sharp whatever the size of
- * the picture, and drawn only when they change. Most of them do not depend on the steering, which may change with each
- * picture: these are kept in another canvas and copied.
+ * the picture, and drawn only when they change.
  */
 
 import { imageToBox, placement } from "./framing.js";
@@ -28,13 +27,10 @@ export class GuideLayer {
   drawn = "nothing yet"; // what the canvas shows
   /** @type {{kind: string, metres: number|null, pieces: import("./projection.js").Point[][]}[]} */
   lines = []; // for tests: the drawn lines, CSS px of the box
+  /** @type {OffscreenCanvas|null} */
+  canvas = null;
   /** @type {OffscreenCanvasRenderingContext2D|null} */
   context = null;
-  /** @type {OffscreenCanvasRenderingContext2D|null} */
-  kept = null; // of the canvas that is copied
-  keptDrawn = "nothing yet";
-  /** @type {GuideLayer["lines"]} */
-  keptLines = [];
 
   /**
    * @param {import("./projection.js").Optics & {calibrated: boolean}} camera
@@ -51,7 +47,7 @@ export class GuideLayer {
   setOptics(optics) {
     this.toImage = projection(optics);
     this.straight = this.straightLines();
-    this.drawn = this.keptDrawn = "nothing yet";
+    this.drawn = "nothing yet";
   }
 
   straightLines() {
@@ -59,9 +55,9 @@ export class GuideLayer {
   }
 
   attach(canvas) {
+    this.canvas = canvas;
     this.context = canvas.getContext("2d", { desynchronized: true });
-    this.kept = new OffscreenCanvas(1, 1).getContext("2d");
-    this.drawn = this.keptDrawn = "nothing yet";
+    this.drawn = "nothing yet";
   }
 
   project({ kind, metres, places }) {
@@ -74,59 +70,34 @@ export class GuideLayer {
    * @param {Seen|null} seen null: no moving picture, or an unknown region
    */
   draw(display, seen) {
-    const { context, kept } = this;
-    if (!context || !kept) return;
+    const { canvas, context } = this;
+    if (!canvas || !context) return;
     const target = this.shown && seen && display.width && display.height ? { ...seen, rad: seen.rad && STEERING_STEP_RAD * Math.round(seen.rad / STEERING_STEP_RAD) } : null;
     const described = JSON.stringify(target && [display, target]);
     if (described === this.drawn) return;
     context.reset(); // lines that no longer match disappear, whatever the size
     this.lines = [];
-    if (target && !this.drawOn(context, kept, display, target)) return;
+    if (target && !clearTo(context, display)) return;
     this.drawn = described;
+    if (target) this.drawOn(context, display, target);
   }
 
-  /** @returns {boolean} whether it is drawn; if not, a canvas has another size, and it will be drawn later */
-  drawOn(context, kept, display, { picture, region, rad }) {
-    const described = JSON.stringify([display, picture, region]);
-    const isKept = described === this.keptDrawn;
-    if (!clearTo(context, display) || !(isKept || clearTo(kept, display))) return false;
-    const sight = sightOf(display, picture, region);
-    if (!isKept) this.drawStraight(kept, sight);
-    this.keptDrawn = described;
+  drawOn(context, display, { picture, region, rad }) {
+    const shown = placement(display, picture, display.view);
+    const toBox = imageToBox(display, picture, display.view, region);
+    const thick = Math.min(1.5, Math.max(0.6, shown.width / USUAL_PX));
     const paths = rad === null ? [] : pathGuides(this.dimensions, rad).map((guide) => this.project(guide));
-    this.lines = [...this.keptLines, ...drawLines(context, sight, paths)];
-    context.resetTransform();
-    context.drawImage(kept.canvas, 0, 0);
-    return true;
-  }
-
-  /** Draw the lines that do not depend on the steering, and all labels. */
-  drawStraight(context, sight) {
-    context.reset();
-    this.keptLines = drawLines(context, sight, this.straight);
-    const visible = visibleIn(sight.display, sight.shown);
-    labelDistances(context, this.keptLines, visible);
+    context.scale(display.ratio, display.ratio);
+    context.beginPath();
+    context.rect(shown.x, shown.y, shown.width, shown.height);
+    context.clip();
+    const lines = (this.lines = [...this.straight, ...paths].map((guide) => ({ ...guide, pieces: guide.pieces.map((piece) => piece.map(toBox)) })));
+    for (const { kind, pieces } of lines) for (const piece of pieces) stroke(context, piece, thick * (LINE_WIDTHS[kind] + 2), "rgba(0,0,0,0.55)");
+    for (const { kind, pieces } of lines) for (const piece of pieces) stroke(context, piece, thick * LINE_WIDTHS[kind], COLOURS[kind]);
+    const visible = visibleIn(display, shown);
+    labelDistances(context, lines, visible);
     if (this.label) labelPicture(context, this.label, visible);
   }
-}
-
-/** Where a picture is in its box on the screen, and how its lines are drawn there. */
-function sightOf(display, picture, region) {
-  const shown = placement(display, picture, display.view);
-  const thick = Math.min(1.5, Math.max(0.6, shown.width / USUAL_PX));
-  return { display, shown, thick, toBox: imageToBox(display, picture, display.view, region) };
-}
-
-/** Draw lines within the picture; returns them in CSS px of the box. */
-function drawLines(context, { display, shown, thick, toBox }, guides) {
-  context.scale(display.ratio, display.ratio);
-  context.beginPath();
-  context.rect(shown.x, shown.y, shown.width, shown.height);
-  context.clip();
-  const lines = guides.map((guide) => ({ ...guide, pieces: guide.pieces.map((piece) => piece.map(toBox)) }));
-  for (const { kind, pieces } of lines) stroke(context, pieces, thick * (LINE_WIDTHS[kind] + 2), "rgba(0,0,0,0.55)");
-  for (const { kind, pieces } of lines) stroke(context, pieces, thick * LINE_WIDTHS[kind], COLOURS[kind]);
-  return lines;
 }
 
 /** The part of the box that the picture covers. */
@@ -135,15 +106,12 @@ function visibleIn({ width, height }, shown) {
   return { left, top, right: Math.min(width, shown.x + shown.width), bottom: Math.min(height, shown.y + shown.height) };
 }
 
-function stroke(context, pieces, thick, colour) {
+function stroke(context, points, thick, colour) {
   context.lineWidth = thick;
   context.strokeStyle = colour;
   context.lineJoin = "round";
   context.beginPath();
-  for (const [first, ...others] of pieces) {
-    context.moveTo(first.x, first.y);
-    for (const { x, y } of others) context.lineTo(x, y);
-  }
+  for (const { x, y } of points) context.lineTo(x, y);
   context.stroke();
 }
 
