@@ -127,6 +127,18 @@ def test_a_full_disk_ends_the_log_and_not_the_drive(tmp_path: Path) -> None:
     assert drive.warnings == [f"{tmp_path / 'drive.jsonl'}: was not closed; the process was killed or is still running"]
 
 
+def test_an_interrupted_write_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write = os.write
+    monkeypatch.setattr("runner.drive.log.os.write", lambda fd, data: write(fd, data[:100]))
+    log = begun(tmp_path)
+    for number in range(10):
+        log.note(f"{number} " + "x" * 1000)
+    log.close()
+    drive = read_drive(tmp_path)
+    assert drive.warnings == []
+    assert [note.text.split()[0] for note in drive.sides["vehicle"].of(Note)] == [str(n) for n in range(10)]
+
+
 def test_a_log_continues_when_the_disk_has_room_again(tmp_path: Path) -> None:
     """Nothing is lost while the disk is full: the lines are queued."""
     code = (

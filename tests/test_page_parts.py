@@ -290,6 +290,7 @@ def test_hello_describes_each_cameras_pose_and_optics():
         "+cameras.rear_center.calibrated=true",
         f"+cameras.front_left.native={native}",
         "cameras.rear_center.place.column_span=2",
+        "graph.key_interval_s=2.5",
     )
     with served(*words) as (port, _):
         hello = asyncio.run(first_message(port))
@@ -302,6 +303,7 @@ def test_hello_describes_each_cameras_pose_and_optics():
     optics = {"fov_deg": 180, "lens": "fisheye", "native": native}
     assert {key: cameras["top_left"][key] for key in optics} == optics
     assert [name for name, camera in cameras.items() if camera["calibrated"]] == ["rear_center"]
+    assert {camera["wave_s"] for camera in cameras.values()} == {2.5}
     assert hello["layout"]["places"]["front_left"] == {"row": 0, "column": 0, "row_span": 1, "column_span": 1}
     assert hello["layout"]["own"]["rear_center"] == {"row": 1, "column": 1, "row_span": 1, "column_span": 2}
     dimensions = {"wheelbase_m": 2.9, "track_m": 1.65, "width_m": 1.92, "front_m": 3.65, "rear_m": 0.95}

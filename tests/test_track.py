@@ -74,7 +74,7 @@ def test_any_order_gives_the_loop(seed: int, count: int) -> None:
     length = hops(oval(count), np.append(np.arange(count), 0)).sum()
     assert order[0] == order[-1] == 0
     assert found.max() < 20 and found.sum() < 1.1 * length
-    # A point left out is in the cell of another, whose diagonal is so long, which may be as close to the route.
+    # A point is left out for another in its cell, at most a diagonal away; that one for a third, less than THIN_M away.
     assert furthest(points, order) <= (math.sqrt(2) + 1) * THIN_M
 
 

@@ -55,8 +55,8 @@ class Log:
     on_report  called, from the log's thread, when the file cannot be written, and when it can again
     raises     UserError if the directory already contains a drive, or cannot be written
 
-    Lines wait in a bounded queue for a thread that writes each with one system call, so that a killed process loses at
-    most the queued lines. Lines are dropped while the queue is full, and a line of kind "dropped" counts them.
+    Lines wait in a bounded queue for a thread that writes each, normally with one system call, so that a killed process
+    loses at most the queued lines. Lines are dropped while the queue is full, and a line of kind "dropped" counts them.
     Lines written before `begin` are kept until then.
     """
 

@@ -17,7 +17,7 @@ from runner.gst.viewers import StreamViewer
 
 USER_TIMEOUT_MS = 2000  # the kernel closes a connection whose data stays unacknowledged for this long (RFC 5482)
 KEEPALIVE_S, KEEPALIVES = 2, 3  # a peer that answers none of this many probes, this far apart, is gone
-_SIOCINQ, _SIOCOUTQ = 0x541B, 0x5411  # unread and unacknowledged bytes (linux/sockios.h)
+_SIOCOUTQ = 0x5411  # unacknowledged bytes (linux/sockios.h)
 _BYTES_ACKED, _MIN_RTT = 120, 148  # offsets in struct tcp_info (linux/tcp.h)
 BUFFER_S = 0.35  # of video in the send buffer, in addition to the round-trip time
 LEAST_BUFFER_BYTES = 16_384
@@ -51,7 +51,7 @@ class RtspConnection:
         self.cameras: dict[str, GstRtspServer.RTSPStreamTransport | None] = {}
         self.described = ""
         self.interleaved = False
-        self.last_request = self._began = self._unread = self._writable = time.monotonic()
+        self.last_request = self._began = self._writable = time.monotonic()
         self._buffer = 0
         self._written: deque[tuple[float, int]] = deque()  # when, total bytes written by then
 
@@ -59,15 +59,8 @@ class RtspConnection:
         return f"{self.viewer.address} ({self.viewer.operator})" if self.viewer.operator else self.viewer.address
 
     def unused_s(self, now: float) -> float:
-        """How long the server has waited for the client's first request, s; 0 afterwards. To be called regularly.
-
-        Over TLS the client may be in the handshake. While what it has sent is unread, it waits for the server.
-        """
-        if self.last_request != self._began:
-            return 0.0
-        if self._bytes(_SIOCINQ):
-            self._unread = now
-        return now - self._unread
+        """How long it has waited for a first request, s; 0 afterwards. Over TLS it may be in the handshake."""
+        return now - self.viewer.since if self.last_request == self._began else 0.0
 
     def identify(self, operator: str | None) -> None:
         self.viewer = self.viewer._replace(operator=operator or "")
@@ -89,7 +82,8 @@ class RtspConnection:
         info = self._socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 256)
         (acked,), (rtt_us,) = struct.unpack_from("Q", info, _BYTES_ACKED), struct.unpack_from("I", info, _MIN_RTT)
         self._resize_buffer(round(kbps * 125 * (BUFFER_S + rtt_us / 1e6)))
-        self._written.append((now, acked + self._bytes(_SIOCOUTQ)))
+        (waiting,) = struct.unpack("i", ioctl(self._socket, _SIOCOUTQ, bytes(4)))
+        self._written.append((now, acked + waiting))
         while self._written and self._written[0][1] <= acked:
             self._written.popleft()
         if not shared or self._has_room():
@@ -101,10 +95,6 @@ class RtspConnection:
         if abs(size - self._buffer) > self._buffer / 10:
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, size // 2)  # the kernel doubles it
             self._buffer = size
-
-    def _bytes(self, request: int) -> int:
-        (count,) = struct.unpack("i", ioctl(self._socket, request, bytes(4)))
-        return int(count)
 
     def _has_room(self) -> bool:
         room = select.poll()

@@ -10,7 +10,7 @@ import resource
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from enum import Enum, auto
@@ -41,8 +41,8 @@ HELD_S = 5.0  # how long an open camera then waits for the next request
 CLOSE_S = 2.0  # how long connections may take to end when the server stops
 TEARDOWN_S = 5.0  # how long a camera that is reopened waits for the end of its previous pipeline
 BACKLOG = 128  # connections waiting to be accepted; with the library's 5, further viewers would retry after 1 s
-# TLS handshakes wait in a pool of ten threads, to which GLib adds slowly. A client that keeps the server waiting for a
-# first request is dropped after FIRST_REQUEST_S, or after CROWDED_S if there are more than CROWD of them.
+# TLS handshakes wait in a pool of ten threads, to which GLib adds slowly. A client without a request is dropped after
+# FIRST_REQUEST_S, or after CROWDED_S if there are more than CROWD of them.
 FIRST_REQUEST_S, CROWD, CROWDED_S = 5.0, 8, 1.0
 # A connection and its thread take three descriptors, and some more until it has ended. Beyond this many connections the
 # one that has waited longest for a first request is dropped.
@@ -393,7 +393,7 @@ class CameraServer:
     ) -> GstRtsp.RTSPStatusCode:
         camera, connection = self._cameras.get(_path(context)), self._connection(client)
         if connection:
-            connection.refusal = ""
+            connection.last_request, connection.refusal = time.monotonic(), ""
         if camera is None:
             return OK  # the library answers 404
         if _has_query(context):
@@ -528,14 +528,13 @@ class CameraServer:
             connections = list(self._connections.items())
             lags = {connection: self._lag(connection) for _, connection in connections if connection.interleaved}
             now = time.monotonic()
-            unused_s = {connection: waited for _, connection in connections if (waited := connection.unused_s(now))}
             self._left = {name: until for name, until in self._left.items() if now < until}
             left = tuple(self._left)
         self._wake(left)
         for name in left:
             self._unblock(name, now)
         if self._viewers:
-            self._drop_silent(unused_s)
+            self._drop_silent([connection for _, connection in connections], now)
         for client, connection in connections:
             if lags.get(connection, 0) > LAG_S:
                 self._close(connection, f"it lags by more than {LAG_S:g} s")
@@ -555,10 +554,11 @@ class CameraServer:
             if (connection.cameras or client.session_filter(None)) and self._viewers.viewer(client) is None:
                 self._close(connection, "its keys are no longer accepted")
 
-    def _drop_silent(self, unused_s: Mapping[RtspConnection, float]) -> None:
+    def _drop_silent(self, connections: Iterable[RtspConnection], now: float) -> None:
         """Close those whose client makes no request, to free threads for other handshakes."""
-        for connection, waited_s in unused_s.items():
-            if waited_s > (CROWDED_S if len(unused_s) > CROWD else FIRST_REQUEST_S):
+        silent = [each for connection in connections if (each := (connection.unused_s(now), connection))[0] > 0]
+        for idle_s, connection in silent:
+            if idle_s > (CROWDED_S if len(silent) > CROWD else FIRST_REQUEST_S):
                 connection.close()
 
     def _refresh_keys(self, viewers: ViewerCheck) -> None:

@@ -176,9 +176,10 @@ class RtspClient:
         sockets = (self.tcp, *self._rtp)
         for sock in sockets:
             with suppress(OSError):
-                sock.shutdown(socket.SHUT_RDWR)
+                socket.socket.shutdown(sock, socket.SHUT_RDWR)  # TLS's own would let the thread read what is encrypted
         if self._thread:
             self._thread.join(10)
+            assert not self._thread.is_alive()
         for sock in sockets:
             sock.close()
 
@@ -230,7 +231,11 @@ class RtspClient:
     def _receive(self) -> bytes:
         if not self._tls:
             return self.tcp.recv(65536)
-        if not self._tls.pending() and not select.select([self._tls], [], [], self._tls.gettimeout())[0]:
+        incoming = select.poll()
+        incoming.register(self._tls, select.POLLIN)
+        with self._lock:
+            waiting = self._tls.pending()
+        if not waiting and not incoming.poll(1000 * (self._tls.gettimeout() or 0)):
             raise TimeoutError
         with self._lock:
             return self._tls.recv(65536)
@@ -255,7 +260,7 @@ class RtspClient:
                     self._answer()
                 if self.delay_s:
                     time.sleep(self.delay_s)
-        except (OSError, EOFError, ValueError):  # ValueError: TLS has been shut down
+        except (OSError, EOFError):
             return
 
     def _read_udp(self) -> None:

@@ -21,7 +21,7 @@ from mcap.reader import make_reader
 from soak.signals import MARK, marked_processes
 
 from rig import LOOPBACK6, free_port, needs_root, process, run, small_robot, until
-from rtsp_client import RtspClient, client_hello
+from rtsp_client import client_hello
 from runner.core.commands import Command
 from runner.core.model import Endpoint
 from runner.core.roles import Role
@@ -551,17 +551,6 @@ def test_silent_clients_do_not_block_others(keys):
             with suppress(ConnectionError):
                 while sock.recv(4096):
                     pass
-
-
-def test_a_viewer_whose_handshake_waits_for_those_of_others_is_not_taken_for_silent(keys):
-    with ExitStack() as stack, sending(keys) as (plans, _):
-        url = plans[0].operator[0].properties["location"]
-        port = int(url.rpartition(":")[2].partition("/")[0])
-        for _ in range(60):  # of which ten are in the handshake at first
-            sock = stack.enter_context(socket.create_connection(("127.0.0.1", port)))
-            sock.sendall(client_hello(keys / "bob"))
-        viewer = stack.enter_context(RtspClient(url, keys=keys / "alice", vehicle=NAME))
-        assert viewer.open() == [200, 200, 200]
 
 
 def test_neither_plain_rtsp_nor_the_password_of_another_is_accepted(keys, tmp_path):

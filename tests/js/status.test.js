@@ -33,6 +33,7 @@ const CASES = [
   ["synchronising", { drawn: false, waits_since: NOW - 12_000, wave_s: 5 }],
   ["frozen", { drawn: false, waits_since: NOW - 12_001, wave_s: 5 }],
   ["frozen", { drawn: false, waits_since: NOW - 5001, wave_s: null }],
+  ["frozen", { drawn: false, waits_since: NOW - 15_001, wave_s: 60 }],
   ["live", { drawn: false, stood_since: NOW - 120 }], // the decoder restarts: the last picture is still recent,
   ["frozen", { drawn: false, stood_since: NOW - 121 }], // and then it stands, although units arrive
   ["live", { stood_since: NOW - 5000 }], // pictures are drawn again

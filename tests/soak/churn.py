@@ -75,8 +75,8 @@ class Slope(NamedTuple):
         return f"{self.value:+.2f} ± {self.error:.2f} ({self.halves[0]:+.2f}, {self.halves[1]:+.2f})"
 
     def rises(self, flat: float) -> bool:
-        """Whether it grows all the time: a heap or a pool that grew once is not a leak."""
-        return self.value - self.error > 0 and min(self.value, *self.halves) > flat
+        """Whether it grows, and has not stopped: a heap or a pool that grew early is not a leak."""
+        return self.value - self.error > 0 and min(self.value, self.halves[1]) > flat
 
 
 def _memory_mb(pid: int) -> float:

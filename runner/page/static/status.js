@@ -6,6 +6,7 @@ export const STALLED = ["frozen", "lost"]; // no new pictures although they are 
 const LOST_MS = 1000;
 const WAVE_S = 1.5; // a refresh wave, if its length is unknown
 const DECODER_MS = 2000; // a decoder's time until its first picture
+const LONGEST_MS = 15_000; // however long the wave is
 export const INTERVALS = 1.3; // this many frame intervals without a picture are more than jitter
 
 /**
@@ -45,7 +46,7 @@ export function judge(s, limits, now) {
 }
 
 /** How long a stream may take to its first picture, ms: two refresh waves, since units of the first may be lost. */
-const synchronisedAfter = (wave_s) => 2000 * (wave_s ?? WAVE_S) + DECODER_MS;
+const synchronisedAfter = (wave_s) => Math.min(2000 * (wave_s ?? WAVE_S) + DECODER_MS, LONGEST_MS);
 
 /** How long a picture may stand until it is frozen, ms. @param {{frozen_ms: number}} limits  @param {number} fps */
 export const frozenAfter = (limits, fps) => Math.max(limits.frozen_ms, (INTERVALS * 1000) / fps);
