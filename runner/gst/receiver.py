@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 from gi.repository import GObject, Gst, GstSdp
@@ -16,7 +18,8 @@ from runner.gst.caps import structure
 from runner.gst.probes import BufferProbe, PassingBuffer
 from runner.gst.repair import RepairBuffer
 from runner.gst.sender_filter import SenderFilter
-from runner.gst.supervised import SupervisedPipeline
+from runner.gst.supervised import STREAM_ENDED, SupervisedPipeline
+from runner.gst.timers import later
 from runner.gst.video_files import VideoFile, VideoFiles
 from runner.gst.viewers import user_agent
 from runner.h264.access_unit import AccessUnit, read_unit
@@ -248,6 +251,7 @@ class Receiver:
             self._on_report(self._name, problem)
         if GObject.signal_lookup("select-stream", self._client):
             prefer_feedback(self._client, self._on_profile)
+            self._client.connect("pad-added", self._on_stream)
         if self._operator and self._client.find_property("user-agent"):
             self._client.set_property("user-agent", user_agent(self._operator))
         if self._video:
@@ -273,6 +277,20 @@ class Receiver:
         self._over_udp |= factory == "udpsrc"
         if element.find_property("used-socket") and element.get_static_pad("src"):
             self._filter_senders(element)
+
+    def _on_stream(self, client: Gst.Element, pad: Gst.Pad) -> None:
+        """Handle the end of a stream (RTCP BYE) here: the library's client may deadlock. From a streaming thread."""
+        number = re.match(r"recv_rtp_src_(\d+)_", pad.get_name())
+        if not number:  # a stream without RTP
+            return
+        session = client.get_by_name("manager").emit("get-internal-session", int(number[1]))
+        for name in ("on-bye-ssrc", "on-bye-timeout", "on-timeout"):
+            disconnect_last(session, name)
+            session.connect(name, lambda *_: later(0, partial(self._on_stream_ended, client)))
+
+    def _on_stream_ended(self, client: Gst.Element) -> None:
+        if client is self._client:
+            self._supervised.restart(STREAM_ENDED)
 
     def _filter_senders(self, source: Gst.Element) -> None:
         """Make a socket of the client accept packets from the vehicle only. From the client's thread."""
@@ -386,6 +404,24 @@ def prefer_feedback(client: Gst.Element, on_profile: Callable[[str], None] = lam
 
     client.connect("on-sdp", on_sdp)
     client.connect("select-stream", lambda _client, number, _caps: number == chosen[0])
+
+
+def disconnect_last(session: GObject.Object, signal: str) -> None:
+    """Disconnect the second handler of a signal of an RTP session, which is the client's; the first is rtpsession's.
+
+    The client ends its elements in the handler, in a thread in which one of them streams. If its connection fails at
+    the same time, it ends them in another thread, and both wait for each other (GStreamer 1.22).
+    """
+    kind = GObject.signal_lookup(signal, session)
+    own = _handler(session, kind, GObject.SignalMatchType.ID)
+    GObject.signal_handler_block(session, own)
+    if other := _handler(session, kind, GObject.SignalMatchType.ID | GObject.SignalMatchType.UNBLOCKED):
+        GObject.signal_handler_disconnect(session, other)
+    GObject.signal_handler_unblock(session, own)
+
+
+def _handler(session: GObject.Object, kind: int, match: GObject.SignalMatchType) -> int:
+    return int(GObject.signal_handler_find(session, match, kind, 0, None, None, None))
 
 
 def capture_time(buffer: Gst.Buffer) -> float | None:

@@ -23,6 +23,7 @@ STOPPED_S = 2.0  # how long the next pipeline waits for the previous one to rele
 STOPPING_S = 0.02  # between two checks
 WATCH_MS = 250  # how often a caller's acknowledgements are counted
 UNACKNOWLEDGED_S = 1.5  # without an acknowledgement for this long, packets are not delivered; SRT itself needs 5 s
+STREAM_ENDED = "the stream ended"
 PATIENCE_S = 5.0  # the other side may start later: until then a waiting side reports nothing
 
 
@@ -78,8 +79,8 @@ class SupervisedPipeline:
             self._pipeline = None
 
     def restart(self, why: str) -> None:
-        """Tear down now, rebuild soon."""
-        if self._retry:
+        """Tear down now, rebuild soon; nothing happens if it is stopped."""
+        if self._retry or self._pipeline is None:
             return
         now = self._ended = time.monotonic()
         if self._works:
@@ -101,7 +102,7 @@ class SupervisedPipeline:
         if concerns_file(message):
             return
         failed = message.type == Gst.MessageType.ERROR
-        self.restart(message.parse_error()[0].message if failed else "the stream ended")
+        self.restart(message.parse_error()[0].message if failed else STREAM_ENDED)
 
     def _on_first_buffer(self, pad: Gst.Pad, _buffer: PassingBuffer) -> bool:
         """From a streaming thread."""

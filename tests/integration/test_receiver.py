@@ -99,6 +99,38 @@ def test_a_vehicle_that_is_away_is_reported_once_and_its_return_once():
     assert all(" works again after " in what for what in back)
 
 
+def test_the_end_of_a_stream_is_handled_here_and_not_by_the_client():
+    """The client's handlers of RTCP BYE and time-outs may deadlock with the failure of its connection."""
+    vehicle, plans = compiled()
+    with sending(vehicle, plans), receiving(plans) as (side, messages, more):
+        more()
+        pipeline, elements = side._receivers["front"]._supervised._pipeline, []
+        pipeline.get_bus().connect("message::eos", lambda *_: elements.append("ended"))
+        number = int(pipeline.get_by_name("client").srcpads[0].get_name().split("_")[3])
+        session = pipeline.get_by_name("manager").emit("get-internal-session", number)
+        names = ("on-bye-ssrc", "on-bye-timeout", "on-timeout")
+        assert {name: count_handlers(session, name) for name in names} == dict.fromkeys(names, 2)
+        session.emit("on-bye-ssrc", session.props.sources[0])
+        until(lambda: side.sample(SENDING)["front"].rebuilt == 1)
+        more()
+        assert any("the stream ended" in what for what in messages)
+        assert elements == []
+
+
+def count_handlers(session, name):
+    """Those of rtpsession and of the receiver."""
+    from gi.repository import GObject
+
+    kind, blocked = GObject.signal_lookup(name, session), []
+    match = GObject.SignalMatchType.ID | GObject.SignalMatchType.UNBLOCKED
+    while handler := GObject.signal_handler_find(session, match, kind, 0, None, None, None):
+        GObject.signal_handler_block(session, handler)
+        blocked.append(handler)
+    for handler in blocked:
+        GObject.signal_handler_unblock(session, handler)
+    return len(blocked)
+
+
 def test_packets_of_other_senders_are_dropped_and_counted():
     vehicle, plans = compiled()
     with sending(vehicle, plans), receiving(plans) as (side, messages, more):
