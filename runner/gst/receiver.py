@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 STALL_S = 2.0  # a camera that should send but neither sends nor answers for longer is rebuilt
 DIALLED_STALL_S = 1.0  # likewise where the vehicle dials: it calls again, but a listener keeps its first caller
+BYE = "on-bye-ssrc"  # signal of an RTP session (RFC 3550, section 6.6)
 GRACE_S = 0.75  # time for the first frame once a camera is expected to send
 
 
@@ -280,13 +281,20 @@ class Receiver:
 
     def _on_stream(self, client: Gst.Element, pad: Gst.Pad) -> None:
         """Handle the end of a stream (RTCP BYE) here: the library's client may deadlock. From a streaming thread."""
-        number = re.match(r"recv_rtp_src_(\d+)_", pad.get_name())
-        if not number:  # a stream without RTP
+        numbers = re.match(r"recv_rtp_src_(\d+)_(\d+)_", pad.get_name())
+        if not numbers:  # a stream without RTP
             return
-        session = client.get_by_name("manager").emit("get-internal-session", int(number[1]))
-        for name in ("on-bye-ssrc", "on-bye-timeout", "on-timeout"):
+        session = client.get_by_name("manager").emit("get-internal-session", int(numbers[1]))
+        for name in (BYE, "on-bye-timeout", "on-timeout"):
             disconnect_last(session, name)
-            session.connect(name, lambda *_: later(0, partial(self._on_stream_ended, client)))
+            session.connect(name, self._on_source_gone, client, int(numbers[2]), name == BYE)
+
+    def _on_source_gone(
+        self, _session: GObject.Object, source: GObject.Object, client: Gst.Element, ssrc: int, ended: bool
+    ) -> None:
+        """A source has sent a BYE, or is silent, which `sample` finds sooner where the vehicle's state is known."""
+        if source.props.ssrc == ssrc and (ended or self.should_send is None):
+            later(0, partial(self._on_stream_ended, client))
 
     def _on_stream_ended(self, client: Gst.Element) -> None:
         if client is self._client:

@@ -49,10 +49,12 @@ class SupervisedPipeline:
         self._begun = self._ended = time.monotonic()  # start and end of the last attempt
         self._lost = self._begun  # when a pipeline last worked
         self._works = self._worked = False  # this pipeline, any pipeline
+        self._stopped = True
         self._outage = Outage(on_report)
         self.rebuilt = 0
 
     def start(self) -> None:
+        self._stopped = False
         pipeline = Gst.parse_launch(self._launch)
         if not isinstance(pipeline, Gst.Pipeline):  # a single element is returned without a pipeline
             element, pipeline = pipeline, Gst.Pipeline.new(None)
@@ -71,6 +73,10 @@ class SupervisedPipeline:
         if self._retry:
             self._retry.cancel()
             self._retry = None
+        self._stopped = True
+        self._tear_down()
+
+    def _tear_down(self) -> None:
         if self._pipeline is not None:
             self._pipeline.get_bus().remove_signal_watch()
             self._change = set_state_in_thread(
@@ -80,7 +86,7 @@ class SupervisedPipeline:
 
     def restart(self, why: str) -> None:
         """Tear down now, rebuild soon; nothing happens if it is stopped."""
-        if self._retry or self._pipeline is None:
+        if self._retry or self._stopped:
             return
         now = self._ended = time.monotonic()
         if self._works:
@@ -88,7 +94,7 @@ class SupervisedPipeline:
             self._lost = now
         if self._worked or now - self._lost > PATIENCE_S:
             self._outage.report_failure(why, self._lost)
-        self.stop()
+        self._tear_down()
         self._retry = later(max(0.0, self._begun + RETRY_S - now), self._retry_start)
 
     def _retry_start(self) -> None:

@@ -106,11 +106,17 @@ def test_the_end_of_a_stream_is_handled_here_and_not_by_the_client():
         more()
         pipeline, elements = side._receivers["front"]._supervised._pipeline, []
         pipeline.get_bus().connect("message::eos", lambda *_: elements.append("ended"))
-        number = int(pipeline.get_by_name("client").srcpads[0].get_name().split("_")[3])
+        number, ssrc = map(int, pipeline.get_by_name("client").srcpads[0].get_name().split("_")[3:5])
         session = pipeline.get_by_name("manager").emit("get-internal-session", number)
+        sources = {source.props.ssrc: source for source in session.props.sources}
         names = ("on-bye-ssrc", "on-bye-timeout", "on-timeout")
         assert {name: count_handlers(session, name) for name in names} == dict.fromkeys(names, 2)
-        session.emit("on-bye-ssrc", session.props.sources[0])
+        session.emit("on-timeout", sources[ssrc])  # frames arrive
+        for other in sources.keys() - {ssrc}:  # the receiver's own, and one of retransmitted packets
+            session.emit("on-bye-ssrc", sources[other])
+        more()
+        assert side.sample(SENDING)["front"].rebuilt == 0
+        session.emit("on-bye-ssrc", sources[ssrc])
         until(lambda: side.sample(SENDING)["front"].rebuilt == 1)
         more()
         assert any("the stream ended" in what for what in messages)
