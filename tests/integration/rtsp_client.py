@@ -92,10 +92,8 @@ class RtspClient:
             self.tcp.setsockopt(socket.IPPROTO_TCP, socket.TCP_MAXSEG, 1400)
         self.tcp.connect(at or (host, int(port)))
         self._tls = tls(keys).wrap_socket(self.tcp) if keys else None
-        self.tcp, self._lock = (
-            self._tls or self.tcp,
-            threading.Lock(),
-        )  # OpenSSL's connections serve one thread at a time
+        self.tcp = self._tls or self.tcp
+        self._lock = threading.Lock()  # OpenSSL's connections serve one thread at a time
         self.session, self.head, self.body = "", "", ""
         self._sequence, self._buffer = 0, b""
         self.packets: list[tuple[float, int, bool]] = []
