@@ -286,7 +286,7 @@ class Receiver:
             return
         session = client.get_by_name("manager").emit("get-internal-session", int(numbers[1]))
         for name in (BYE, "on-bye-timeout", "on-timeout"):
-            disconnect_last(session, name)
+            disconnect_second(session, name)
             session.connect(name, self._on_source_gone, client, int(numbers[2]), name == BYE)
 
     def _on_source_gone(
@@ -414,7 +414,7 @@ def prefer_feedback(client: Gst.Element, on_profile: Callable[[str], None] = lam
     client.connect("select-stream", lambda _client, number, _caps: number == chosen[0])
 
 
-def disconnect_last(session: GObject.Object, signal: str) -> None:
+def disconnect_second(session: GObject.Object, signal: str) -> None:
     """Disconnect the second handler of a signal of an RTP session, which is the client's; the first is rtpsession's.
 
     The client ends its elements in the handler, in a thread in which one of them streams. If its connection fails at
