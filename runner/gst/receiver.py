@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import time
 from collections import deque
 from collections.abc import Callable
@@ -10,7 +9,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
-from gi.repository import GObject, Gst, GstSdp
+from gi.repository import Gst, GstSdp
 
 from runner.graph import Plan, video_codec
 from runner.gst.arriving import MAX_FRAMES, NTP_EPOCH_S, RTP_HZ, MediaClock
@@ -18,7 +17,8 @@ from runner.gst.caps import structure
 from runner.gst.probes import BufferProbe, PassingBuffer
 from runner.gst.repair import RepairBuffer
 from runner.gst.sender_filter import SenderFilter
-from runner.gst.supervised import STREAM_ENDED, SupervisedPipeline
+from runner.gst.stream_end import STREAM_ENDED, handle_stream_end, is_rtsp_client
+from runner.gst.supervised import SupervisedPipeline
 from runner.gst.timers import later
 from runner.gst.video_files import VideoFile, VideoFiles
 from runner.gst.viewers import user_agent
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 
 STALL_S = 2.0  # a camera that should send but neither sends nor answers for longer is rebuilt
 DIALLED_STALL_S = 1.0  # likewise where the vehicle dials: it calls again, but a listener keeps its first caller
-BYE = "on-bye-ssrc"  # signal of an RTP session (RFC 3550, section 6.6)
 GRACE_S = 0.75  # time for the first frame once a camera is expected to send
 
 
@@ -250,9 +249,9 @@ class Receiver:
         self._client = pipeline.get_by_name(self._client_name)
         if self._login and (problem := self._login.prepare(pipeline, self._client)):
             self._on_report(self._name, problem)
-        if GObject.signal_lookup("select-stream", self._client):
+        if is_rtsp_client(self._client):
             prefer_feedback(self._client, self._on_profile)
-            self._client.connect("pad-added", self._on_stream)
+            handle_stream_end(self._client, self._on_source_gone)
         if self._operator and self._client.find_property("user-agent"):
             self._client.set_property("user-agent", user_agent(self._operator))
         if self._video:
@@ -279,21 +278,9 @@ class Receiver:
         if element.find_property("used-socket") and element.get_static_pad("src"):
             self._filter_senders(element)
 
-    def _on_stream(self, client: Gst.Element, pad: Gst.Pad) -> None:
-        """Handle the end of a stream (RTCP BYE) here: the library's client may deadlock. From a streaming thread."""
-        numbers = re.match(r"recv_rtp_src_(\d+)_(\d+)_", pad.get_name())
-        if not numbers:  # a stream without RTP
-            return
-        session = client.get_by_name("manager").emit("get-internal-session", int(numbers[1]))
-        for name in (BYE, "on-bye-timeout", "on-timeout"):
-            disconnect_second(session, name)
-            session.connect(name, self._on_source_gone, client, int(numbers[2]), name == BYE)
-
-    def _on_source_gone(
-        self, _session: GObject.Object, source: GObject.Object, client: Gst.Element, ssrc: int, ended: bool
-    ) -> None:
-        """A source has sent a BYE, or is silent, which `sample` finds sooner where the vehicle's state is known."""
-        if source.props.ssrc == ssrc and (ended or self.should_send is None):
+    def _on_source_gone(self, client: Gst.Element, is_bye: bool) -> None:
+        """The stream has ended, or is silent, which `sample` finds sooner where the vehicle's state is known."""
+        if is_bye or self.should_send is None:
             later(0, partial(self._on_stream_ended, client))
 
     def _on_stream_ended(self, client: Gst.Element) -> None:
@@ -412,24 +399,6 @@ def prefer_feedback(client: Gst.Element, on_profile: Callable[[str], None] = lam
 
     client.connect("on-sdp", on_sdp)
     client.connect("select-stream", lambda _client, number, _caps: number == chosen[0])
-
-
-def disconnect_second(session: GObject.Object, signal: str) -> None:
-    """Disconnect the second handler of a signal of an RTP session, which is the client's; the first is rtpsession's.
-
-    The client ends its elements in the handler, in a thread in which one of them streams. If its connection fails at
-    the same time, it ends them in another thread, and both wait for each other (GStreamer 1.22).
-    """
-    kind = GObject.signal_lookup(signal, session)
-    own = _handler(session, kind, GObject.SignalMatchType.ID)
-    GObject.signal_handler_block(session, own)
-    if other := _handler(session, kind, GObject.SignalMatchType.ID | GObject.SignalMatchType.UNBLOCKED):
-        GObject.signal_handler_disconnect(session, other)
-    GObject.signal_handler_unblock(session, own)
-
-
-def _handler(session: GObject.Object, kind: int, match: GObject.SignalMatchType) -> int:
-    return int(GObject.signal_handler_find(session, match, kind, 0, None, None, None))
 
 
 def capture_time(buffer: Gst.Buffer) -> float | None:

@@ -15,6 +15,7 @@ from runner.gst.aside import HUNG, set_state_in_thread
 from runner.gst.outage import Outage
 from runner.gst.pipeline import Build, CameraPipeline, encrypt
 from runner.gst.probes import BufferProbe, PassingBuffer
+from runner.gst.stream_end import STREAM_ENDED
 from runner.gst.timers import Delayed, every, later
 from runner.gst.video_files import concerns_file
 
@@ -23,7 +24,6 @@ STOPPED_S = 2.0  # how long the next pipeline waits for the previous one to rele
 STOPPING_S = 0.02  # between two checks
 WATCH_MS = 250  # how often a caller's acknowledgements are counted
 UNACKNOWLEDGED_S = 1.5  # without an acknowledgement for this long, packets are not delivered; SRT itself needs 5 s
-STREAM_ENDED = "the stream ended"
 PATIENCE_S = 5.0  # the other side may start later: until then a waiting side reports nothing
 
 

@@ -14,6 +14,7 @@ from runner.gst.credentials import log_in
 from runner.gst.outage import Outage
 from runner.gst.probes import EventProbe, IdleProbe
 from runner.gst.source import fixed_rate
+from runner.gst.stream_end import STREAM_ENDED, handle_stream_end, is_rtsp_client
 from runner.gst.timers import Delayed, later
 from runner.system.backoff import pause_s
 
@@ -107,8 +108,13 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         """From a streaming thread. The end of a source that has worked does not end the pipeline."""
         if event != Gst.EventType.EOS or not self._frames():
             return False
-        self._set_error("the stream ended")
+        self._set_error(STREAM_ENDED)
         return True
+
+    def _on_stream_gone(self, client: Gst.Element, is_bye: bool) -> None:
+        """From a streaming thread of an IP camera's client. If it is only silent, frames are missing."""
+        if is_bye and client.get_parent() is self._child and self._frames():
+            self._set_error(STREAM_ENDED)
 
     def _set_error(self, what: str) -> None:
         self._error = self._error or (what, self._frames())  # the first one: others follow from it
@@ -187,6 +193,8 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
             from runner.gst.bag_feed import play_bag
 
             play_bag(child, self._plan, self._plan.bag, self._on_report)
+        for client in filter(is_rtsp_client, child.children):
+            handle_stream_end(client, self._on_stream_gone)
         for element in fixed_rate(child):
             element.set_property("skip-to-first", True)  # otherwise the first frame is repeated for the time before it
         self.add(child)

@@ -483,6 +483,29 @@ GLib.MainLoop().run()
 """
 
 
+STREAM_END_SIGNALS = ("on-bye-ssrc", "on-bye-timeout", "on-timeout")  # of an RTP session
+
+
+def rtp_session(client: Any) -> tuple[Any, int]:
+    """The session of an RTSP client that receives one stream, and the stream's SSRC."""
+    _, _, _, number, ssrc, _ = client.srcpads[0].get_name().split("_")
+    return client.get_by_name("manager").emit("get-internal-session", int(number)), int(ssrc)
+
+
+def count_handlers(session: Any, name: str) -> int:
+    """Of a signal of an RTP session: one is rtpsession's."""
+    from gi.repository import GObject
+
+    kind, blocked = GObject.signal_lookup(name, session), []
+    match = GObject.SignalMatchType.ID | GObject.SignalMatchType.UNBLOCKED
+    while handler := GObject.signal_handler_find(session, match, kind, 0, None, None, None):
+        GObject.signal_handler_block(session, handler)
+        blocked.append(handler)
+    for handler in blocked:
+        GObject.signal_handler_unblock(session, handler)
+    return len(blocked)
+
+
 @contextmanager
 def ip_camera(port: int, user: str = "", password: str = "") -> Iterator[tuple[str, subprocess.Popen[str]]]:
     """An IP camera in its own process. Yields its address and the process, which may be stopped or killed.

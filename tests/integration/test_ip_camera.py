@@ -11,7 +11,7 @@ from contextlib import ExitStack, contextmanager
 
 import pytest
 
-from rig import free_port, ip_camera, streaming, until, watching
+from rig import STREAM_END_SIGNALS, count_handlers, free_port, ip_camera, rtp_session, streaming, until, watching
 from runner.core.commands import Command
 
 WORDS = ("vehicle=delivery_robot", "source=rtsp", "fps_max=15")
@@ -107,6 +107,25 @@ def test_frames_keep_the_times_of_a_camera_that_is_faster_or_slower(fps_max):
         assert passed == own[: len(passed)]  # nothing is dropped
     else:
         assert len(passed) < len(own)
+
+
+def test_a_camera_that_ends_its_stream_is_reported_and_connected_again():
+    """The client's own handlers of RTCP BYE and time-outs may deadlock with the failure of its connection."""
+    with driving() as (camera, side, _, plan, reported), watching(plan) as client:
+        until(lambda: len(client.sizes) > 10)
+        session, ssrc = rtp_session(side._pipeline("rear")._pipeline.get_by_name("source"))
+        assert [count_handlers(session, name) for name in STREAM_END_SIGNALS] == [2, 2, 2]
+        camera.send_signal(signal.SIGSTOP)
+        source = next(source for source in session.props.sources if source.props.ssrc == ssrc)
+        session.emit("on-bye-ssrc", source)
+        until(side.sources)
+        assert side.sources() == {"rear": "source: the stream ended"}
+        camera.send_signal(signal.SIGCONT)
+        until(lambda: not side.sources())
+        before = len(client.sizes)
+        until(lambda: len(client.sizes) > before + 10)
+        assert client.errors == []
+        assert reported[:2] == ["rear: pipeline built", "rear: source: the stream ended"]
 
 
 def test_a_camera_that_is_off_is_still_monitored():

@@ -14,7 +14,7 @@ from statistics import median
 
 import pytest
 
-from rig import SMALL_ROBOT, free_port, until
+from rig import SMALL_ROBOT, STREAM_END_SIGNALS, count_handlers, free_port, rtp_session, until
 from runner.core.commands import Command
 from runner.errors import RunError
 
@@ -106,11 +106,9 @@ def test_the_end_of_a_stream_is_handled_here_and_not_by_the_client():
         more()
         pipeline, elements = side._receivers["front"]._supervised._pipeline, []
         pipeline.get_bus().connect("message::eos", lambda *_: elements.append("ended"))
-        number, ssrc = map(int, pipeline.get_by_name("client").srcpads[0].get_name().split("_")[3:5])
-        session = pipeline.get_by_name("manager").emit("get-internal-session", number)
+        session, ssrc = rtp_session(pipeline.get_by_name("client"))
         sources = {source.props.ssrc: source for source in session.props.sources}
-        names = ("on-bye-ssrc", "on-bye-timeout", "on-timeout")
-        assert {name: count_handlers(session, name) for name in names} == dict.fromkeys(names, 2)
+        assert [count_handlers(session, name) for name in STREAM_END_SIGNALS] == [2, 2, 2]
         session.emit("on-timeout", sources[ssrc])  # frames arrive
         for other in sources.keys() - {ssrc}:  # the receiver's own, and one of retransmitted packets
             session.emit("on-bye-ssrc", sources[other])
@@ -121,20 +119,6 @@ def test_the_end_of_a_stream_is_handled_here_and_not_by_the_client():
         more()
         assert any("the stream ended" in what for what in messages)
         assert elements == []
-
-
-def count_handlers(session, name):
-    """Those of rtpsession and of the receiver."""
-    from gi.repository import GObject
-
-    kind, blocked = GObject.signal_lookup(name, session), []
-    match = GObject.SignalMatchType.ID | GObject.SignalMatchType.UNBLOCKED
-    while handler := GObject.signal_handler_find(session, match, kind, 0, None, None, None):
-        GObject.signal_handler_block(session, handler)
-        blocked.append(handler)
-    for handler in blocked:
-        GObject.signal_handler_unblock(session, handler)
-    return len(blocked)
 
 
 def test_packets_of_other_senders_are_dropped_and_counted():

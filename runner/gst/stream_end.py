@@ -1,0 +1,66 @@
+"""The end of a stream received over RTSP, handled here: rtspsrc's own handlers may deadlock (GStreamer 1.22)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from weakref import WeakMethod
+
+from gi.repository import GObject, Gst
+
+STREAM_ENDED = "the stream ended"
+BYE = "on-bye-ssrc"  # signals of an RTP session (RFC 3550, section 6.6)
+SILENT = ("on-bye-timeout", "on-timeout")
+
+
+def is_rtsp_client(element: Gst.Element) -> bool:
+    return bool(GObject.signal_lookup("select-stream", element))
+
+
+def handle_stream_end(client: Gst.Element, on_gone: Callable[[Gst.Element, bool], None]) -> None:
+    """Replace the handlers by which an RTSP client ends a stream.
+
+    They end its elements, in a thread in which one of them streams. If the connection fails at the same time, another
+    thread ends the same elements, and both wait for each other.
+
+    on_gone  method of the owner, which it does not keep alive; called in a streaming thread with the client, and
+             whether the source of the stream has ended it (BYE) or is only silent
+    """
+    client.connect("pad-added", _on_stream, WeakMethod(on_gone))
+
+
+def _on_stream(client: Gst.Element, pad: Gst.Pad, on_gone: WeakMethod[Callable[[Gst.Element, bool], None]]) -> None:
+    numbers = re.match(r"recv_rtp_src_(\d+)_(\d+)_", pad.get_name())
+    if not numbers:  # a stream without RTP
+        return
+    session = client.get_by_name("manager").emit("get-internal-session", int(numbers[1]))
+    for name in (BYE, *SILENT):
+        _disconnect_second(session, name)
+        session.connect(name, _on_source_gone, on_gone, client, int(numbers[2]), name == BYE)
+
+
+def _on_source_gone(
+    _session: GObject.Object,
+    source: GObject.Object,
+    on_gone: WeakMethod[Callable[[Gst.Element, bool], None]],
+    client: Gst.Element,
+    ssrc: int,
+    is_bye: bool,
+) -> None:
+    method = on_gone()
+    if method and source.props.ssrc == ssrc:  # not the receiver's own, nor one of retransmitted packets
+        method(client, is_bye)
+
+
+def _disconnect_second(session: GObject.Object, signal: str) -> None:
+    """Disconnect the second handler of a signal of an RTP session, which is the client's; the first is rtpsession's."""
+    kind = GObject.signal_lookup(signal, session)
+    own = _handler(session, kind, GObject.SignalMatchType.ID)
+    GObject.signal_handler_block(session, own)
+    if other := _handler(session, kind, GObject.SignalMatchType.ID | GObject.SignalMatchType.UNBLOCKED):
+        GObject.signal_handler_disconnect(session, other)
+    GObject.signal_handler_unblock(session, own)
+
+
+def _handler(session: GObject.Object, kind: int, match: GObject.SignalMatchType) -> int:
+    return int(GObject.signal_handler_find(session, match, kind, 0, None, None, None))
