@@ -6,9 +6,14 @@ A V4L2 camera is a device of v4l2loopback; without that in the kernel, only othe
 from __future__ import annotations
 
 import itertools
+import json
+import re
+import subprocess
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
+import yaml
 
 from rig import CHECKOUT, free_port, ip_camera, process, streaming, until, watching
 from runner.configuration.config import configuration
@@ -126,6 +131,50 @@ def test_a_v4l2_device_is_streamed_with_the_times_of_its_driver():
         writer.set_state(Gst.State.NULL)
     assert all(earlier < later for earlier, later in itertools.pairwise(captured))
     assert len({later - earlier for earlier, later in itertools.pairwise(captured)}) > 1  # not rounded to a rate
+
+
+def test_a_camera_that_is_unplugged_comes_back_when_it_is_plugged_in_again(tmp_path):
+    """Shared memory stands in for the device: it fails like one that is unplugged, and cannot be opened for a while."""
+    socket = tmp_path / "device"
+    elements = yaml.safe_load((CHECKOUT / "conf/source/v4l2.yaml").read_text())["elements"]
+    properties = {"socket-path": str(socket), "is-live": True, "do-timestamp": True}
+    elements[0] = {"name": "source", "element": "shmsrc", "properties": properties}
+    flow = re.sub(r'"([\w-]+)": ', r"\1: ", json.dumps(elements))  # Hydra does not quote keys
+    capture = f"+cameras.{CAMERA}.capture={{format: I420, width: 640, height: 360, fps: 15}}"
+    words = (*V4L2, f"source.elements={flow}", capture)
+    with ExitStack() as until_unplugged:
+        until_unplugged.enter_context(plugged_in(socket))
+        with streaming(*words) as (side, _, (plan,), reported), watching(plan) as client:
+            turn(side, sending=True, size=(480, 260), bitrate=500)
+            until(lambda: len(client.sizes) > 10)
+            until_unplugged.close()
+            until(side.sources)
+            with plugged_in(socket):
+                until(lambda: not side.sources())
+                before = len(client.sizes)
+                until(lambda: len(client.sizes) > before + 10)
+                assert client.errors == []
+                messages = [line.removeprefix(f"{CAMERA}: ") for line in reported]
+    assert messages[0] == "pipeline built"  # once: viewers stay
+    assert messages[1].startswith("source: ")
+    assert messages[-1].startswith("works again after ")
+    assert not any("built" in message for message in messages[1:])
+
+
+@contextmanager
+def plugged_in(socket):
+    """A process that sends pictures through shared memory until the end of the context, where it is killed."""
+    caps = "video/x-raw,format=I420,width=640,height=360,framerate=15/1"
+    sink = f"shmsink socket-path={socket} shm-size=20000000 wait-for-connection=false"
+    command = ["gst-launch-1.0", "-q", *f"videotestsrc is-live=true pattern=ball ! {caps} ! {sink}".split()]
+    with subprocess.Popen(command) as writer:
+        try:
+            until(socket.exists)
+            yield
+        finally:
+            writer.kill()
+            writer.wait()
+            socket.unlink()
 
 
 def noted(times, time):
