@@ -14,6 +14,7 @@ from runner.gst.arriving import CAPTURE_ID
 from runner.gst.knobs import KnobPanel
 from runner.gst.probes import BufferProbe, PassingBuffer, TypeProbe
 from runner.gst.repeats import RepeatDetector
+from runner.gst.requests import RequestLimit
 from runner.gst.sender_stages import EncoderWatch, SenderStages
 from runner.gst.source import loop_clip
 from runner.gst.watched import WatchedSource
@@ -41,7 +42,8 @@ class CameraPipeline:
     on_report  called, from a streaming thread, with a fault of the source, and on its recovery
     source     the source, if it is watched
 
-    `untimed` is whether the source does not know when the last picture was captured.
+    `untimed` is whether the source does not know when the last picture was captured, `requests` limits what viewers
+    request.
     """
 
     def __init__(
@@ -71,6 +73,7 @@ class CameraPipeline:
         last = next(pad for element in reversed(self._elements) if (pad := element.get_static_pad("src")))
         self._add_capture_time(last.get_parent_element())
         self.knobs.set_now(self._allowed(self._first))
+        self.requests = RequestLimit(last, on_report)
         self._first_packet = BufferProbe(last, self._on_first_packet, in_lists=True)
         self._first_packet.arm()
         _NOT_SEEKABLE.add_to(last)

@@ -62,6 +62,8 @@ _add_probe = _function("gst_pad_add_probe", c_ulong, c_void_p, c_uint, _Callback
 _get_size = _function("gst_buffer_get_size", c_size_t, c_void_p)
 _extract = _function("gst_buffer_extract", c_size_t, c_void_p, c_size_t, c_char_p, c_size_t)
 _get_reference = _function("gst_buffer_get_reference_timestamp_meta", POINTER(_ReferenceTimestamp), c_void_p, c_void_p)
+_get_structure = _function("gst_event_get_structure", c_void_p, c_void_p)
+_get_name = _function("gst_structure_get_name", c_char_p, c_void_p)
 _pointer = ctypes.pythonapi.PyCapsule_GetPointer
 _pointer.restype, _pointer.argtypes = c_void_p, (ctypes.py_object, c_char_p)
 
@@ -209,6 +211,27 @@ class EventProbe(_Probe):
         return Gst.PadProbeReturn.DROP if dropped else Gst.PadProbeReturn.OK
 
 
+class RequestProbe(_Probe):
+    """Asks a method of its owner, which it does not keep alive, whether a custom event may go upstream.
+
+    name        of the events; others pass
+    is_granted  called in a streaming thread for each
+    """
+
+    def __init__(self, name: str, is_granted: Callable[[], bool]) -> None:
+        super().__init__(Gst.PadProbeType.EVENT_UPSTREAM)
+        self._name, self._is_granted = name.encode(), WeakMethod(is_granted)
+
+    def handle(self, address: int | None) -> Gst.PadProbeReturn:
+        assert address
+        is_granted = self._is_granted()
+        if is_granted is None or _Typed.from_address(address).type != _CUSTOM_UPSTREAM:
+            return Gst.PadProbeReturn.OK
+        dropped = _get_name(_get_structure(address)) == self._name and not is_granted()
+        return Gst.PadProbeReturn.DROP if dropped else Gst.PadProbeReturn.OK
+
+
+_CUSTOM_UPSTREAM = int(Gst.EventType.CUSTOM_UPSTREAM)
 _keys = itertools.count(1)
 _probes: WeakValueDictionary[int, _Probe] = WeakValueDictionary()
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import resource
 import threading
 import time
+import weakref
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
@@ -223,11 +224,11 @@ class CameraServer:
     def _on_configure(self, _factory: object, media: GstRtspServer.RTSPMedia, camera: _Camera) -> None:
         element = media.get_element()
         pipeline = element.get_parent()
-        pipeline.connect("deep-element-added", _on_element)
         bus = pipeline.get_bus()
         bus.enable_sync_message_emission()  # the library watches the bus itself and reports nothing
         bus.connect("sync-message::error", self._on_error, camera)
         built = self._build(element, camera.plan)
+        pipeline.connect("deep-element-added", _on_element, weakref.ref(built))
         with self._changed:
             camera.media, camera.bus, camera.stage, camera.prepared = media, bus, _Stage.BUILT, False
             self.pipelines[camera.name] = built
@@ -718,15 +719,19 @@ def _user_agent(context: GstRtspServer.RTSPContext) -> str | None:
     return agent
 
 
-def _on_element(pipeline: Gst.Bin, parent: Gst.Bin, element: Gst.Element) -> None:
+def _on_element(pipeline: Gst.Bin, parent: Gst.Bin, element: Gst.Element, built: weakref.ref[CameraPipeline]) -> None:
     """Configure the elements that the server library adds around a pipeline."""
-    if parent is pipeline and element.get_factory().get_name() == "queue":
+    factory = element.get_factory().get_name() if element.get_factory() else ""
+    if parent is pipeline and factory == "queue":
         # In front of its sinks, if it has several: a sink that accepts nothing must not block the others. Not limited
         # by time: the first packet after a pause would seem as old as the pause, and be dropped for the second.
         element.set_property("leaky", "downstream")
         element.set_property("max-size-buffers", 0)
         element.set_property("max-size-time", 0)
         element.set_property("max-size-bytes", QUEUE_BYTES)
+    camera = built()
+    if camera and factory == "rtprtxsend":
+        camera.requests.add_store(element)
     if element.find_property("processing-deadline"):
         # Sinks of a live pipeline hold packets until their time: pure latency, and retransmissions wait behind them.
         element.set_property("sync", False)

@@ -6,8 +6,10 @@ import re
 import select
 import socket
 import ssl
+import struct
 import threading
 import time
+from collections import Counter
 from contextlib import suppress
 from hashlib import md5
 from itertools import pairwise
@@ -61,7 +63,7 @@ def client_hello(keys: Path) -> bytes:
 
 
 class RtspClient:
-    """One connection; packets are kept as (time, sequence number, marker).
+    """One connection; packets are kept as (time, sequence number, marker), and their number by source (SSRC).
 
     at      address to connect to instead of the URL's
     source  address to connect from
@@ -97,6 +99,7 @@ class RtspClient:
         self.session, self.head, self.body = "", "", ""
         self._sequence, self._buffer = 0, b""
         self.packets: list[tuple[float, int, bool]] = []
+        self.sources: Counter[int] = Counter()
         self._rtp: list[socket.socket] = []
         self._thread: threading.Thread | None = None
         self.delay_s = 0.0  # between two reads
@@ -127,12 +130,12 @@ class RtspClient:
         with self._lock:
             self.tcp.sendall("\r\n".join([*lines, "", ""]).encode())
 
-    def open(self, *, udp: bool = False, **play: object) -> list[int]:
-        """Status codes of DESCRIBE, SETUP and PLAY, up to the first failure."""
+    def open(self, *, udp: bool = False, feedback: bool = False, **play: object) -> list[int]:
+        """Status codes of DESCRIBE, SETUP and PLAY, up to the first failure; with a profile for feedback (RFC 4585)."""
         codes = [self.ask("DESCRIBE", Accept="application/sdp")]
         base = re.search(r"Content-Base: (\S+?)/*\r", self.head)
         if codes == [200]:
-            codes.append(self.ask("SETUP", f"{base[1]}/stream=0", Transport=self._transport(udp)))  # type: ignore[index]
+            codes.append(self.ask("SETUP", f"{base[1]}/stream=0", Transport=self._transport(udp, feedback)))  # type: ignore[index]
         if codes == [200, 200]:
             codes.append(self.ask("PLAY", **play))
         return codes
@@ -149,6 +152,13 @@ class RtspClient:
     @property
     def server_port(self) -> int:
         return int(re.search(r"server_port=(\d+)", self._setup)[1])  # type: ignore[index]
+
+    def send_feedback(self, kind: int, form: int, ssrc: int, content: bytes = b"") -> None:
+        """Send an RTCP feedback message about a source (RFC 4585, section 6.1) behind an empty receiver report."""
+        own = 1
+        report = struct.pack(">BBHI", 0x80, 201, 1, own)
+        message = struct.pack(">BBHII", 0x80 | form, kind, 2 + len(content) // 4, own, ssrc) + content
+        self._rtp[1].sendto(report + message, (self.tcp.getpeername()[0], self.server_port + 1))
 
     @property
     def lost(self) -> int:
@@ -187,8 +197,8 @@ class RtspClient:
     def __exit__(self, *_: Any) -> None:
         self.close()
 
-    def _transport(self, udp: bool) -> str:
-        profile = "RTP/SAVP" if self._login else "RTP/AVP"
+    def _transport(self, udp: bool, feedback: bool) -> str:
+        profile = ("RTP/SAVP" if self._login else "RTP/AVP") + ("F" if feedback else "")
         if not udp:
             return f"{profile}/TCP;unicast;interleaved=0-1"
         for _ in range(2):
@@ -246,7 +256,10 @@ class RtspClient:
             self._keep(data)
 
     def _keep(self, data: bytes) -> None:
-        self.packets.append((time.monotonic(), int.from_bytes(data[2:4], "big"), bool(data[1] & 0x80)))
+        source = int.from_bytes(data[8:12], "big")
+        self.sources[source] += 1
+        if source == next(iter(self.sources)):  # and not of packets sent again, which follow
+            self.packets.append((time.monotonic(), int.from_bytes(data[2:4], "big"), bool(data[1] & 0x80)))
 
     def _read_tcp(self) -> None:
         try:

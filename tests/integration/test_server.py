@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import gc
+import itertools
 import socket
+import struct
 import subprocess
 import threading
 import time
@@ -15,6 +17,7 @@ from rig import SMALL_FRONT, streaming, until
 from rtsp_client import RtspClient
 from runner.core.commands import Command
 from runner.gst import GLib, Gst
+from runner.gst.requests import AT_ONCE, KEY_UNIT_S, REPEATED
 from runner.gst.server import CameraServer
 from runner.gst.viewers import user_agent
 
@@ -611,6 +614,49 @@ def test_an_ended_pipeline_leaves_no_watched_source():
                 assert _alive("WatchedSource") == 1
             until(lambda n=number: vehicle.reported.count(f"{SMALL_CAMERA}: pipeline stopped") == n)
             until(lambda: _alive("WatchedSource") == 0)
+
+
+def test_a_viewer_that_requests_everything_again_gets_a_quarter_of_it():
+    with serving() as vehicle, RtspClient(vehicle.url(CAMERA)) as viewer:
+        assert viewer.open(udp=True, feedback=True) == [200, 200, 200]
+        viewer.read()
+        until(lambda: viewer.sources)
+        (own,) = viewer.sources
+
+        def request_again():
+            newest = viewer.packets[-1][1]
+            lost = b"".join(struct.pack(">HH", (newest - 17 * k) % 65536, 0xFFFF) for k in range(8))
+            viewer.send_feedback(205, 1, own, lost)
+            return viewer.sources[own] > 300
+
+        until(request_again)
+        repeated = sum(viewer.sources.values()) - viewer.sources[own]
+        assert 0 < repeated <= AT_ONCE + REPEATED * (viewer.sources[own] + 10)
+        limited = "viewers request more than 25 % of the packets again; further requests are ignored"
+        assert vehicle.reported == [f"{CAMERA}: pipeline built", f"{CAMERA}: {limited}"]
+
+
+def test_requests_for_key_frames_reach_the_encoder_once_a_second():
+    from runner.gst import Gst
+
+    granted = []
+
+    def note(_pad, info):
+        structure = info.get_event().get_structure()
+        if structure and structure.get_name() == "GstForceKeyUnit":
+            granted.append(time.monotonic())
+        return Gst.PadProbeReturn.OK
+
+    with serving() as vehicle, RtspClient(vehicle.url(CAMERA)) as viewer:
+        assert viewer.open(udp=True, feedback=True) == [200, 200, 200]
+        viewer.read()
+        until(lambda: viewer.sources)
+        (own,) = viewer.sources
+        encoder = vehicle.side._pipeline(CAMERA)._pipeline.get_by_name("encoder")
+        encoder.get_static_pad("src").add_probe(Gst.PadProbeType.EVENT_UPSTREAM, note)
+        requests = itertools.count()
+        until(lambda: viewer.send_feedback(206, 1, own) or (next(requests) > 50 and len(granted) == 3))
+    assert all(later - earlier >= KEY_UNIT_S for earlier, later in itertools.pairwise(granted))
 
 
 @pytest.mark.parametrize(
