@@ -206,7 +206,7 @@ def boxes(page):
     return page.evaluate(BOXES)
 
 
-SCREENS = ((1280, 720), (1920, 1080), (2560, 1440), (3840, 2160), (1024, 768))
+SCREENS = ((1280, 720), (1920, 1080), (2560, 1440), (3840, 2160), (1024, 768), (768, 1024))
 
 
 def sized(page, width, height):

@@ -24,7 +24,7 @@ export const STALE = [...SILENT, "frozen"]; // the displayed picture is older th
 const THIN = "\u2009"; // space
 const NO_AGE = { age_ms: undefined, bound_ms: undefined };
 const UNCERTAIN_MS = 20; // a latency with a larger error bound is marked
-const HEAD = 28; // header and border of a tile, as in the style sheet
+const BORDERS = 2; // of a tile, as in the style sheet
 
 const { canShowVideo } = globalThis.boot;
 const area = byId("tiles");
@@ -80,8 +80,8 @@ function groupTiles() {
 function chromeHeight() {
   if (store.view === "monitor") return 0;
   const style = getComputedStyle(document.documentElement);
-  const [scale, below] = ["--text-scale", "--caption"].map((name) => parseFloat(style.getPropertyValue(name)));
-  return (HEAD + below) * scale;
+  const [scale, head, caption] = ["--text-scale", "--head", "--caption"].map((name) => parseFloat(style.getPropertyValue(name)));
+  return (BORDERS + head + caption) * scale;
 }
 
 function showNoVideo() {
