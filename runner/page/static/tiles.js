@@ -80,8 +80,8 @@ function groupTiles() {
 function chromeHeight() {
   if (store.view === "monitor") return 0;
   const style = getComputedStyle(document.documentElement);
-  const [scale, head, caption] = ["--text-scale", "--head", "--caption"].map((name) => parseFloat(style.getPropertyValue(name)));
-  return (BORDERS + head + caption) * scale;
+  const [scale, head, below] = ["--text-scale", "--head", "--caption"].map((name) => parseFloat(style.getPropertyValue(name)));
+  return (BORDERS + head + below) * scale;
 }
 
 function showNoVideo() {
