@@ -51,16 +51,15 @@ def test_lines_end_at_the_marks_on_the_ground(page):
     assert not guides(page, "fisheye"), "not calibrated"
     page.locator("body").press("g")
     until(lambda: guides(page, "fisheye"))
-    page.add_style_tag(content=".tile .head, .drawn-off canvas.guides { visibility: hidden; }")
+    page.add_style_tag(content=".tile .head { visibility: hidden; }")
     apart = {}
     for name, camera in CAMERAS.items():
         if name in ("mirrored", "fisheye"):
             enlarge(page, name)
         on, lines = seen(page, name)
         shot(page, f"guides-{name}")
-        page.evaluate("document.body.classList.add('drawn-off')")
-        off, _ = seen(page, name)
-        page.evaluate("document.body.classList.remove('drawn-off')")
+        with without_guides(page):
+            off, _ = seen(page, name, guided=False)
         ends = ends_of(lines, camera.ends)
         for key, end in ends.items():
             mark = found(off, end, [other for other in ends.values() if other is not end])
@@ -79,11 +78,11 @@ def test_lines_match_marks_in_a_straightened_fisheye_which_accepts_no_region(pag
     until(lambda: page.inner_text("[data-camera=fisheye] .shown") == "straight, 100° of 130°")
     until(lambda: scale_of(page, "fisheye", CAMERAS["fisheye"]) > 1)
     until(lambda: page.evaluate("tod.measure()")["cameras"]["fisheye"]["straight"])
-    page.add_style_tag(content=".tile .head, .drawn-off canvas.guides { visibility: hidden; }")
+    page.add_style_tag(content=".tile .head { visibility: hidden; }")
     on, lines = seen(page, "fisheye")
     shot(page, "straight")
-    page.evaluate("document.body.classList.add('drawn-off')")
-    off, _ = seen(page, "fisheye")
+    with without_guides(page):
+        off, _ = seen(page, "fisheye", guided=False)
     scale, ends = scale_of(page, "fisheye", CAMERAS["fisheye"]), ends_of(lines, CAMERAS["fisheye"].ends)
     marks = {key: found(off, end, [other for other in ends.values() if other is not end]) for key, end in ends.items()}
     apart = {key: round(math.dist(mark, ends[key]) / scale, 2) for key, mark in marks.items()}
@@ -197,13 +196,24 @@ def drag(page, begin, end, button="left"):
     page.mouse.up(button=button)
 
 
-def seen(page, name):
-    """Luma of a camera's box on the screen while its picture is live, and its guides."""
+def seen(page, name, guided=True):
+    """Luma of a camera's box on the screen while its picture is live, and its guides, shown or not."""
 
     def live():
-        return page.evaluate("tod.measure()")["cameras"][name]["status"] == "live" and guides(page, name)
+        is_live = page.evaluate("tod.measure()")["cameras"][name]["status"] == "live"
+        lines = guides(page, name)
+        return (lines if guided else not lines) if is_live else None
 
     return on_screen(page.locator(f"[data-camera={name}] .picture"), live)
+
+
+@contextmanager
+def without_guides(page):
+    """The pictures alone: guides are a part of them."""
+    names = [name for name in CAMERAS if guides(page, name)]
+    page.evaluate("boot.worker.postMessage({order: 'guided', names: []})")
+    yield
+    page.evaluate("names => boot.worker.postMessage({order: 'guided', names})", names)
 
 
 def scale_of(page, name, camera):
@@ -239,15 +249,16 @@ def test_the_path_follows_the_steering_and_disappears_with_it(page, served):
 
 
 def test_the_path_passes_the_marks_where_the_wheels_will_go(page, served):
-    page.add_style_tag(content=".tile .head, canvas.guides { visibility: hidden; }")
+    page.add_style_tag(content=".tile .head { visibility: hidden; }")
 
     def paths():
         return [line["pieces"][0] for line in guides(page, "scaled") if line["kind"] == "path" and line["pieces"]]
 
     with steering(served, STEERED_RAD):
         until(lambda: len(paths()) == 2)
-        picture, _ = seen(page, "scaled")
         points = [paths()[-side][-1 - before] for before, side, _ in STEERED]
+        with without_guides(page):
+            picture, _ = seen(page, "scaled", guided=False)
     drawn = [(point["x"], point["y"]) for point in points]
     marks = [found(picture, each, [other for other in drawn if other is not each]) for each in drawn]
     scale = scale_of(page, "scaled", CAMERAS["scaled"])

@@ -121,7 +121,6 @@ export function toggleGuides() {
 function refreshGuides() {
   const cameras = placedCameras();
   const guided = store.view !== "configure" ? cameras.filter((camera) => isGuided(camera, guidesChoice())).map(({ name }) => name) : [];
-  for (const canvas of document.querySelectorAll("canvas.guides")) canvas.toggleAttribute("hidden", !guided.includes(canvas.getAttribute("data-guides") ?? ""));
   showGuides(guided);
   byId("guides").hidden = !cameras.length;
   const isPartial = guidesChoice() === "calibrated" && guided.length < cameras.length;

@@ -4,10 +4,11 @@
  */
 
 import { groundOf, groundPlacement, latticeOf, outline, sharesOf, sightOf, trianglesOf } from "./ground.js";
-import { clearTo, COLOURS, ESTIMATED, labelPicture, STEERING_STEP_RAD } from "./guide_layer.js";
+import { COLOURS, ESTIMATED, labelPicture, STEERING_STEP_RAD } from "./guide_lines.js";
 import { pathGuides } from "./guides.js";
 import { AMBER, frame, RED } from "./overlay.js";
 import { RemoteWarp, UNANSWERED } from "./remote_warp.js";
+import { resize } from "./resizing.js";
 import { MOVING, STALLED } from "./status.js";
 
 const DISTANCES_M = [1, 2, 5]; // from the vehicle
@@ -303,4 +304,15 @@ function boxOf({ rear, front, right, left }, laid) {
 function coverWith(context, { width, height }) {
   context.fillStyle = "#000";
   context.fillRect(0, 0, width, height);
+}
+
+/**
+ * Clear a canvas that has the size of its box.
+ * @param {OffscreenCanvasRenderingContext2D} context  @param {{width: number, height: number, ratio: number}} display
+ * @returns {boolean} whether it has; if not, it will be drawn later
+ */
+function clearTo(context, { width, height, ratio }) {
+  const isResized = resize(context.canvas, { width: Math.round(width * ratio), height: Math.round(height * ratio) });
+  if (isResized) context.reset();
+  return isResized;
 }

@@ -81,13 +81,6 @@ export function transferCanvas(name, element) {
 /** State whether the operator can see this page; the worker reports it to the station. @param {string} state */
 export const reportAttention = (state) => worker.postMessage({ order: "attention", state });
 
-/** Transfer the canvas of a camera's guides to the worker. */
-export function transferGuides(name, element) {
-  if (!canShowVideo) return;
-  const canvas = element.transferControlToOffscreen();
-  worker.postMessage({ order: "guides", name, canvas }, [canvas]);
-}
-
 /** @param {string[]} names of the cameras whose guides are shown */
 export const showGuides = (names) => worker.postMessage({ order: "guided", names });
 

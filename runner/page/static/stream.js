@@ -2,11 +2,11 @@
 
 import { codecOf, isKnown, nameOf, spsOf } from "./codec.js";
 import { now } from "./clock.js";
-import { placement, visible, WHOLE } from "./framing.js";
+import { imageToBox, placement, visible, WHOLE } from "./framing.js";
 import { elapsed, read } from "./counter.js";
 import { Pace } from "./pace.js";
 import { paintImage, pictureOf } from "./picture.js";
-import { ESTIMATED, GuideLayer, labelPicture } from "./guide_layer.js";
+import { ESTIMATED, GuideLines, labelPicture } from "./guide_lines.js";
 import { resize } from "./resizing.js";
 import { alarmText, frozenAfter, INTERVALS, judge, MOVING, STALLED } from "./status.js";
 import { drawOverlay, readably } from "./overlay.js";
@@ -94,7 +94,7 @@ export class Stream {
     this.mark = ""; // the mark that the canvas shows
     this.last_drawn = 0; // page time
     this.late_age = NaN; // of the last late picture
-    this.guides = camera.pose && station.dimensions ? new GuideLayer(camera, station.dimensions) : null;
+    this.guides = camera.pose && station.dimensions ? new GuideLines(camera, station.dimensions) : null;
     this.full = { x: 0, y: 0, width: camera.width, height: camera.height };
     /** @type {import("./framing.js").Rectangle|null} */
     this.region = null; // the part of the full image that pictures show; null: unknown, or about to change
@@ -355,7 +355,6 @@ export class Stream {
     if (!this.isOnlyInBirdseye) this.checkAge(next.meta, now());
     this.status = judge(this.times(), this.station.limits, now());
     this.paint(now());
-    this.drawGuides();
     if (!this.isOnlyInBirdseye) this.recordStages(next.meta, now());
     if (this.station.keep) this.first ??= this.picture();
     if (this.station.counted === this.name) this.readCounter(next);
@@ -364,28 +363,38 @@ export class Stream {
   /** Show or hide the guides of this camera. */
   showGuides(shown) {
     if (!this.guides) return;
+    if (this.guides.shown === shown) return;
     this.guides.shown = shown;
-    if (this.straight) this.painted_text = null; // repaint, since both have the label
-    this.drawGuides();
+    if (this.shown) this.paint(now());
   }
 
-  /** Draw the guides of the displayed picture; none over a stalled one, since nobody may steer by it. */
-  drawGuides() {
+  /** Draw the guides over the picture in the canvas; none over a stalled one, since nobody may steer by it. */
+  drawGuides(context, canvas) {
     const { guides, shown } = this;
-    if (!guides) return;
-    const drawn = MOVING.includes(this.status) ? this.drawnRegion() : null;
-    guides.draw(this.display, shown && drawn && { ...drawn, rad: this.station.steering.angleAt(shown.meta.captured) });
+    const region = MOVING.includes(this.status) ? this.drawnRegion() : null;
+    const area = this.visibleArea(canvas);
+    const css = (canvas.width * this.display.ratio) / (this.widthOnScreen(canvas) || canvas.width);
+    const { mirrored } = this.display.view;
+    guides?.draw(context, shown && region && { region, rad: this.station.steering.angleAt(shown.meta.captured), area, css, mirrored });
   }
 
-  /** The region in the canvas, of the image that the guides are made for, and its size; null: unknown. */
+  /** The region in the canvas, of the image that the guides are made for; null: unknown. */
   drawnRegion() {
-    const { shown, expected, canvas } = this;
+    const { shown, expected } = this;
     const region = this.shownRegion();
     if (!shown || !region) return null;
-    if (this.straight) return canvas && shown.image ? { picture: { width: canvas.width, height: canvas.height }, region: this.full } : null;
+    if (this.straight) return shown.image ? this.full : null;
     const { width, height } = shown.picture;
     const fits = expected && width === expected.width && height === expected.height && this.capturedAt(shown.meta) >= this.size_since;
-    return fits ? { picture: { width, height }, region } : null;
+    return fits ? region : null;
+  }
+
+  /** For tests: the guides that are drawn, in CSS px of the picture's box. */
+  guideLines() {
+    const { canvas, guides, display } = this;
+    if (!canvas || !guides) return undefined;
+    const toBox = imageToBox(display, canvas, display.view, { x: 0, y: 0, width: canvas.width, height: canvas.height });
+    return guides.drawn.map((line) => ({ ...line, pieces: line.pieces.map((piece) => piece.map(toBox)) }));
   }
 
   /** Show the picture straightened, or the original. */
@@ -487,7 +496,6 @@ export class Stream {
     if (!WAITING.includes(this.status)) this.waits_since = time;
     const text = this.overlayText(time);
     if (this.context && text !== this.painted_text) this.paint(time);
-    if (!MOVING.includes(this.status)) this.drawGuides();
     const changed = this.status !== this.reported;
     this.reported = this.status;
     return changed;
@@ -496,7 +504,6 @@ export class Stream {
   /** Draw what waits for a canvas of another size. */
   drawResized() {
     if (this.isResizeDue) this.paint(now());
-    this.drawGuides();
   }
 
   overlayText(time) {
@@ -518,6 +525,7 @@ export class Stream {
     this.resizeCanvas(canvas, STALLED.includes(this.status));
     if (this.shown && this.status !== "off" && this.status !== "unsupported") this.paintPicture(context, this.shown);
     else blank(context);
+    this.drawGuides(context, canvas);
     this.labelEstimate(context, canvas);
     if (text) drawOverlay(context, this.visibleArea(canvas), this.display.view.mirrored, this.status, text);
     this.painted_text = text;
@@ -548,13 +556,15 @@ export class Stream {
 
   /**
    * The canvas has the picture's size. For a lasting alarm it is an integer multiple of it, close to the size on the
-   * screen, so that words are sharp while the aspect ratio, and with it the page's layout, stays the same.
+   * screen, so that words are sharp while the aspect ratio, and with it the page's layout, stays the same; for guides one
+   * that is at most as large, which costs less.
    */
   resizeCanvas(canvas, sharp) {
     const { width: wide, height: high, ratio } = this.display;
     const box = { width: Math.round(wide * ratio) || 480, height: Math.round(high * ratio) || 270 };
     const own = this.straight ? (this.shown?.image ?? this.straightSize()) : (this.shown?.picture.painted ?? box);
-    const times = sharp ? Math.min(6, Math.max(1, Math.ceil(this.widthOnScreen(own) / own.width))) : 1;
+    const scale = this.widthOnScreen(own) / own.width;
+    const times = Math.min(6, Math.max(1, sharp ? Math.ceil(scale) : this.guides?.shown ? Math.floor(scale) : 1));
     const width = own.width * times;
     const height = own.height * times;
     if (this.isFresh) Object.assign(canvas, { width, height }); // nothing is shown yet

@@ -1,7 +1,7 @@
 /** The tiles: one per camera, with its status, its picture and the values of its stream. */
 
 import { camera, decisionOf, enlarge, inControl, listen, publish, select, store } from "./store.js";
-import { drawFirst, reportSize, transferCanvas, transferGuides } from "./link.js";
+import { drawFirst, reportSize, transferCanvas } from "./link.js";
 import { pending, request, whyNoControl } from "./requests.js";
 import { dragRegion, shownRegion } from "./roi.js";
 import { RegionFrame, showsPart } from "./region_frame.js";
@@ -89,7 +89,7 @@ function showNoVideo() {
   area.before(make("p", { class: "no-video", role: "alert" }, text));
 }
 
-function buildTile({ name, pose }) {
+function buildTile({ name }) {
   const canvas = make("canvas", { "data-name": name, role: "img", "aria-label": `picture of ${displayName(name)}` });
   const parts = {
     view: WHOLE,
@@ -118,11 +118,6 @@ function buildTile({ name, pose }) {
   parts.on.addEventListener("dblclick", (event) => event.stopPropagation());
   tiles.set(name, { element, reason, refused, ...parts });
   transferCanvas(name, canvas);
-  if (pose) {
-    const guides = make("canvas", { class: "guides", "data-guides": name, "aria-hidden": "true" });
-    canvas.after(guides);
-    transferGuides(name, guides);
-  }
   dragRegion(name, parts.box, () => tiles.get(name).view);
   zoomRegion(name, parts.box, () => tiles.get(name).view);
   sizes.observe(parts.box);

@@ -19,7 +19,7 @@ import "./codec.js";
 import "./counter.js";
 import "./framing.js";
 import "./ground.js";
-import "./guide_layer.js";
+import "./guide_lines.js";
 import "./guides.js";
 import "./pace.js";
 import "./projection.js";
@@ -269,7 +269,6 @@ const orders = {
     setInterval(() => send({ clock: now() }), 1000);
   },
   canvas: ({ name, canvas }) => find(name)?.attach(canvas),
-  guides: ({ name, canvas }) => find(name)?.guides?.attach(canvas),
   guided({ names }) {
     guided = names;
     applyGuides();
@@ -294,11 +293,10 @@ const orders = {
     const stream = find(name);
     if (!stream) return;
     Object.assign(stream, { display, painted_text: null });
-    stream.drawGuides(); // the picture follows its box at once
   },
   send: ({ message }) => toPage({ kind: "sent", id: message.id, sent: send(message) }),
   async ask({ id, what, name }) {
-    const questions = { measure, guides: () => find(name)?.guides?.lines, ground: () => ground.measure(), stages: allStages, picture: () => find(name)?.picture(), first: () => find(name)?.first };
+    const questions = { measure, guides: () => find(name)?.guideLines(), ground: () => ground.measure(), stages: allStages, picture: () => find(name)?.picture(), first: () => find(name)?.first };
     toPage({ kind: "answer", id, value: await questions[what]() });
   },
 };

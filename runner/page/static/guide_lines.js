@@ -1,0 +1,157 @@
+/**
+ * The guides of one camera, drawn by the worker into its picture. In a canvas of their own above each picture, the browser would
+ * copy and blend twice as many canvases: without a GPU that takes longer than the lines.
+ */
+
+import { readably } from "./overlay.js";
+import { imageOf, pathGuides, straightGuides } from "./guides.js";
+import { projection } from "./projection.js";
+
+export const COLOURS = { width: "#ffffff", distance: "#ffffff", path: "#5cd6ff" };
+const LINE_WIDTHS = { width: 1.5, distance: 1.5, path: 3 }; // CSS px, on a picture of 960 px
+const OUTLINE = 2; // CSS px, likewise
+export const ESTIMATED = "ESTIMATED"; // label of what is computed for a camera that is not calibrated
+const USUAL_PX = 960;
+export const STEERING_STEP_RAD = 1e-3; // a smaller change of the steering moves no line by a pixel
+
+/** @typedef {{kind: string, metres: number|null, pieces: import("./projection.js").Point[][]}} Line */
+/**
+ * @typedef {object} Shown how a picture is shown
+ * @property {import("./framing.js").Rectangle} region of the full image that the canvas shows, px
+ * @property {number|null} rad steering when it was captured; null: unknown
+ * @property {import("./framing.js").Rectangle} area the part of the canvas that is on the screen
+ * @property {number} css px of the canvas per CSS px
+ * @property {boolean} mirrored whether the canvas is mirrored
+ */
+
+export class GuideLines {
+  shown = false;
+  /** @type {Line[]} */
+  drawn = []; // for tests: in the canvas, px
+  /** @type {{rad: number, lines: Line[]}} */
+  paths = { rad: NaN, lines: [] }; // in the full image
+
+  /**
+   * @param {import("./projection.js").Optics & {calibrated: boolean}} camera
+   * @param {import("./guides.js").Dimensions} dimensions
+   */
+  constructor(camera, dimensions) {
+    this.dimensions = dimensions;
+    this.label = camera.calibrated ? "" : ESTIMATED;
+    this.toImage = projection(camera);
+    this.straight = this.straightLines();
+  }
+
+  /** Set the picture's optics: straightened, or the original. @param {import("./projection.js").Optics} optics */
+  setOptics(optics) {
+    this.toImage = projection(optics);
+    this.straight = this.straightLines();
+    this.paths = { rad: NaN, lines: [] };
+  }
+
+  straightLines() {
+    return straightGuides(this.dimensions).map((guide) => this.project(guide));
+  }
+
+  project({ kind, metres, places }) {
+    return { kind, metres, pieces: imageOf(places, this.toImage) };
+  }
+
+  /** The path for a steering angle, in the full image. */
+  pathsFor(rad) {
+    const rounded = STEERING_STEP_RAD * Math.round(rad / STEERING_STEP_RAD);
+    if (this.paths.rad !== rounded) this.paths = { rad: rounded, lines: pathGuides(this.dimensions, rounded).map((guide) => this.project(guide)) };
+    return this.paths.lines;
+  }
+
+  /**
+   * Draw the guides over the picture in its canvas.
+   * @param {OffscreenCanvasRenderingContext2D} context
+   * @param {Shown|null} seen null: no moving picture, or an unknown region
+   */
+  draw(context, seen) {
+    this.drawn = [];
+    if (!this.shown || !seen) return;
+    const { region, rad, area, css, mirrored } = seen;
+    const { width, height } = context.canvas;
+    const toCanvas = ({ x, y }) => ({ x: ((x - region.x) * width) / region.width, y: ((y - region.y) * height) / region.height });
+    const lines = [...this.straight, ...(rad === null ? [] : this.pathsFor(rad))];
+    this.drawn = lines.map((guide) => ({ ...guide, pieces: guide.pieces.map((piece) => piece.map(toCanvas)) }));
+    const thick = css * Math.min(1.5, Math.max(0.6, width / css / USUAL_PX));
+    context.save();
+    this.strokeAll(context, thick);
+    context.restore();
+    readably(context, area, mirrored, () => {
+      labelDistances(context, this.drawn, area, mirrored, css);
+      if (this.label) labelPicture(context, this.label, { left: 0, top: 0, bottom: area.height }, css);
+    });
+  }
+
+  /** All outlines, and then the lines, so that no outline covers a line; those of one kind at once. */
+  strokeAll(context, thick) {
+    const kinds = [...new Set(this.drawn.map(({ kind }) => kind))];
+    const paths = kinds.map((kind) => pathOf(this.drawn.filter((line) => line.kind === kind)));
+    context.lineJoin = "round";
+    context.strokeStyle = "rgba(0,0,0,0.55)";
+    for (const [i, kind] of kinds.entries()) {
+      context.lineWidth = thick * (LINE_WIDTHS[kind] + OUTLINE);
+      context.stroke(paths[i]);
+    }
+    for (const [i, kind] of kinds.entries()) {
+      context.lineWidth = thick * LINE_WIDTHS[kind];
+      context.strokeStyle = COLOURS[kind];
+      context.stroke(paths[i]);
+    }
+  }
+}
+
+/** @param {Line[]} lines */
+function pathOf(lines) {
+  const path = new Path2D();
+  for (const { pieces } of lines)
+    for (const piece of pieces) for (const [i, { x, y }] of piece.entries()) i ? path.lineTo(x, y) : path.moveTo(x, y);
+  return path;
+}
+
+/** Write the distances next to the right ends of their lines, as seen on the screen, where there is room. */
+function labelDistances(context, lines, area, mirrored, css) {
+  const size = fontSize({ top: 0, bottom: area.height }, 0.028, css);
+  context.font = `600 ${size}px system-ui, "DejaVu Sans", sans-serif`;
+  context.textAlign = "start";
+  context.textBaseline = "middle";
+  const onScreen = ({ x, y }) => ({ x: mirrored ? area.x + area.width - x : x - area.x, y: y - area.y });
+  /** @type {{x: number, y: number}[]} */
+  const labelled = [];
+  for (const { metres, pieces } of lines.filter((line) => line.kind === "distance")) {
+    const words = `${metres} m`;
+    const ends = pieces.flatMap((piece) => [piece[0], piece[piece.length - 1]].map(onScreen)).sort((a, b) => b.x - a.x);
+    const wide = context.measureText(words).width + size;
+    const at = ends.find(({ x, y }) => x >= 0 && x + wide <= area.width && y >= size && y <= area.height - size);
+    if (!at || labelled.some(({ x, y }) => Math.abs(at.x - x) < wide && Math.abs(at.y - y) < 1.2 * size)) continue;
+    labelled.push(at);
+    context.lineWidth = size / 4;
+    context.strokeStyle = "rgba(0,0,0,0.7)";
+    context.strokeText(words, at.x + size / 2, at.y);
+    context.fillStyle = "#fff";
+    context.fillText(words, at.x + size / 2, at.y);
+  }
+}
+
+/**
+ * A label in the lower left corner of the visible part.
+ * @param {OffscreenCanvasRenderingContext2D} context  @param {string} words
+ * @param {{left: number, top: number, bottom: number}} visible  @param {number} css units of the drawing per CSS px
+ */
+export function labelPicture(context, words, { left, top, bottom }, css = 1) {
+  const size = fontSize({ top, bottom }, 0.035, css);
+  context.font = `700 ${size}px system-ui, "DejaVu Sans", sans-serif`;
+  context.textAlign = "start";
+  context.textBaseline = "middle";
+  const wide = context.measureText(words).width + size;
+  context.fillStyle = "#ffb000";
+  context.fillRect(left, bottom - 1.5 * size, wide, 1.5 * size);
+  context.fillStyle = "#000";
+  context.fillText(words, left + size / 2, bottom - 0.75 * size);
+}
+
+const fontSize = ({ top, bottom }, share, css) => Math.round(css * Math.min(22, Math.max(10, (share * (bottom - top)) / css)));
