@@ -42,8 +42,8 @@ class CameraPipeline:
     on_report  called, from a streaming thread, with a fault of the source, and on its recovery
     source     the source, if it is watched
 
-    `untimed` is whether the source does not know when the last picture was captured, `requests` limits what viewers
-    request.
+    untimed    whether the source does not know when the last picture was captured
+    requests   limits what viewers request
     """
 
     def __init__(

@@ -227,7 +227,8 @@ class RequestProbe(_Probe):
         is_granted = self._is_granted()
         if is_granted is None or _Typed.from_address(address).type != _CUSTOM_UPSTREAM:
             return Gst.PadProbeReturn.OK
-        dropped = _get_name(_get_structure(address)) == self._name and not is_granted()
+        structure = _get_structure(address)
+        dropped = structure and _get_name(structure) == self._name and not is_granted()
         return Gst.PadProbeReturn.DROP if dropped else Gst.PadProbeReturn.OK
 
 

@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from gi.repository import Gst
+from gi.repository import GLib, Gst
 
 from runner.graph import Plan, launch
 from runner.gst.aside import HUNG, HUNG_STARTING, change_in_thread, set_state_in_thread
@@ -112,9 +112,13 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         return True
 
     def _on_stream_gone(self, client: Gst.Element, is_bye: bool) -> None:
-        """From a streaming thread of an IP camera's client. If it is only silent, frames are missing."""
-        if is_bye and client.get_parent() is self._child and self._frames():
+        """From a streaming thread of an IP camera's client. A silent one is noticed by its missing frames."""
+        if not is_bye or client.get_parent() is not self._child:
+            return
+        if self._frames():
             self._set_error(STREAM_ENDED)
+        else:
+            self.post_message(Gst.Message.new_error(self, GLib.Error(STREAM_ENDED), ""))
 
     def _set_error(self, what: str) -> None:
         self._error = self._error or (what, self._frames())  # the first one: others follow from it

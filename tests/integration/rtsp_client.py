@@ -258,7 +258,7 @@ class RtspClient:
     def _keep(self, data: bytes) -> None:
         source = int.from_bytes(data[8:12], "big")
         self.sources[source] += 1
-        if source == next(iter(self.sources)):  # and not of packets sent again, which follow
+        if source == next(iter(self.sources)):  # not those sent again, which have another source
             self.packets.append((time.monotonic(), int.from_bytes(data[2:4], "big"), bool(data[1] & 0x80)))
 
     def _read_tcp(self) -> None:

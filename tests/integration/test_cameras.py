@@ -8,6 +8,7 @@ from __future__ import annotations
 import itertools
 import json
 import re
+import signal
 import subprocess
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -141,7 +142,7 @@ def test_a_camera_that_is_unplugged_comes_back_when_it_is_plugged_in_again(tmp_p
     elements[0] = {"name": "source", "element": "shmsrc", "properties": properties}
     flow = re.sub(r'"([\w-]+)": ', r"\1: ", json.dumps(elements))  # Hydra does not quote keys
     capture = f"+cameras.{CAMERA}.capture={{format: I420, width: 640, height: 360, fps: 15}}"
-    words = (*V4L2, f"source.elements={flow}", capture)
+    words = (*V4L2, "source.frozen_s=1", f"source.elements={flow}", capture)
     with ExitStack() as until_unplugged:
         until_unplugged.enter_context(plugged_in(socket))
         with streaming(*words) as (side, _, (plan,), reported), watching(plan) as client:
@@ -163,7 +164,7 @@ def test_a_camera_that_is_unplugged_comes_back_when_it_is_plugged_in_again(tmp_p
 
 @contextmanager
 def plugged_in(socket):
-    """A process that sends pictures through shared memory until the end of the context, where it is killed."""
+    """A process that sends pictures through shared memory until the end of the context."""
     caps = "video/x-raw,format=I420,width=640,height=360,framerate=15/1"
     sink = f"shmsink socket-path={socket} shm-size=20000000 wait-for-connection=false"
     command = ["gst-launch-1.0", "-q", *f"videotestsrc is-live=true pattern=ball ! {caps} ! {sink}".split()]
@@ -172,9 +173,9 @@ def plugged_in(socket):
             until(socket.exists)
             yield
         finally:
-            writer.kill()
-            writer.wait()
-            socket.unlink()
+            writer.send_signal(signal.SIGINT)  # a killed one would leave its shared memory
+            writer.wait(10)
+            socket.unlink(missing_ok=True)
 
 
 def noted(times, time):

@@ -111,11 +111,12 @@ def test_frames_keep_the_times_of_a_camera_that_is_faster_or_slower(fps_max):
 
 def test_a_camera_that_ends_its_stream_is_reported_and_connected_again():
     """The client's own handlers of RTCP BYE and time-outs may deadlock with the failure of its connection."""
-    with driving() as (camera, side, _, plan, reported), watching(plan) as client:
+    with driving("source.frozen_s=3") as (camera, side, _, plan, reported), watching(plan) as client:
         until(lambda: len(client.sizes) > 10)
         session, ssrc = rtp_session(side._pipeline("rear")._pipeline.get_by_name("source"))
         assert [count_handlers(session, name) for name in STREAM_END_SIGNALS] == [2, 2, 2]
         camera.send_signal(signal.SIGSTOP)
+        time.sleep(1)  # frames in flight arrive
         source = next(source for source in session.props.sources if source.props.ssrc == ssrc)
         session.emit("on-bye-ssrc", source)
         until(side.sources)

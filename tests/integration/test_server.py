@@ -616,7 +616,7 @@ def test_an_ended_pipeline_leaves_no_watched_source():
             until(lambda: _alive("WatchedSource") == 0)
 
 
-def test_a_viewer_that_requests_everything_again_gets_a_quarter_of_it():
+def test_a_viewer_that_requests_everything_again_gets_half_of_it():
     with serving() as vehicle, RtspClient(vehicle.url(CAMERA)) as viewer:
         assert viewer.open(udp=True, feedback=True) == [200, 200, 200]
         viewer.read()
@@ -632,7 +632,7 @@ def test_a_viewer_that_requests_everything_again_gets_a_quarter_of_it():
         until(request_again)
         repeated = sum(viewer.sources.values()) - viewer.sources[own]
         assert 0 < repeated <= AT_ONCE + REPEATED * (viewer.sources[own] + 10)
-        limited = "viewers request more than 25 % of the packets again; further requests are ignored"
+        limited = "viewers request more than 50 % of the packets again; some requests are ignored"
         assert vehicle.reported == [f"{CAMERA}: pipeline built", f"{CAMERA}: {limited}"]
 
 
@@ -655,8 +655,8 @@ def test_requests_for_key_frames_reach_the_encoder_once_a_second():
         encoder = vehicle.side._pipeline(CAMERA)._pipeline.get_by_name("encoder")
         encoder.get_static_pad("src").add_probe(Gst.PadProbeType.EVENT_UPSTREAM, note)
         requests = itertools.count()
-        until(lambda: viewer.send_feedback(206, 1, own) or (next(requests) > 50 and len(granted) == 3))
-    assert all(later - earlier >= KEY_UNIT_S for earlier, later in itertools.pairwise(granted))
+        until(lambda: viewer.send_feedback(206, 1, own) or (next(requests) > 50 and len(granted) >= 3))
+    assert all(later - earlier > KEY_UNIT_S - 0.1 for earlier, later in itertools.pairwise(granted))
 
 
 @pytest.mark.parametrize(
