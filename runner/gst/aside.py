@@ -23,10 +23,15 @@ def set_state_in_thread(
     state: Gst.State,
     on_hung: Callable[[], None] = lambda: None,
     after: threading.Thread | None = None,
+    first: Callable[[], object] = lambda: None,
 ) -> threading.Thread:
-    """Set an element's state as `change_in_thread` does."""
+    """Set an element's state as `change_in_thread` does.
+
+    first  called before, in the same thread
+    """
 
     def change() -> None:
+        first()
         element.set_state(state)
         if state == Gst.State.NULL:
             give_back()

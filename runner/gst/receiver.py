@@ -16,8 +16,8 @@ from runner.gst.arriving import MAX_FRAMES, NTP_EPOCH_S, RTP_HZ, MediaClock
 from runner.gst.caps import structure
 from runner.gst.probes import BufferProbe, PassingBuffer
 from runner.gst.repair import RepairBuffer
+from runner.gst.rtspsrc import STREAM_ENDED, Opening, handle_stream_end, is_rtsp_client, limit_teardown
 from runner.gst.sender_filter import SenderFilter
-from runner.gst.stream_end import STREAM_ENDED, handle_stream_end, is_rtsp_client
 from runner.gst.supervised import SupervisedPipeline
 from runner.gst.timers import later
 from runner.gst.video_files import VideoFile, VideoFiles
@@ -252,6 +252,8 @@ class Receiver:
         if is_rtsp_client(self._client):
             prefer_feedback(self._client, self._on_profile)
             handle_stream_end(self._client, self._on_source_gone)
+            limit_teardown(self._client)
+            self._supervised.before_failed_stop = Opening(pipeline.get_bus()).wait
         if self._operator and self._client.find_property("user-agent"):
             self._client.set_property("user-agent", user_agent(self._operator))
         if self._video:

@@ -13,8 +13,8 @@ from runner.gst.aside import HUNG, HUNG_STARTING, change_in_thread, set_state_in
 from runner.gst.credentials import log_in
 from runner.gst.outage import Outage
 from runner.gst.probes import EventProbe, IdleProbe
+from runner.gst.rtspsrc import STREAM_ENDED, handle_stream_end, is_rtsp_client, limit_teardown
 from runner.gst.source import fixed_rate
-from runner.gst.stream_end import STREAM_ENDED, handle_stream_end, is_rtsp_client
 from runner.gst.timers import Delayed, later
 from runner.system.backoff import pause_s
 
@@ -199,6 +199,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
             play_bag(child, self._plan, self._plan.bag, self._on_report)
         for client in filter(is_rtsp_client, child.children):
             handle_stream_end(client, self._on_stream_gone)
+            limit_teardown(client)
         for element in fixed_rate(child):
             element.set_property("skip-to-first", True)  # otherwise the first frame is repeated for the time before it
         self.add(child)

@@ -121,6 +121,33 @@ def test_the_end_of_a_stream_is_handled_here_and_not_by_the_client():
         assert elements == []
 
 
+def test_a_client_is_not_stopped_while_it_frees_its_connection():
+    """It reports an error first, and frees its connection in its own thread."""
+    from runner.gst import Gst
+    from runner.gst.rtspsrc import Opening
+
+    bus, client = Gst.Bus(), Gst.ElementFactory.make("identity")
+    opening, stopped = Opening(bus), threading.Event()
+
+    def report(kind):
+        bus.post(Gst.Message.new_progress(client, kind, "open", ""))
+
+    opening.wait()  # nothing is being opened
+    report(Gst.ProgressType.START)
+    report(Gst.ProgressType.CONTINUE)
+    stopping = threading.Thread(target=lambda: opening.wait() or stopped.set())
+    stopping.start()
+    assert not stopped.wait(0.2)
+    report(Gst.ProgressType.ERROR)
+    assert stopped.wait(1)
+    stopping.join()
+    vehicle, plans = compiled()
+    with sending(vehicle, plans), receiving(plans) as (side, _, more):
+        more()
+        source = side._receivers["front"]._client
+        assert source.get_property("teardown-timeout") > 1000 * source.get_property("tcp-timeout")  # ns, µs
+
+
 def test_packets_of_other_senders_are_dropped_and_counted():
     vehicle, plans = compiled()
     with sending(vehicle, plans), receiving(plans) as (side, messages, more):

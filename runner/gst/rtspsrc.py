@@ -1,20 +1,56 @@
-"""The end of a stream received over RTSP, handled here: rtspsrc's own handlers may deadlock (GStreamer 1.22)."""
+"""Keeps rtspsrc, GStreamer's RTSP client, from races that hang or end the process (GStreamer 1.22)."""
 
 from __future__ import annotations
 
 import re
+import threading
 from collections.abc import Callable
 from weakref import WeakMethod
 
 from gi.repository import GObject, Gst
 
 STREAM_ENDED = "the stream ended"
+# The client frees its connection in a thread of its own, up to `tcp-timeout` later if the server does not answer. After
+# this time it is stopped nevertheless, and may use the connection that is being freed.
+TEARDOWN_S = 2.0
+FAILING_S = 2.0  # likewise while it fails to open a stream, after its error
 BYE = "on-bye-ssrc"  # signals of an RTP session (RFC 3550, section 6.6)
 SILENT = ("on-bye-timeout", "on-timeout")
 
 
 def is_rtsp_client(element: Gst.Element) -> bool:
     return bool(GObject.signal_lookup("select-stream", element))
+
+
+def limit_teardown(client: Gst.Element) -> None:
+    """Make an RTSP client that is stopped close its connection first, for TEARDOWN_S at most."""
+    client.set_property("teardown-timeout", round(TEARDOWN_S * Gst.SECOND))
+
+
+class Opening:
+    """Whether the RTSP client of a pipeline is opening its stream.
+
+    It reports an error before it frees its connection: wait until it has, then stop it.
+    """
+
+    def __init__(self, bus: Gst.Bus) -> None:
+        self._ended = threading.Event()
+        self._ended.set()
+        bus.enable_sync_message_emission()
+        bus.connect("sync-message::progress", self._on_progress)
+
+    def wait(self) -> None:
+        """Until it has ended, for FAILING_S at most."""
+        self._ended.wait(FAILING_S)
+
+    def _on_progress(self, _bus: Gst.Bus, message: Gst.Message) -> None:
+        kind, code, _text = message.parse_progress()
+        if code != "open":
+            return
+        if kind == Gst.ProgressType.START:
+            self._ended.clear()
+        elif kind != Gst.ProgressType.CONTINUE:
+            self._ended.set()
 
 
 def handle_stream_end(client: Gst.Element, on_gone: Callable[[Gst.Element, bool], None]) -> None:
