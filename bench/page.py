@@ -49,8 +49,9 @@ PAIRS = 10  # of blocks with and without overlays or the bird's-eye view
 TOP_VIEWS = 4  # cameras of a bird's-eye view, which replaces their own pictures
 BLOCK_SETTLE_S = 0.3
 STEERING_S, STEERING_RAD = 0.05, 0.3  # between two reports, and amplitude: the path changes in each picture
-# The rectangle of a requested region, which the page shows only until the picture has that region.
-OVERLAYS = ".bare #drive { visibility: hidden } body:not(.bare) .roi-drag { display: block !important; inset: 20% }"
+# The rectangle of a requested region, which the page shows on one camera until its picture has that region.
+REGION = "body:not(.bare) [data-camera=camera_0] .roi-drag"
+OVERLAYS = f".bare #drive {{ visibility: hidden }} {REGION} {{ display: block !important; inset: 20% }}"
 
 
 def main() -> None:

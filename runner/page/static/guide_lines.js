@@ -1,6 +1,6 @@
 /**
- * The guides of one camera, drawn by the worker into its picture. In a canvas of their own above each picture, the browser would
- * copy and blend twice as many canvases: without a GPU that takes longer than the lines.
+ * The guides of one camera, drawn by the worker into its picture. With a canvas of their own above each picture, the browser would
+ * copy and blend twice as many canvases: without a GPU that takes as long as drawing the lines.
  */
 
 import { readably } from "./overlay.js";
@@ -12,6 +12,7 @@ const LINE_WIDTHS = { width: 1.5, distance: 1.5, path: 3 }; // CSS px, on a pict
 const OUTLINE = 2; // CSS px, likewise
 export const ESTIMATED = "ESTIMATED"; // label of what is computed for a camera that is not calibrated
 const USUAL_PX = 960;
+const STRAIGHT_PX = 0.1; // of the canvas: points closer to a straight line are left out
 export const STEERING_STEP_RAD = 1e-3; // a smaller change of the steering moves no line by a pixel
 
 /** @typedef {{kind: string, metres: number|null, pieces: import("./projection.js").Point[][]}} Line */
@@ -109,8 +110,27 @@ export class GuideLines {
 function pathOf(lines) {
   const path = new Path2D();
   for (const { pieces } of lines)
-    for (const piece of pieces) for (const [i, { x, y }] of piece.entries()) i ? path.lineTo(x, y) : path.moveTo(x, y);
+    for (const piece of pieces) for (const [i, { x, y }] of withoutStraight(piece).entries()) i ? path.lineTo(x, y) : path.moveTo(x, y);
   return path;
+}
+
+/** A line without the points on its straight parts: each joint takes time to draw. @param {import("./projection.js").Point[]} points */
+export function withoutStraight(points) {
+  const kept = points.slice(0, 1);
+  for (let i = 1, from = 0; i < points.length; i++) {
+    const isLast = i === points.length - 1;
+    if (!isLast && points.slice(from + 1, i + 1).every((point) => distanceTo(point, points[from], points[i + 1]) < STRAIGHT_PX)) continue;
+    kept.push(points[i]);
+    from = i;
+  }
+  return kept;
+}
+
+/** How far a point is from the line through two others, or from both if these coincide. */
+function distanceTo({ x, y }, a, b) {
+  const [across, down] = [b.x - a.x, b.y - a.y];
+  const length = Math.hypot(across, down);
+  return length ? Math.abs((x - a.x) * down - (y - a.y) * across) / length : Math.hypot(x - a.x, y - a.y);
 }
 
 /** Write the distances next to the right ends of their lines, as seen on the screen, where there is room. */
