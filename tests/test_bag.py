@@ -164,11 +164,10 @@ def test_problems_of_a_bag_are_reported(tod, bag, verb, tmp_path):
     assert tod(verb, *given).problems == [
         f"command line: cameras.rear.topic: {bag}: /a/image: no such topic with pictures, did you mean /a/image_raw?"
     ]
-    assert (
-        tod(verb, *words(bag, front="/a/image_raw", rear="/a/image_raw")).problems
-        == [f"command line: source.topic: {bag}: must be given, a topic with pictures: /a/image_raw, /b/image_raw"]
-        or True
-    )
+    rule = f"{bag}: must be given, a topic with pictures: /a/image_raw, /b/image_raw"
+    assert tod(verb, *words(bag, front="/a/image_raw", rear="/a/image_raw")).problems == [
+        f"command line: source.topic: {rule}"
+    ]
     assert tod(verb, *words(tmp_path / "none")).problems == [f"command line: source.bag: {tmp_path}/none: no such file"]
 
 

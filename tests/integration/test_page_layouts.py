@@ -246,6 +246,7 @@ def drawn_while_busy(page, keys, seconds):
     return {name for name, times in drawn.items() if any(begun < time <= ended for time in times)}, ended
 
 
+@pytest.mark.soak
 def test_a_busy_page_delays_neither_pictures_nor_alarms_even_as_webgl_starts(chromium, picture):
     """Without a GPU, some functions of canvases and WebGL wait for the page's main thread."""
     mast = {"lens": "fisheye", "width_px": 320, "height_px": 180, "calibrated": "false"}  # as large as the picture
