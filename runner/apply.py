@@ -34,6 +34,7 @@ from runner.gst.registry import (
     missing_recorders,
     versions,
 )
+from runner.gst.rtspsrc import limit_teardown
 from runner.gst.server import CameraServer, OnReport
 from runner.gst.supervised import CameraCaller
 from runner.gst.timers import every
@@ -347,6 +348,7 @@ class VehicleSide:
         """Set up a newly built pipeline, with every knob at its wanted value."""
         name = plan.camera.name
         source = None
+        limit_teardown(pipeline)
         if plan.frozen_s is not None:
             source = WatchedSource(plan, lambda what: self._on_report(name, what))
             source.install(pipeline, plan)

@@ -252,8 +252,8 @@ class Receiver:
         if is_rtsp_client(self._client):
             prefer_feedback(self._client, self._on_profile)
             handle_stream_end(self._client, self._on_source_gone)
-            limit_teardown(self._client)
-            self._supervised.before_failed_stop = Opening(pipeline.get_bus()).wait
+            limit_teardown(pipeline)
+            self._supervised.before_stop = Opening(pipeline.get_bus()).wait
         if self._operator and self._client.find_property("user-agent"):
             self._client.set_property("user-agent", user_agent(self._operator))
         if self._video:

@@ -15,6 +15,7 @@ from runner.gst.caps import structure
 from runner.gst.clocks import unix_time
 from runner.gst.credentials import log_in
 from runner.gst.pipeline import passed_counts
+from runner.gst.rtspsrc import limit_teardown
 from runner.gst.source import fixed_rate, loop_clip
 
 if TYPE_CHECKING:
@@ -100,6 +101,7 @@ class Recorder:
         self._out.add_probe(Gst.PadProbeType.BUFFER, self._on_first_frame)
         for element in self._rated:
             element.set_property("skip-to-first", True)  # otherwise the first frame is repeated for the time before it
+        limit_teardown(self._pipeline)
         problem = log_in(self._pipeline, self._plan)
         if self._plan.loops:
             loop_clip(self._pipeline, self._plan)

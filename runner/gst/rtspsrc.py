@@ -10,10 +10,10 @@ from weakref import WeakMethod
 from gi.repository import GObject, Gst
 
 STREAM_ENDED = "the stream ended"
-# The client frees its connection in a thread of its own, up to `tcp-timeout` later if the server does not answer. After
-# this time it is stopped nevertheless, and may use the connection that is being freed.
-TEARDOWN_S = 2.0
-FAILING_S = 2.0  # likewise while it fails to open a stream, after its error
+# The client closes in a thread of its own, which frees its streams: up to `tcp-timeout` later if the server does not
+# answer. After this time it is stopped nevertheless, and uses what is being freed.
+TEARDOWN_S = 1.5
+FAILING_S = 1.5  # likewise after an error, while it fails to open a stream
 BYE = "on-bye-ssrc"  # signals of an RTP session (RFC 3550, section 6.6)
 SILENT = ("on-bye-timeout", "on-timeout")
 
@@ -22,35 +22,46 @@ def is_rtsp_client(element: Gst.Element) -> bool:
     return bool(GObject.signal_lookup("select-stream", element))
 
 
-def limit_teardown(client: Gst.Element) -> None:
-    """Make an RTSP client that is stopped close its connection first, for TEARDOWN_S at most."""
-    client.set_property("teardown-timeout", round(TEARDOWN_S * Gst.SECOND))
+def limit_teardown(pipeline: Gst.Bin) -> None:
+    """Make RTSP clients in a pipeline close before they are stopped, for TEARDOWN_S at most."""
+    for client in filter(is_rtsp_client, pipeline.children):
+        client.set_property("teardown-timeout", round(TEARDOWN_S * Gst.SECOND))
 
 
 class Opening:
-    """Whether the RTSP client of a pipeline is opening its stream.
+    """Whether an RTSP client is failing to open its stream: it reports an error, then frees what it has set up.
 
-    It reports an error before it frees its connection: wait until it has, then stop it.
+    bus         of its pipeline
+    is_failing  whether it is at first
     """
 
-    def __init__(self, bus: Gst.Bus) -> None:
-        self._ended = threading.Event()
-        self._ended.set()
+    def __init__(self, bus: Gst.Bus, is_failing: bool = False) -> None:
+        self._ended, self._is_failing = threading.Event(), is_failing
+        if not is_failing:
+            self._ended.set()
         bus.enable_sync_message_emission()
         bus.connect("sync-message::progress", self._on_progress)
+        bus.connect("sync-message::error", self._on_error)
 
     def wait(self) -> None:
-        """Until it has ended, for FAILING_S at most."""
-        self._ended.wait(FAILING_S)
+        """To be called before it is stopped: wait until it has failed, for FAILING_S at most."""
+        if self._is_failing:
+            self._ended.wait(FAILING_S)
 
     def _on_progress(self, _bus: Gst.Bus, message: Gst.Message) -> None:
-        kind, code, _text = message.parse_progress()
-        if code != "open":
-            return
-        if kind == Gst.ProgressType.START:
-            self._ended.clear()
-        elif kind != Gst.ProgressType.CONTINUE:
-            self._ended.set()
+        opening = is_opening(message)
+        if opening is not None:
+            (self._ended.clear if opening else self._ended.set)()
+
+    def _on_error(self, _bus: Gst.Bus, _message: Gst.Message) -> None:
+        """In the client's thread, before it frees anything."""
+        self._is_failing = not self._ended.is_set()
+
+
+def is_opening(progress: Gst.Message) -> bool | None:
+    """Whether a client has begun to open its stream, or has ended that; None: another progress."""
+    kind, code, _text = progress.parse_progress()
+    return None if code != "open" else kind in (Gst.ProgressType.START, Gst.ProgressType.CONTINUE)
 
 
 def handle_stream_end(client: Gst.Element, on_gone: Callable[[Gst.Element, bool], None]) -> None:

@@ -36,7 +36,7 @@ class SupervisedPipeline:
     on_built   called with each new pipeline before it starts; returns the pad whose first buffer shows that it works
     on_report  called once with each reason, until the pipeline works again
     rebuilt    how often a pipeline that had worked was rebuilt
-    before_failed_stop  called before this pipeline is stopped for an element's error, in the thread that stops it
+    before_stop  called before this pipeline is stopped, in the thread that stops it
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class SupervisedPipeline:
         self._stopped = True
         self._outage = Outage(on_report)
         self.rebuilt = 0
-        self.before_failed_stop: Callable[[], object] = lambda: None
+        self.before_stop: Callable[[], object] = lambda: None
 
     def start(self) -> None:
         self._stopped = False
@@ -78,19 +78,16 @@ class SupervisedPipeline:
         self._stopped = True
         self._tear_down()
 
-    def _tear_down(self, first: Callable[[], object] = lambda: None) -> None:
+    def _tear_down(self) -> None:
         if self._pipeline is not None:
             self._pipeline.get_bus().remove_signal_watch()
             self._change = set_state_in_thread(
-                self._pipeline, Gst.State.NULL, lambda: self._on_report(HUNG), self._change, first
+                self._pipeline, Gst.State.NULL, lambda: self._on_report(HUNG), self._change, self.before_stop
             )
             self._pipeline = None
 
-    def restart(self, why: str, failed: bool = False) -> None:
-        """Tear down now, rebuild soon; nothing happens if it is stopped.
-
-        failed  whether an element has reported an error
-        """
+    def restart(self, why: str) -> None:
+        """Tear down now, rebuild soon; nothing happens if it is stopped."""
         if self._retry or self._stopped:
             return
         now = self._ended = time.monotonic()
@@ -99,7 +96,7 @@ class SupervisedPipeline:
             self._lost = now
         if self._worked or now - self._lost > PATIENCE_S:
             self._outage.report_failure(why, self._lost)
-        self._tear_down(self.before_failed_stop if failed else lambda: None)
+        self._tear_down()
         self._retry = later(max(0.0, self._begun + RETRY_S - now), self._retry_start)
 
     def _retry_start(self) -> None:
@@ -113,7 +110,7 @@ class SupervisedPipeline:
         if concerns_file(message):
             return
         failed = message.type == Gst.MessageType.ERROR
-        self.restart(message.parse_error()[0].message if failed else STREAM_ENDED, failed)
+        self.restart(message.parse_error()[0].message if failed else STREAM_ENDED)
 
     def _on_first_buffer(self, pad: Gst.Pad, _buffer: PassingBuffer) -> bool:
         """From a streaming thread."""

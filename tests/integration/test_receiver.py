@@ -123,7 +123,7 @@ def test_the_end_of_a_stream_is_handled_here_and_not_by_the_client():
 
 def test_a_client_is_not_stopped_while_it_frees_its_connection():
     """It reports an error first, and frees its connection in its own thread."""
-    from runner.gst import Gst
+    from runner.gst import GLib, Gst
     from runner.gst.rtspsrc import Opening
 
     bus, client = Gst.Bus(), Gst.ElementFactory.make("identity")
@@ -135,6 +135,8 @@ def test_a_client_is_not_stopped_while_it_frees_its_connection():
     opening.wait()  # nothing is being opened
     report(Gst.ProgressType.START)
     report(Gst.ProgressType.CONTINUE)
+    opening.wait()  # it may be stopped meanwhile
+    bus.post(Gst.Message.new_error(client, GLib.Error("refused"), ""))
     stopping = threading.Thread(target=lambda: opening.wait() or stopped.set())
     stopping.start()
     assert not stopped.wait(0.2)

@@ -5,7 +5,7 @@ import { now } from "./clock.js";
 import { imageToBox, placement, visible, WHOLE } from "./framing.js";
 import { elapsed, read } from "./counter.js";
 import { Pace } from "./pace.js";
-import { paintImage, pictureOf } from "./picture.js";
+import { hasGpu, paintImage, pictureOf } from "./picture.js";
 import { ESTIMATED, GuideLines, labelPicture } from "./guide_lines.js";
 import { resize } from "./resizing.js";
 import { alarmText, frozenAfter, INTERVALS, judge, MOVING, STALLED } from "./status.js";
@@ -371,7 +371,7 @@ export class Stream {
   /** Draw the guides over the picture in the canvas; none over a stalled one, since nobody may steer by it. */
   drawGuides(context, canvas) {
     const { guides, shown } = this;
-    const region = MOVING.includes(this.status) ? this.drawnRegion() : null;
+    const region = MOVING.includes(this.status) && this.display.width ? this.drawnRegion() : null;
     const area = this.visibleArea(canvas);
     const css = (canvas.width * this.display.ratio) / (this.widthOnScreen(canvas) || canvas.width);
     const { mirrored } = this.display.view;
@@ -556,15 +556,15 @@ export class Stream {
 
   /**
    * The canvas has the picture's size. For a lasting alarm it is an integer multiple of it, close to the size on the
-   * screen, so that words are sharp while the aspect ratio, and with it the page's layout, stays the same; for guides one
-   * that is at most as large, which costs less.
+   * screen, so that words are sharp while the aspect ratio, and with it the page's layout, stays the same; for guides, too, if
+   * the browser scales pictures with a GPU.
    */
   resizeCanvas(canvas, sharp) {
     const { width: wide, height: high, ratio } = this.display;
     const box = { width: Math.round(wide * ratio) || 480, height: Math.round(high * ratio) || 270 };
     const own = this.straight ? (this.shown?.image ?? this.straightSize()) : (this.shown?.picture.painted ?? box);
     const scale = this.widthOnScreen(own) / own.width;
-    const times = Math.min(6, Math.max(1, sharp ? Math.ceil(scale) : this.guides?.shown ? Math.floor(scale) : 1));
+    const times = Math.min(6, Math.max(1, sharp ? Math.ceil(scale) : this.guides?.shown && hasGpu ? Math.round(scale) : 1));
     const width = own.width * times;
     const height = own.height * times;
     if (this.isFresh) Object.assign(canvas, { width, height }); // nothing is shown yet
