@@ -253,7 +253,9 @@ class Receiver:
             prefer_feedback(self._client, self._on_profile)
             handle_stream_end(self._client, self._on_source_gone)
             limit_teardown(pipeline)
-            self._supervised.before_stop = Opening(pipeline.get_bus()).wait
+            opening = Opening()
+            opening.follow(pipeline.get_bus())
+            self._supervised.before_stop = opening.wait
         if self._operator and self._client.find_property("user-agent"):
             self._client.set_property("user-agent", user_agent(self._operator))
         if self._video:

@@ -31,37 +31,32 @@ def limit_teardown(pipeline: Gst.Bin) -> None:
 class Opening:
     """Whether an RTSP client is failing to open its stream: it reports an error, then frees what it has set up.
 
-    bus         of its pipeline
-    is_failing  whether it is at first
+    Both show in its messages, which must be handled in its thread.
     """
 
-    def __init__(self, bus: Gst.Bus, is_failing: bool = False) -> None:
-        self._ended, self._is_failing = threading.Event(), is_failing
-        if not is_failing:
-            self._ended.set()
+    def __init__(self) -> None:
+        self._ended, self._is_failing = threading.Event(), False
+        self._ended.set()
+
+    def follow(self, bus: Gst.Bus) -> None:
+        """Handle the messages of a bus."""
         bus.enable_sync_message_emission()
-        bus.connect("sync-message::progress", self._on_progress)
-        bus.connect("sync-message::error", self._on_error)
+        for kind in ("progress", "error"):
+            bus.connect(f"sync-message::{kind}", lambda _bus, message: self.handle(message))
+
+    def handle(self, message: Gst.Message) -> None:
+        if message.type == Gst.MessageType.ERROR:
+            self._is_failing = not self._ended.is_set()
+        elif message.type == Gst.MessageType.PROGRESS:
+            kind, code, _text = message.parse_progress()
+            if code == "open":
+                is_opening = kind in (Gst.ProgressType.START, Gst.ProgressType.CONTINUE)
+                (self._ended.clear if is_opening else self._ended.set)()
 
     def wait(self) -> None:
         """To be called before it is stopped: wait until it has failed, for FAILING_S at most."""
         if self._is_failing:
             self._ended.wait(FAILING_S)
-
-    def _on_progress(self, _bus: Gst.Bus, message: Gst.Message) -> None:
-        opening = is_opening(message)
-        if opening is not None:
-            (self._ended.clear if opening else self._ended.set)()
-
-    def _on_error(self, _bus: Gst.Bus, _message: Gst.Message) -> None:
-        """In the client's thread, before it frees anything."""
-        self._is_failing = not self._ended.is_set()
-
-
-def is_opening(progress: Gst.Message) -> bool | None:
-    """Whether a client has begun to open its stream, or has ended that; None: another progress."""
-    kind, code, _text = progress.parse_progress()
-    return None if code != "open" else kind in (Gst.ProgressType.START, Gst.ProgressType.CONTINUE)
 
 
 def handle_stream_end(client: Gst.Element, on_gone: Callable[[Gst.Element, bool], None]) -> None:

@@ -13,7 +13,7 @@ from runner.gst.aside import HUNG, HUNG_STARTING, change_in_thread, set_state_in
 from runner.gst.credentials import log_in
 from runner.gst.outage import Outage
 from runner.gst.probes import EventProbe, IdleProbe
-from runner.gst.rtspsrc import STREAM_ENDED, Opening, handle_stream_end, is_opening, is_rtsp_client, limit_teardown
+from runner.gst.rtspsrc import STREAM_ENDED, Opening, handle_stream_end, is_rtsp_client, limit_teardown
 from runner.gst.source import fixed_rate
 from runner.gst.timers import Delayed, later
 from runner.system.backoff import pause_s
@@ -58,7 +58,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         self._next_check: Delayed | None = None
         self._starting: threading.Thread | None = None  # starts the child
         self._started = 0.0  # when it began
-        self._is_opening = self._is_failing = False  # its RTSP client; set from its threads
+        self._opening = Opening()  # of its RTSP client
         self._error: tuple[str, int] | None = None  # the source's own error, and frames before it; set from its threads
         self._progress = (0, 0.0)  # frames at the last change of the counter, and when
         self._watched = 0.0  # when it was last checked
@@ -97,10 +97,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
             self.outage, self._attempts = Outage(self._on_report), 0
 
     def do_handle_message(self, message: Gst.Message) -> None:
-        if message.type == Gst.MessageType.PROGRESS and (opening := is_opening(message)) is not None:
-            self._is_opening, self._is_failing = opening, False
-        elif message.type == Gst.MessageType.ERROR:
-            self._is_failing = self._is_opening
+        self._opening.handle(message)
         if self._frames():
             if message.type == Gst.MessageType.ERROR:
                 self._set_error(message.parse_error()[0].message)
@@ -216,12 +213,11 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         child, self._child = self._child, None
         if child is not None:
             self.remove(child)
-            bus = Gst.Bus()
+            bus, opening, self._opening = Gst.Bus(), self._opening, Opening()
+            opening.follow(bus)
             child.set_bus(bus)  # it belongs to no pipeline any more
-            first = Opening(bus, self._is_failing).wait
-            self._is_opening = self._is_failing = False
             hung = f"source: {HUNG}"
-            set_state_in_thread(child, Gst.State.NULL, lambda: self._on_report(hung), self._starting, first)
+            set_state_in_thread(child, Gst.State.NULL, lambda: self._on_report(hung), self._starting, opening.wait)
             self._starting = None
 
     # ------------------------------------------------------------------------------------------------------------------

@@ -127,7 +127,8 @@ def test_a_client_is_not_stopped_while_it_frees_its_connection():
     from runner.gst.rtspsrc import Opening
 
     bus, client = Gst.Bus(), Gst.ElementFactory.make("identity")
-    opening, stopped = Opening(bus), threading.Event()
+    opening, stopped = Opening(), threading.Event()
+    opening.follow(bus)
 
     def report(kind):
         bus.post(Gst.Message.new_progress(client, kind, "open", ""))
