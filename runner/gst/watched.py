@@ -46,6 +46,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         self._launch, self._last = launch(plan.source), plan.source[-1].name
         self._on_report = on_report
         self.outage = Outage(on_report)
+        self._opening = Opening()  # of its RTSP client; messages of this bin are handled from the first `add` on
         self._counter = Gst.ElementFactory.make("identity", "source-frames")
         self.add(self._counter)
         self.add_pad(Gst.GhostPad.new("src", self._counter.get_static_pad("src")))
@@ -58,7 +59,6 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         self._next_check: Delayed | None = None
         self._starting: threading.Thread | None = None  # starts the child
         self._started = 0.0  # when it began
-        self._opening = Opening()  # of its RTSP client
         self._error: tuple[str, int] | None = None  # the source's own error, and frames before it; set from its threads
         self._progress = (0, 0.0)  # frames at the last change of the counter, and when
         self._watched = 0.0  # when it was last checked
