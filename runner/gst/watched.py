@@ -216,8 +216,13 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
             bus, opening, self._opening = Gst.Bus(), self._opening, Opening()
             opening.follow(bus)
             child.set_bus(bus)  # it belongs to no pipeline any more
+
+            def before_stop() -> None:
+                opening.wait()
+                bus.set_flushing(True)  # messages in a bus keep their elements alive, and these the bus
+
             hung = f"source: {HUNG}"
-            set_state_in_thread(child, Gst.State.NULL, lambda: self._on_report(hung), self._starting, opening.wait)
+            set_state_in_thread(child, Gst.State.NULL, lambda: self._on_report(hung), self._starting, before_stop)
             self._starting = None
 
     # ------------------------------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import itertools
+import os
 import socket
 import struct
 import subprocess
@@ -682,17 +683,26 @@ def _alive(kind):
     return sum(type(each).__name__ == kind for each in gc.get_objects())
 
 
-def test_the_reason_of_a_source_that_fails_is_reported():
+def test_the_reason_of_a_source_that_fails_is_reported_and_it_leaves_nothing():
     elements = (
         "source.elements=[{name: source, element: videotestsrc, properties: {is-live: true}},"
         " {name: fails, element: identity, properties: {error-after: 12}},"
         ' {name: raw, element: capsfilter, properties: {caps: "{raw_caps}"}}]'
     )
-    with serving(*SMALL, elements, "source.frozen_s=2", cameras=(SMALL_CAMERA,)) as vehicle:
-        with watched(vehicle, SMALL_CAMERA):
-            until(lambda: any("source: " in report for report in vehicle.reported))
-        reason = next(report for report in vehicle.reported if "source: " in report)
-        assert "Failed after iterations" in reason
+    with (
+        serving(*SMALL, elements, "source.frozen_s=0.5", cameras=(SMALL_CAMERA,)) as vehicle,
+        watched(vehicle, SMALL_CAMERA),
+    ):
+
+        def failures():
+            return [report for report in vehicle.reported if "source: " in report and "Failed" in report]
+
+        until(failures)
+        assert "Failed after iterations" in failures()[0]
+        until(lambda: len(failures()) == 2)
+        before = len(os.listdir("/proc/self/fd"))
+        until(lambda: len(failures()) >= 6)
+        assert len(os.listdir("/proc/self/fd")) < before + 4, "each source left its bus behind"
 
 
 def test_idle_connections_take_no_descriptors_from_others(monkeypatch):
