@@ -32,7 +32,9 @@ MASTER = "http://localhost:11311"  # of ROS 1, as in rosgraph
 
 SCRIPT = Path(__file__).parent / "node" / "__main__.py"
 PROFILE = Path(__file__).with_name("fastdds.xml")
-OWN_TRANSPORTS = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_BUILTIN_TRANSPORTS")
+LOCAL_PROFILE = Path(__file__).with_name("fastdds_local.xml")
+PROFILES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")  # Fast DDS 3, and before
+OWN_TRANSPORTS = (*PROFILES, "FASTDDS_BUILTIN_TRANSPORTS")
 
 Message = Mapping[str, Any]
 NOTHING: Mapping[str, str] = {}
@@ -77,10 +79,12 @@ def _environment(settings: RosSettings, insecure: bool, publishes: bool) -> dict
         own = {"ROS_MASTER_URI": _master_uri(), "ROS_NAMESPACE": settings.namespace}
         return own if insecure else {**own, "ROS_HOSTNAME": "127.0.0.1"}  # listens only there
     own = {"ROS_AUTOMATIC_DISCOVERY_RANGE": settings.discovery.upper()}
-    if settings.discovery in LOCAL and not insecure:
+    is_local = settings.discovery in LOCAL and not insecure
+    if is_local:
         own["ROS_STATIC_PEERS"] = ""  # they would be connected, whatever the range
-    if publishes and not any(name in os.environ for name in OWN_TRANSPORTS):
-        own["FASTDDS_DEFAULT_PROFILES_FILE"] = str(PROFILE)
+    if (is_local or publishes) and not any(name in os.environ for name in OWN_TRANSPORTS):
+        # The range limits whom this node looks for; only the profile keeps out nodes that look for this one.
+        own |= dict.fromkeys(PROFILES, str(LOCAL_PROFILE if is_local else PROFILE))
     return own
 
 

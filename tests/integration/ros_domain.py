@@ -64,11 +64,15 @@ class Ros:
         self.master.call("setParam", "/use_sim_time", True)
         return []
 
-    def start(self, script, *words, large=True):
-        """A script, which may use `ros_either`; `large`: it has shared memory for many pictures."""
+    def start(self, script, *words, large=True, inside=None):
+        """A script, which may use `ros_either`.
+
+        large   it has shared memory for many pictures
+        inside  machine on which it runs, if not this one
+        """
         profile = {"FASTDDS_DEFAULT_PROFILES_FILE": str(PROFILE)} if large else {}
         return subprocess.Popen(
-            [self.python, str(HERE / script), *words],
+            [*(inside.command if inside else ()), self.python, str(HERE / script), *words],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
@@ -76,8 +80,8 @@ class Ros:
         )
 
     @contextmanager
-    def client(self, name, *topics):
-        node = RosClient(self.start("ros_client.py", name, *topics))
+    def client(self, name, *topics, inside=None):
+        node = RosClient(self.start("ros_client.py", name, *topics, large=not inside, inside=inside))
         try:
             yield node
         finally:

@@ -7,6 +7,8 @@ import os
 import re
 import shutil
 import signal
+import subprocess
+import sys
 import threading
 import time
 from contextlib import contextmanager, suppress
@@ -19,6 +21,7 @@ from xmlrpc.client import ServerProxy
 import numpy as np
 import pytest
 from bags import filmed
+from machines import cable, machines
 from numbered import BITS, HEIGHT, WIDTH, encoded, number_of
 from ros_domain import MARKS, ROS2_PYTHON, SCRIPT, running
 from shared_data import shared
@@ -550,6 +553,38 @@ def test_unauthenticated_nodes_of_other_machines_are_not_discovered(ros2):
     status, (line,) = refused(ros2, "ros.discovery=subnet")
     assert status == 2
     assert line.startswith("command line: ros.discovery: subnet: admits any node on the network: set up SROS 2 ")
+
+
+LISTENER = """\
+import sys, time
+from runner.core.model import RosSettings
+from runner.ros.process import NodeProcess
+node = NodeProcess(RosSettings(python=sys.argv[1]), lambda message, _: print(message["text"], flush=True), print,
+                   inputs={"/heard": "text"})
+node.start()
+sys.stdin.read()
+node.close()
+"""
+
+
+def test_a_node_of_another_machine_that_knows_the_address_is_not_connected(ros2, monkeypatch):
+    with machines("own", "other") as (own, other):
+        cable(own, "link0", other, "link0")
+        own.run("ip addr add 10.9.0.1/24 dev link0")
+        other.run("ip addr add 10.9.0.2/24 dev link0")
+        own.run("ip route add 224.0.0.0/4 dev link0")
+        command = [*own.command, sys.executable, "-c", LISTENER, ros2.python]
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as listener:
+            with ros2.client("local", inside=own) as local:
+                monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
+                monkeypatch.setenv("ROS_STATIC_PEERS", "10.9.0.1")
+                with ros2.client("foreign", inside=other) as foreign:
+                    foreign.publish("/heard", text="foreign")  # waits for a subscriber
+                    time.sleep(5)
+                    local.publish("/heard", text="local")
+                    assert listener.stdout.readline() == "local\n"
+                    time.sleep(2)
+            assert listener.communicate(timeout=20)[0] == ""
 
 
 def test_a_camera_without_a_topic(ros):
