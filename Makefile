@@ -3,7 +3,7 @@
 # make check  lint, types, import contracts, schemas, unit tests: no GStreamer, no browser
 # make javascript  only the checks of the pages' scripts
 # make soak   long repetitions of faults that a drive must survive, an hour; SOAK=0.1 make soak is a tenth, KEYS=1 encrypts
-# make deadspot  two drives over a recorded uplink: the picture of the README
+# make deadspot UPLINK=FILE.csv  two drives over a recorded uplink: the picture of the README
 # make setup  install what driving needs; the command is then .venv/bin/tod-runner
 # make ros2   ROS 2 in an environment of its own, .venv-ros2; docs/ros.md
 # make ros1   ROS 1, which is end-of-life, as Debian's packages
@@ -17,7 +17,7 @@ NODE_READY := node_modules/.ready
 # Tests start hundreds of processes; without cached bytecode each would compile the project again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test timed untimed golden units check fast coverage lint javascript setup bench deadspot soak ros1 ros2 clean
+.PHONY: demo test timed untimed golden units check fast coverage lint javascript setup bench deadspot uplink-given soak ros1 ros2 clean
 
 demo: $(READY)
 	$(BIN)/tod-runner demo
@@ -65,10 +65,13 @@ javascript: $(NODE_READY)
 bench: $(TEST_READY)
 	$(BIN)/python bench bench.json
 
-# One drive over a recorded uplink, twice, as shown by the operator's page: make deadspot UPLINK=uplink.csv
-UPLINK ?= ../shared/data/traces/tidy/orange-4G-traces-A-up_uplink_1s.csv
-deadspot: $(TEST_READY)
-	$(BIN)/python bench/deadspot.py $(UPLINK) docs/images/deadspot.png
+# One drive over a recorded uplink, twice, as shown by the operator's page; DEADSPOT=FILE.png names another output.
+DEADSPOT ?= docs/images/deadspot.png
+deadspot: uplink-given $(TEST_READY)
+	$(BIN)/python bench/deadspot.py "$(UPLINK)" "$(DEADSPOT)"
+
+uplink-given:
+	@test -f "$(UPLINK)" || { echo 'make deadspot needs UPLINK=FILE.csv: a recorded uplink with the columns t_s (s) and uplink_kbps (kbit/s)' >&2; exit 2; }
 
 soak: $(TEST_READY) $(NODE_READY)
 	PYTHONPATH=tests/integration $(BIN)/python tests/soak $(PARTS)

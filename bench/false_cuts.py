@@ -1,6 +1,6 @@
 """False cuts of the total while only the reports of the operator's side are lost.
 
-  sudo python bench/false_cuts.py OUT                     10 minutes; less: --seconds 60
+  sudo .venv/bin/python bench/false_cuts.py OUT                     10 minutes; less: --seconds 60
 
 A link that carries more than is sent, and loses 1 % of the packets on the way back, by which the reports travel. Prints
 how often the measured link lowered the total, and why. OUT keeps the drive; an existing one is not repeated. Run it on

@@ -1,6 +1,6 @@
 """How soon the encoders follow a link whose rate halves, by transport.
 
-  sudo python bench/reaction.py OUT                    6 minutes; one transport: --only SRT
+  sudo .venv/bin/python bench/reaction.py OUT                    6 minutes; one transport: --only SRT
 
 Three cameras, predictions of 4 Mbit/s that never change, 20 ms each way. The link carries 4.4 Mbit/s, and every 12 s
 half of that for 4 s. A row for each transport: time from each fall until the total, with packet headers, is at most the

@@ -1,7 +1,7 @@
 """The test cases of RFC 8867 in `experiment=rfc8867`: use of the link, and queuing delay.
 
-  sudo python bench/rfc8867.py OUT                            all cases, 25 minutes
-  sudo python bench/rfc8867.py OTHER --only 5_6_long_tcp --runs 5 --words modes=paper
+  sudo .venv/bin/python bench/rfc8867.py OUT                            all cases, 25 minutes
+  sudo .venv/bin/python bench/rfc8867.py OTHER --only 5_6_long_tcp --runs 5 --words modes=paper
   python bench/rfc8867.py THIRD --only 5_1_variable --quality
 
 A row for each case: medians over the runs, and their range. A row is void if a busy machine dropped frames. --quality

@@ -49,7 +49,7 @@ def test_capture_times_are_those_of_stamps_unless_a_clock_is_wrong():
     assert topic.get(10, 0.25) == 9.75
     topic.take_reports()
     assert topic.get(10.1, 1.0) is None  # earlier than the one before
-    assert topic.take_reports() == ["a picture is not later than the one before: such pictures are left out"]
+    assert topic.take_reports() == ["a picture is not later than the one before: such pictures are skipped"]
     assert topic.get(11, -0.02) == 11  # never from the future
     assert topic.take_reports() == []
     for at, age in ((11.1, 1.01), (11.2, -0.021), (11.3, None)):
@@ -94,14 +94,14 @@ def test_pictures_that_cannot_be_shown_are_left_out(wrong, rule):
     first, again = topic.take_reports()
     assert first == again
     assert first.startswith(rule)
-    assert first.endswith(": such pictures are left out")
+    assert first.endswith(": such pictures are skipped")
 
 
 def test_bytes_determine_the_type_of_compressed_pictures():
     topic = Topic()
     os.write(topic._memory, b"GIF89a")
     assert topic.get(1, size=6, stated="jpeg") is None
-    assert topic.take_reports() == ["format 'jpeg' is not supported; expected JPEG or PNG: such pictures are left out"]
+    assert topic.take_reports() == ["format 'jpeg' is not supported; expected JPEG or PNG: such pictures are skipped"]
     os.pwrite(topic._memory, b"\x89PNG\r\n\x1a\n" + bytes(8) + (1280).to_bytes(4) + (960).to_bytes(4), 0)
     assert topic.get(2, size=24, stated="jpeg") == 2
     assert topic.take_reports() == ["pictures are png 1280x960"]

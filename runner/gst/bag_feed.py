@@ -127,7 +127,7 @@ class BagFeed:
             raise ModelError("topic", where, why)
         if not self._skip_reported:
             self._skip_reported = True
-            self._on_report(f"{where}: {why}: such pictures are left out")
+            self._on_report(f"{where}: {why}: such pictures are skipped")
 
     def _push(self, picture: Picture) -> bool:
         """Push a picture when it is due; returns False if the pipeline is gone."""

@@ -118,12 +118,12 @@ class CameraStream:
         try:
             kind = _picture_type(message, memory)
         except ValueError as error:
-            self._leave_out(f"{error}: such pictures are left out")
+            self._leave_out(f"{error}: such pictures are skipped")
             return None
         captured = self._capture_time(message)
         self._rate(message["at"])
         if captured <= self._captured:
-            self._leave_out("a picture is not later than the one before: such pictures are left out")
+            self._leave_out("a picture is not later than the one before: such pictures are skipped")
             return None
         self._captured = captured
         self._faults.clear()

@@ -134,7 +134,7 @@ HYDRA_FLAGS = {
     ("--config-name", "-cn"): "conf=DIR may contain a config.yaml of your own",
     ("--run", "-r"): "a verb runs without a flag",
     ("--shell-completion", "-sc"): "tod-runner completion bash or zsh prints the script",
-    ("--hydra-help",): "docs/configuration.md lists the supported parts of Hydra",
+    ("--hydra-help",): "docs/configuration.md describes groups, overrides and defaults lists",
     ("--experimental-rerun",): "replay input=DRIVE repeats a drive with its own configuration",
 }
 

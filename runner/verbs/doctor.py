@@ -104,7 +104,7 @@ def _extras(verb: str, vehicle: Vehicle, document: Mapping[str, Any]) -> Iterato
         yield "page"
     if verb in ("vehicle", "demo", "record") and any(c.source.render for c in vehicle.cameras.values()):
         yield "synthetic"
-    if verb in ("vehicle", "operator", "latency", "demo"):
+    if verb in ("vehicle", "operator", "latency", "ros", "demo"):
         yield from ["security"] if vehicle.keys is not None else []
     ports = {"vehicle": vehicle.metrics.vehicle_port, "operator": vehicle.metrics.operator_port}
     if any(port is not None and verb in (side, "demo") for side, port in ports.items()):

@@ -8,9 +8,9 @@ each is listed. A new directory appears only when it is complete.
 With files=schemas only the schemas are written: for an existing directory, or, after an update, once you have removed
 DIR/.schemas.
 
-  tod-runner init my_fleet
-  tod-runner validate conf=my_fleet
-  tod-runner print conf=my_fleet vehicle=my_vehicle modes=my_modes
+  tod-runner init my_vehicles
+  tod-runner validate conf=my_vehicles
+  tod-runner print conf=my_vehicles vehicle=my_vehicle modes=my_modes
   tod-runner init my_vehicles files=schemas
 """
 

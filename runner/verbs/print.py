@@ -2,8 +2,8 @@
 
 Dry run: prints for each camera the pipelines of vehicle and operator, and the rules' decision for a total of N kbit/s,
 with the reason. Starts nothing and needs no GStreamer. Each line runs as printed: a UDP sink and the matching source
-replace the live system's RTSP server and client, which gst-launch does not have. Passwords in addresses are left out:
-put them back to run such a line.
+replace the live system's RTSP server and client, which gst-launch does not have. Passwords are never
+printed: for a camera with `credentials`, add user-id= and user-pw= to rtspsrc.
 
 format=yaml shows the composed configuration instead, with the file or the override that each value comes from.
 

@@ -15,6 +15,7 @@ from machines import Machine, Watch
 from rig import CHECKOUT, WAIT_S, process, until
 
 DOCUMENT = CHECKOUT / "docs" / "deployment.md"
+VEHICLE = "10.0.0.2"  # its address there, also where a recipe gives it another one later
 TWO_MACHINES, FIREWALLS, SRT, WIREGUARD = "From two bare machines to driving", "Firewalls", "SRT", "WireGuard"
 # There is no systemd here: replacements for its services.
 BROKER = "sudo install -d -o mosquitto /run/mosquitto; sudo mosquitto -d -c /etc/mosquitto/mosquitto.conf"
@@ -85,9 +86,9 @@ class Site:
         for home in self.homes.values():
             home.mkdir()
         self.output = self.homes["vehicle"] / "output.txt"  # of the vehicle's side
-        ssh = directory / "ssh"  # rsync's way to the vehicle, whose name it is given first
+        ssh = directory / "ssh"  # rsync's way to the vehicle, whose address it is given first
         inside = " ".join(vehicle.inside(self.homes["vehicle"]))
-        ssh.write_text(f'#!/bin/sh\ntest "$1" = vehicle && shift && exec {inside} sh -c "$*"\n')
+        ssh.write_text(f'#!/bin/sh\ntest "$1" = {VEHICLE} && shift && exec {inside} sh -c "$*"\n')
         ssh.chmod(0o700)
         self._environment = f"RSYNC_RSH={ssh}"
         self.other: dict[str, str] = {}  # in files, in place of the document's text

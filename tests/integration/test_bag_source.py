@@ -161,7 +161,7 @@ def test_pictures_of_another_size_are_left_out_and_others_continue(tmp_path):
         send(side, "front", "rear")
         with watching(plans[0]) as front, watching(plans[1]) as rear:
             until(lambda: len(front.sizes) > 30 and len(rear.sizes) > 30)
-    what = f"front: {bag}: /front/image: picture 9 is 192x108, the first one 384x216: such pictures are left out"
+    what = f"front: {bag}: /front/image: picture 9 is 192x108, the first one 384x216: such pictures are skipped"
     assert [line for line in reported if "pipeline" not in line] == [what]
 
 

@@ -252,7 +252,7 @@ def test_faults_of_a_topic_are_reported_once_and_others_continue(ros):
     lines = [line.removeprefix("front: /front/image: ") for line in reported if "/front/image" in line]
     assert [re.sub(r"[0-9.]+ s", "N s", line) for line in calm(lines)] == [
         "pictures are BGR 384x216",
-        f"{unknown}; expected one of {', '.join(FORMATS)}: such pictures are left out",
+        f"{unknown}; expected one of {', '.join(FORMATS)}: such pictures are skipped",
         f"{size}, scaled up to the camera's 384x216; they were BGR 384x216",
         "a stamp is N s old: the latency of these pictures is unknown",
         "pictures are BGR 384x216; they were BGR 192x108",
@@ -290,8 +290,8 @@ def test_incompatible_qos(ros2):
         publishing(ros2, front={"reliability": "best_effort"}, rear={}),
         subscribing(ros2, *words) as (_, _, reported),
     ):
-        for name, policy in (("front", "reliability reliable"), ("rear", "durability transient_local")):
-            why = f"incompatible QoS: ros.qos asks for {policy}, its publisher offers less"
+        for name, policy in (("front", "reliability=reliable"), ("rear", "durability=transient_local")):
+            why = f"ros.qos requests {policy}, but the publisher does not offer it"
             until(lambda line=f"{name}: /{name}/image: {why}": line in reported)
 
 

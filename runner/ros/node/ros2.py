@@ -79,7 +79,7 @@ class Ros2PictureTopic(PictureTopic):
 
         policy = qos_policy_name_from_kind(event.last_policy_kind).lower()
         if requested := self._requested.get(policy):  # otherwise the next update subscribes with the new offer
-            self.fail(f"incompatible QoS: ros.qos asks for {policy} {requested}, its publisher offers less")
+            self.fail(f"ros.qos requests {policy}={requested}, but the publisher does not offer it")
 
     def _on_lost(self, event: Any) -> None:
         self.losses.lost_in_transport += event.total_count_change
