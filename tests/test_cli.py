@@ -228,6 +228,15 @@ def test_a_standard_output_closed_from_the_start(words: list[str]) -> None:
     assert (done.returncode, done.stderr) == (0, b"")
 
 
+def test_a_closed_standard_error_does_not_change_the_status() -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    words = [sys.executable, "-m", "runner", "print", "fps_max=0"]
+    done = subprocess.run(words, stdout=subprocess.PIPE, stderr=writer, check=False)
+    os.close(writer)
+    assert (done.returncode, done.stdout) == (2, b"")
+
+
 def test_ctrl_c_ends_with_130() -> None:
     replay = subprocess.Popen(
         [sys.executable, "-m", "runner", "replay", *PAPER],
