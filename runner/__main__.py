@@ -31,7 +31,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one verb.
 
     argv     None: the process's own; a process ended by a signal then does not return from here
-    returns  exit status: 0 fine, 1 a run failed, 2 the user's input is wrong, 130 Ctrl-C, 143 SIGTERM
+    returns  exit status: 0 fine, 1 a run failed, 2 the user's input is wrong, 129 SIGHUP, 130 Ctrl-C,
+             143 SIGTERM
     """
     with signals.handled():
         status = _status(list(sys.argv[1:] if argv is None else argv))
