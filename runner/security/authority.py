@@ -278,8 +278,6 @@ def _write(path: Path, content: bytes) -> None:
         mode = 0o644 if path.name in keyring.PUBLIC else 0o600
         with open(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
             file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
 
 
 @contextmanager

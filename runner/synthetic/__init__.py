@@ -21,6 +21,7 @@ from pathlib import Path
 from runner.clips import View, clip_path
 from runner.core.model import Progress
 from runner.system import signals
+from runner.system.files import put_in_place
 from runner.system.spawned import WorkerContext
 
 SHORTEST_S = 4
@@ -183,7 +184,7 @@ def _work(pipe: Connection, seconds: float, cache: Path, world: Path) -> None:
 
 
 def _render_clip(view: View, seconds: float, cache: Path, world: Path, report: Callable[[int], None]) -> None:
-    """Render to a temporary file and rename it: a clip is complete or does not exist."""
+    """Render to a temporary file first: a clip is complete or does not exist."""
     from runner.apply import write_clip
     from runner.synthetic.picture import pictures
 
@@ -198,4 +199,4 @@ def _render_clip(view: View, seconds: float, cache: Path, world: Path, report: C
                 report(view.width * view.height * ((number - 1) % every + 1))
 
     write_clip(unfinished, counted(), view.width, view.height, view.fps)
-    unfinished.replace(clip)
+    put_in_place(unfinished, clip)
