@@ -66,13 +66,12 @@ def _status(words: list[str]) -> int:  # noqa: PLR0911
     except RunError as error:
         _complain(error)
         return 1
-    except ModuleNotFoundError as error:
-        from runner.verbs import extra_of
+    except ImportError as error:
+        from runner.verbs import import_problem
 
-        extra = extra_of((error.name or "").partition(".")[0])
-        if extra is None:
+        if (problem := import_problem(error)) is None:
             raise
-        _complain(f"the Python module {error.name} is not installed: install the extra {extra}, see docs/install.md")
+        _complain(problem)
         return 1
     except KeyboardInterrupt:
         return 128 + (signals.received() or signal.SIGINT)

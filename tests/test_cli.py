@@ -187,6 +187,31 @@ def test_doctor_accepts_a_verb(tod: Command, words: list[str], expected: str) ->
     assert (result.status, result.out) == (2, "") and expected in result.err
 
 
+@pytest.mark.parametrize(
+    "error, expected",
+    [
+        (
+            ImportError("libfreetype.so.6: cannot open", name="matplotlib.ft2font"),
+            "the Python module matplotlib does not load: libfreetype.so.6: cannot open; "
+            "reinstall the extra model, see docs/install.md",
+        ),
+        (ImportError("needs NumPy 2"), "a Python module does not load: needs NumPy 2"),
+        (
+            ModuleNotFoundError("No module", name="paho.mqtt"),
+            "the Python module paho.mqtt is not installed: install the extra live, see docs/install.md",
+        ),
+    ],
+)
+def test_a_library_that_does_not_load_is_named(
+    tod: Command, monkeypatch: pytest.MonkeyPatch, error: ImportError, expected: str
+) -> None:
+    def run(_arguments: object) -> int:
+        raise error
+
+    monkeypatch.setattr("runner.verbs.print.run", run)
+    assert tod("print") == (1, "", f"{expected}\n")
+
+
 # --- closed pipes -----------------------------------------------------------------------------------------------------
 
 

@@ -155,9 +155,17 @@ EXTRAS = {
 }
 
 
-def extra_of(module: str) -> str | None:
-    """The extra that provides a Python module; None: no extra does."""
-    return next((extra for extra, modules in EXTRAS.items() if module in modules), None)
+def import_problem(error: ImportError) -> str | None:
+    """What to tell the user about a library that cannot be imported; None for a mistake in this package."""
+    module = (error.name or "").partition(".")[0]
+    extra = next((extra for extra, modules in EXTRAS.items() if module in modules), None)
+    if isinstance(error, ModuleNotFoundError):
+        missing = f"the Python module {error.name} is not installed"
+        return f"{missing}: install the extra {extra}, see docs/install.md" if extra else None
+    if module == "runner":
+        return None
+    remedy = f"; reinstall the extra {extra}, see docs/install.md" if extra else ""
+    return f"{f'the Python module {module}' if module else 'a Python module'} does not load: {error}{remedy}"
 
 
 @dataclass(frozen=True, slots=True)
