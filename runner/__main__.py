@@ -34,12 +34,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     returns  exit status: 0 fine, 1 a run failed, 2 the user's input is wrong, 129 SIGHUP, 130 Ctrl-C,
              143 SIGTERM
     """
+    _open_standard_streams()
     with signals.handled():
         status = _status(list(sys.argv[1:] if argv is None else argv))
         _flush_or_drop()
         if argv is None and signals.received():
             os._exit(status)  # a normal exit would wait for library threads that may still run Python code
     return status
+
+
+def _open_standard_streams() -> None:
+    """Open /dev/null in place of closed standard streams (`>&-`), whose numbers the next files would get."""
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
+        os.set_inheritable(descriptor, True)
+    os.close(descriptor)
+    for number, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(number, mode, closefd=False))
 
 
 def _flush_or_drop() -> None:

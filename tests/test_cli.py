@@ -253,6 +253,17 @@ def test_a_standard_output_closed_from_the_start(words: list[str]) -> None:
     assert (done.returncode, done.stderr) == (0, b"")
 
 
+@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&-", "<&- >&- 2>&-"])
+@pytest.mark.parametrize(
+    ("words", "status"), [("print source=test", 0), ("print fps_max=0", 2), ("replay source=test", 0)]
+)
+def test_standard_streams_that_are_not_open(closed: str, words: str, status: int) -> None:
+    command = f"'{sys.executable}' -m runner {words} {closed}"
+    done = subprocess.run(["sh", "-c", command], stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
+    assert done.returncode == status, done
+    assert "Traceback" not in done.stderr
+
+
 def test_a_closed_standard_error_does_not_change_the_status() -> None:
     reader, writer = os.pipe()
     os.close(reader)
