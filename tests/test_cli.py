@@ -94,6 +94,17 @@ def test_the_conf_of_the_environment_must_exist_too(tod: Command, monkeypatch: p
     assert tod("print") == (2, "", "command line: conf: /nowhere: no such directory\n")
 
 
+@pytest.mark.parametrize("word", ["vehicle=caf\udce9", "conf=/caf\udce9"])
+def test_a_word_that_is_not_utf_8_is_refused(tod: Command, word: str) -> None:
+    shown = word.replace("\udce9", "\\udce9")
+    assert tod("print", word) == (2, "", f"command line: {shown}: must be UTF-8\n")
+
+
+def test_a_conf_of_the_environment_that_is_not_utf_8_is_refused(tod: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TOD_CONF", "/caf\udce9")
+    assert tod("print") == (2, "", "environment: TOD_CONF: /caf\\udce9: must be UTF-8\n")
+
+
 # --- no GStreamer -----------------------------------------------------------------------------------------------------
 
 

@@ -187,9 +187,11 @@ class Arguments:
     def parse(verb: str, words: Sequence[str]) -> Arguments:
         """Parse the words. A path given to an argument may contain any character, since Hydra never sees it.
 
-        raises  UserError for a flag other than -m, for a name that only another verb takes or that is misspelt, and for
-                an argument without a value
+        raises  UserError for a flag other than -m, for a name that only another verb takes or that is misspelt, for an
+                argument without a value, and for a word that is not UTF-8
         """
+        for word in words:
+            _check_utf8("command line", "", word)
         own = (*VERBS[verb].arguments, "conf")
         sweeps = VERBS[verb].sweeps and "-m" in words
         words = [word for word in words if not (sweeps and word == "-m")]
@@ -213,6 +215,7 @@ class Arguments:
                 _check_name(verb, key)
                 overrides.append(word)
         conf = values.pop("conf", None) or os.environ.get("TOD_CONF")
+        _check_utf8("environment", "TOD_CONF", conf or "")
         return Arguments(verb, overrides, Path(conf) if conf else None, values, tuple(plain), sweeps)
 
     def runs(self) -> list[tuple[tuple[str, ...], Arguments]]:
@@ -280,6 +283,15 @@ def unknown_flag(word: str) -> UserError:
         return UserError("command line", "", word, f"must follow one of {sweeping}")
     rule = next((instead for names, instead in HYDRA_FLAGS.items() if name in names), "write NAME=VALUE, or --help")
     return UserError("command line", "", word, f"flags are not supported; {rule}")
+
+
+def _check_utf8(where: str, key: str, text: str) -> None:
+    """raises UserError for text with undecodable bytes: YAML, JSON and the log could not hold it"""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        found = text.encode("utf-8", "backslashreplace").decode()
+        raise UserError(where, key, found, "must be UTF-8") from None
 
 
 def _check_name(verb: str, key: str) -> None:
