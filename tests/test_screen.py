@@ -49,6 +49,17 @@ def test_what_can_be_written_arrives(capsys: pytest.CaptureFixture[str]) -> None
     assert out == "written\n" and err.endswith(" finishing the files\n")
 
 
+def test_progress_that_does_not_interrupt(monkeypatch: pytest.MonkeyPatch) -> None:
+    def check() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("runner.system.signals.check", check)
+    with progress_bar(interrupts=False) as progress:
+        progress("front", 0.5)
+    with pytest.raises(KeyboardInterrupt), progress_bar() as progress:
+        progress("front", 0.5)
+
+
 def test_the_console_survives_a_line_that_cannot_be_written() -> None:
     seen: list[str] = []
 

@@ -232,7 +232,7 @@ def _check_sources(vehicle: Vehicle) -> None:
 def _shown(vehicle: Vehicle, files: Mapping[str, Path], duration_s: float | None) -> Iterator[Show]:
     """Progress of the recording: bars if its length is known, otherwise figures once a second."""
     if duration_s is not None:
-        with progress_bar() as progress:
+        with progress_bar(interrupts=False) as progress:  # a signal ends the recording in order
 
             def show_share(samples: Mapping[str, Recorded]) -> None:
                 for name, recorded in samples.items():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from types import ModuleType
 from typing import IO, cast
@@ -63,13 +63,14 @@ def say(what: str) -> None:
 
 
 @contextmanager
-def progress_bar() -> Iterator[Progress]:
+def progress_bar(*, interrupts: bool = True) -> Iterator[Progress]:
     """Shows the progress of long work once it is reported. Without a terminal, prints a line for each tenth.
 
-    A signal interrupts work in the main thread when it reports its progress.
+    interrupts  whether a signal interrupts work in the main thread when it reports its progress
     """
+    check = signals.check if interrupts else _no_check
     if not sys.stderr.isatty():
-        yield _progress_lines()
+        yield _progress_lines(check)
         return
     from rich.console import Console
     from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
@@ -80,7 +81,7 @@ def progress_bar() -> Iterator[Progress]:
         tasks: dict[str, int] = {}
 
         def progress(what: str, done: float) -> None:
-            signals.check()
+            check()
             if what not in tasks:
                 tasks[what] = bars.add_task(what, total=1.0)
             bars.update(tasks[what], completed=done)  # type: ignore[arg-type]
@@ -88,11 +89,15 @@ def progress_bar() -> Iterator[Progress]:
         yield progress
 
 
-def _progress_lines() -> Progress:
+def _no_check() -> None:
+    pass
+
+
+def _progress_lines(check: Callable[[], None]) -> Progress:
     tenths: dict[str, int] = {}
 
     def progress(what: str, done: float) -> None:
-        signals.check()
+        check()
         if int(done * 10) != tenths.get(what):
             tenths[what] = int(done * 10)
             say(f"{what}: {done:.0%}")
