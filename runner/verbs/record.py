@@ -150,7 +150,7 @@ class _Session:
             }
             recordings.write_index(self._directory, document)
         kept = [name for name in cameras if name in self._kept]
-        out, err = forgiving(sys.stdout), forgiving(sys.stderr)  # the status says whether the recording is complete
+        out, err = forgiving(sys.stdout), forgiving(sys.stderr)  # a closed pipe leaves the status as it is
         for name in kept:
             print(self._line(name, cameras[name]), file=out)
         for name in kept:
