@@ -31,16 +31,40 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one verb.
 
     argv     None: the process's own; a process ended by a signal then does not return from here
-    returns  exit status: 0 fine, 1 a run failed, 2 the user's input is wrong, 130 Ctrl-C, 143 SIGTERM
+    returns  exit status: 0 fine, 1 a run failed, 2 the user's input is wrong, 129 SIGHUP, 130 Ctrl-C,
+             143 SIGTERM
     """
+    _open_standard_streams()
     with signals.handled():
         status = _status(list(sys.argv[1:] if argv is None else argv))
+        _flush_or_drop()
         if argv is None and signals.received():
-            # A normal exit would wait for library threads that may still run Python code.
-            with suppress(OSError):
-                sys.stdout.flush()
-            os._exit(status)
+            os._exit(status)  # a normal exit would wait for library threads that may still run Python code
     return status
+
+
+def _open_standard_streams() -> None:
+    """Open /dev/null in place of closed standard streams (`>&-`), whose numbers the next files would get."""
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
+        os.set_inheritable(descriptor, True)
+    os.close(descriptor)
+    for number, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(number, mode, closefd=False))
+
+
+def _flush_or_drop() -> None:
+    """Drop output that cannot be written: the interpreter would fail again on its final flush, with status 120."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except OSError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+def _complain(what: object) -> None:
+    with suppress(OSError):  # the status says it, too
+        print(what, file=sys.stderr)
 
 
 def _status(words: list[str]) -> int:  # noqa: PLR0911
@@ -48,31 +72,25 @@ def _status(words: list[str]) -> int:  # noqa: PLR0911
         with signals.interruptible():
             return _run(words)
     except UserError as error:
-        print(error, file=sys.stderr)
+        _complain(error)
         return 2
     except RunError as error:
-        print(error, file=sys.stderr)
+        _complain(error)
         return 1
-    except ModuleNotFoundError as error:
-        from runner.verbs import extra_of
+    except ImportError as error:
+        from runner.verbs import import_problem
 
-        extra = extra_of((error.name or "").partition(".")[0])
-        if extra is None:
+        if (problem := import_problem(error)) is None:
             raise
-        print(
-            f"the Python module {error.name} is not installed: install the extra {extra}, see docs/install.md",
-            file=sys.stderr,
-        )
+        _complain(problem)
         return 1
     except KeyboardInterrupt:
         return 128 + (signals.received() or signal.SIGINT)
-    except BrokenPipeError:
-        # The reader of our output has closed it; the interpreter would fail again on its final flush.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except BrokenPipeError:  # the reader of our output has closed it
         return 0
     except OSError as error:  # a full disk, a file without read permission
         where = f"{error.filename}: " if error.filename else ""
-        print(f"{where}{(error.strerror or str(error)).lower()}", file=sys.stderr)
+        _complain(f"{where}{(error.strerror or str(error)).lower()}")
         return 1
 
 
@@ -107,7 +125,8 @@ def _run(words: list[str]) -> int:
     if arguments.conf is not None and not arguments.conf.is_dir():
         raise UserError("command line", "conf", str(arguments.conf), "no such directory")
     status: int = module.run(arguments)
-    sys.stdout.flush()
+    with suppress(BrokenPipeError):
+        sys.stdout.flush()
     return status
 
 

@@ -30,5 +30,5 @@ def render_missing(vehicle: Vehicle, progress: Progress) -> None:
 
         try:
             render(views, seconds, cache_directory(), progress)
-        except (RuntimeError, OSError) as error:
+        except (RuntimeError, OSError, ImportError) as error:  # numba may be installed, but not load
             raise RunError(f"the synthetic drive cannot be rendered: {error}") from None

@@ -94,6 +94,17 @@ def test_the_conf_of_the_environment_must_exist_too(tod: Command, monkeypatch: p
     assert tod("print") == (2, "", "command line: conf: /nowhere: no such directory\n")
 
 
+@pytest.mark.parametrize("word", ["vehicle=caf\udce9", "conf=/caf\udce9"])
+def test_a_word_that_is_not_utf_8_is_refused(tod: Command, word: str) -> None:
+    shown = word.replace("\udce9", "\\udce9")
+    assert tod("print", word) == (2, "", f"command line: {shown}: must be UTF-8\n")
+
+
+def test_a_conf_of_the_environment_that_is_not_utf_8_is_refused(tod: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TOD_CONF", "/caf\udce9")
+    assert tod("print") == (2, "", "environment: TOD_CONF: /caf\\udce9: must be UTF-8\n")
+
+
 # --- no GStreamer -----------------------------------------------------------------------------------------------------
 
 
@@ -188,6 +199,31 @@ def test_doctor_accepts_a_verb(tod: Command, words: list[str], expected: str) ->
     assert (result.status, result.out) == (2, "") and expected in result.err
 
 
+@pytest.mark.parametrize(
+    "error, expected",
+    [
+        (
+            ImportError("libfreetype.so.6: cannot open", name="matplotlib.ft2font"),
+            "the Python module matplotlib does not load: libfreetype.so.6: cannot open; "
+            "reinstall the extra model, see docs/install.md",
+        ),
+        (ImportError("needs NumPy 2"), "a Python module does not load: needs NumPy 2"),
+        (
+            ModuleNotFoundError("No module", name="paho.mqtt"),
+            "the Python module paho.mqtt is not installed: install the extra live, see docs/install.md",
+        ),
+    ],
+)
+def test_a_library_that_does_not_load_is_named(
+    tod: Command, monkeypatch: pytest.MonkeyPatch, error: ImportError, expected: str
+) -> None:
+    def run(_arguments: object) -> int:
+        raise error
+
+    monkeypatch.setattr("runner.verbs.print.run", run)
+    assert tod("print") == (1, "", f"{expected}\n")
+
+
 # --- closed pipes -----------------------------------------------------------------------------------------------------
 
 
@@ -229,6 +265,26 @@ def test_a_standard_output_closed_from_the_start(words: list[str]) -> None:
     assert (done.returncode, done.stderr) == (0, b"")
 
 
+@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&-", "<&- >&- 2>&-"])
+@pytest.mark.parametrize(
+    ("words", "status"), [("print source=test", 0), ("print fps_max=0", 2), ("replay source=test", 0)]
+)
+def test_standard_streams_that_are_not_open(closed: str, words: str, status: int) -> None:
+    command = f"'{sys.executable}' -m runner {words} {closed}"
+    done = subprocess.run(["sh", "-c", command], stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
+    assert done.returncode == status, done
+    assert "Traceback" not in done.stderr
+
+
+def test_a_closed_standard_error_does_not_change_the_status() -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    words = [sys.executable, "-m", "runner", "print", "fps_max=0"]
+    done = subprocess.run(words, stdout=subprocess.PIPE, stderr=writer, check=False)
+    os.close(writer)
+    assert (done.returncode, done.stdout) == (2, b"")
+
+
 def test_ctrl_c_ends_with_130() -> None:
     replay = subprocess.Popen(
         [sys.executable, "-m", "runner", "replay", *PAPER],
@@ -257,7 +313,7 @@ def test_the_table_of_exit_statuses_has_every_verb(tod: Command) -> None:
     assert verbs == [f"`{verb}`" for verb in VERBS]
     assert main.__doc__
     returned = main.__doc__.partition("exit status: ")[2]
-    assert statuses == re.findall(r"\d+", returned) == ["0", "1", "2", "130", "143"]
+    assert statuses == re.findall(r"\d+", returned) == ["0", "1", "2", "129", "130", "143"]
     for verb in VERBS:
         assert tod(verb, "--nonsense").status == 2
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -18,7 +19,7 @@ import pytest
 from runner.core.events import CameraSwitched
 from runner.drive.log import Log, new_drive
 from runner.drive.read import read_drive
-from runner.errors import UserError
+from runner.errors import RunError, UserError
 from runner.records import LinesDropped, Note
 
 CHECKOUT = Path(__file__).resolve().parents[1]
@@ -159,6 +160,54 @@ def test_a_log_continues_when_the_disk_has_room_again(tmp_path: Path) -> None:
     drive = read_drive(tmp_path)
     assert drive.warnings == []
     assert [note.text.split()[0] for note in drive.sides["vehicle"].of(Note)] == [str(n) for n in range(100)]
+
+
+@pytest.mark.parametrize("call", ["fdatasync", "close"])
+def test_lines_that_may_not_reach_the_disk_are_reported_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str
+) -> None:
+    log_file: list[int] = []
+
+    def fail(descriptor: int) -> None:
+        if descriptor in log_file:
+            raise OSError(errno.EIO, "Input/output error")
+        original(descriptor)
+
+    original = getattr(os, call)
+    monkeypatch.setattr(os, call, fail)
+    monkeypatch.setattr("runner.drive.log.SYNC_S", 0.0)
+    messages: list[str] = []
+    log = Log(tmp_path, "vehicle", {}, {}, messages.append)
+    log_file += [
+        int(each.name) for each in Path("/proc/self/fd").iterdir() if each.resolve() == tmp_path / "drive.jsonl"
+    ]
+    log.begin()
+    for number in range(5):
+        log.note(str(number))
+    log.close()
+    assert messages == ["lines may be missing: drive.jsonl: input/output error"]
+
+
+def test_a_past_drive_that_may_not_reach_the_disk_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(_descriptor: int) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    log = Log(tmp_path, "vehicle", {}, {}, lambda what: None)
+    log.begin(at=0.0)
+    monkeypatch.setattr(os, "fdatasync", fail)
+    with pytest.raises(RunError, match=r"drive\.jsonl: lines may be missing: input/output error"):
+        log.close()
+
+
+def test_a_drive_is_flushed_to_the_disk_while_it_is_logged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    threads: list[str] = []
+    monkeypatch.setattr(os, "fdatasync", lambda _: threads.append(threading.current_thread().name))
+    monkeypatch.setattr("runner.drive.log.SYNC_S", 0.0)
+    log = begun(tmp_path)
+    log.note("first")
+    log.close()
+    assert len(threads) > 3  # after each line, and at the end
+    assert set(threads) == {"log"}
 
 
 def test_a_hanging_disk_does_not_block_and_dropped_lines_are_counted(

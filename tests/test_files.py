@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from helpers import CONF
 
-from runner.system.files import whole_file
+from runner.system.files import unfinished_directory, whole_file, write_whole
 
 PRINT = """\
 from pathlib import Path
-from runner.system.files import whole_file
+from runner.system.files import unfinished_directory, whole_file, write_whole
 print("before", flush=True)
 with whole_file(Path("/dev/stdout")) as file:
     file.write("written\\n")
@@ -38,3 +40,32 @@ def test_a_redirected_standard_output_is_written_to(tmp_path: Path) -> None:
         subprocess.run([sys.executable, "-c", PRINT], stdout=file, cwd=Path(CONF).parent, check=True)
     assert output.read_text() == "before\nwritten\nafter\n"
     assert Path("/dev/stdout").is_symlink()
+
+
+def test_a_finished_file_reaches_the_disk_before_it_gets_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, seen = tmp_path / "map.csv", []
+
+    def fsync(descriptor: int) -> None:
+        flushed = Path(os.readlink(f"/proc/self/fd/{descriptor}"))
+        seen.append(("directory" if flushed == tmp_path else flushed.read_text(), path.exists()))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    write_whole(path, b"whole")
+    assert seen == [("whole", False), ("directory", True)]
+
+
+def test_files_of_a_directory_reach_the_disk_before_it_gets_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, seen = tmp_path / "rosbag2", []
+
+    def fsync(descriptor: int) -> None:
+        seen.append((Path(os.readlink(f"/proc/self/fd/{descriptor}")).name, path.exists()))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    with unfinished_directory(path) as part:
+        part.mkdir()
+        (part / "metadata.yaml").touch()
+    assert seen == [("rosbag2", False), ("metadata.yaml", False), (tmp_path.name, True)]

@@ -13,6 +13,8 @@ from pathlib import Path
 
 import pytest
 from cryptography import x509
+from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives.asymmetric import ec, ed25519
 from cryptography.x509.oid import NameOID
 from helpers import out_of_reach
 
@@ -228,6 +230,46 @@ def test_all_problems_of_a_directory_are_reported_together(authority):
         "own.key: no such file or directory; own.secret: others may read it (mode 644); chmod 600; "
         "media.secret: no such file or directory"
     )
+
+
+def pem(key, encryption):
+    form = (serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8)
+    return key.private_bytes(*form, encryption)
+
+
+@pytest.mark.parametrize(
+    ("file", "content"),
+    [
+        ("authority/issued.json", lambda: b'[{"name": "car"'),
+        ("authority/issued.json", lambda: b"[{}]"),
+        ("car/own.crt", lambda: b"damaged"),
+        ("authority/ca.crt", lambda: b"damaged"),
+        ("authority/authority.key", lambda: b"damaged"),
+        (
+            "authority/authority.key",
+            lambda: pem(ec.generate_private_key(ec.SECP256R1()), serialization.BestAvailableEncryption(b"secret")),
+        ),
+        (
+            "authority/authority.key",
+            lambda: pem(ed25519.Ed25519PrivateKey.generate(), serialization.NoEncryption()),
+        ),
+    ],
+)
+def test_a_damaged_file_is_named(tmp_path, capsys, file, content):
+    output = tmp_path / "keys"
+    assert main(["keys", f"output={output}", *FIRST]) == 0
+    (output / file).write_bytes(content())
+    assert main(["keys", f"output={output}", "watcher=new"]) == 1
+    assert capsys.readouterr().err.startswith(f"{output / file}: not as `tod-runner keys` writes it: ")
+
+
+def test_a_damaged_certificate_is_renewed_as_advised(tmp_path, capsys):
+    output = tmp_path / "keys"
+    assert main(["keys", f"output={output}", *FIRST]) == 0
+    (output / "car/own.crt").write_bytes(b"damaged")
+    assert main(["keys", f"output={output}", "watcher=bob"]) == 1
+    assert capsys.readouterr().err.endswith("; rotate=car renews it\n")
+    assert main(["keys", f"output={output}", "rotate=car"]) == 0
 
 
 def test_two_processes_do_not_change_the_same_keys(authority):

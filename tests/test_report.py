@@ -378,6 +378,20 @@ def test_colours_are_those_of_the_operators_page() -> None:
 # --- mistakes ---------------------------------------------------------------------------------------------------------
 
 
+def test_a_page_of_the_users_own_is_not_overwritten(tod: Command, drive: Path, tmp_path: Path) -> None:
+    own = tmp_path / "index.html"
+    own.write_text("<title>my site</title>")
+    rule = "exists and was not written by tod-runner report; choose another directory"
+    assert tod("report", str(drive), f"output={tmp_path}") == (2, "", f"command line: output: '{own}': {rule}\n")
+    assert own.read_text() == "<title>my site</title>"
+
+
+@pytest.mark.usefixtures("unprinted")
+def test_a_report_is_made_again(tod: Command, drive: Path, tmp_path: Path) -> None:
+    words = ("report", str(drive), f"output={tmp_path}")
+    assert (tod(*words).status, tod(*words).status) == (0, 0)
+
+
 def test_invalid_words(tod: Command, drive: Path, tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.touch()

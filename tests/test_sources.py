@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from runner.configuration.config import configuration
-from runner.errors import ConfigError
+from runner.errors import ConfigError, RunError
 from runner.graph import Plan
-from runner.plans import compile_plans
+from runner.plans import compile_plans, render_missing
 
 LENS = "must lie in ]0, 170] for a pinhole, ]0, 360] for a fisheye"
 
@@ -27,6 +29,17 @@ def test_a_camera_that_the_drive_cannot_show(override: str, line: str) -> None:
         configuration(["source=synthetic", override]).vehicle()
     assert str(raised.value) == f"{line}\n1 problem, nothing was started"
     configuration(["source=test", override]).vehicle()  # other sources accept it
+
+
+def test_a_numba_that_does_not_load_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def render(*_: object) -> None:
+        raise ImportError("Numba needs NumPy 2.0 or less")
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr("runner.synthetic.render", render)
+    vehicle = configuration(["vehicle=delivery_robot", "source=synthetic"]).vehicle()
+    with pytest.raises(RunError, match="the synthetic drive cannot be rendered: Numba needs NumPy"):
+        render_missing(vehicle, lambda *_: None)
 
 
 DEVICES = [f"cameras.{name}.device=/dev/video{n}" for n, name in enumerate(("front", "rear", "mast"))]

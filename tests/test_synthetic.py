@@ -155,6 +155,17 @@ def test_an_interrupt_ends_the_workers_and_leaves_no_partial_clip(world: Path, t
     assert {path.name for path in tmp_path.iterdir()} == {"lock", clip_path(TOP, SECONDS, tmp_path).name}
 
 
+def test_a_signal_is_noticed_while_workers_compile(
+    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def check() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(synthetic.signals, "check", check)
+    with pytest.raises(KeyboardInterrupt):
+        synthetic._distribute([FORWARD], SECONDS, tmp_path, world, lambda *_: pytest.fail("a worker has reported"))
+
+
 @pytest.mark.gst
 def test_failing_worker(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError, match="rendering the drive: FileNotFoundError"):

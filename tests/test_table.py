@@ -67,6 +67,11 @@ KBPS = "must be a finite number of kbit/s, 0 or more"
         ("lon,lat,kbps\n1,nan,9\n", ":2: lat nan", "must lie in [-90, 90] degrees; are lon and lat swapped?"),
         ("lon,lat,kbps\n181,2,9\n", ":2: lon 181", "must lie in [-180, 180] degrees"),
         ("lon,lat,kbps\n1_0,2,9\n", "", "must contain only plain decimal numbers"),
+        (
+            'lon,lat,kbps\n1,2,3\n1,"2,3\n' + 30_000 * "1,2,3\n",
+            ":3: field larger than field limit (131072)",
+            "must be CSV; is a closing quote missing?",
+        ),
         ("lon,lat,kbps\n1,2,\udcff\n", ":2: kbps '\ufffd'", "must be a number"),
     ],
 )

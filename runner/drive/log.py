@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import json
 import os
@@ -42,6 +43,7 @@ FILES = {"vehicle": "drive.jsonl", "operator": "operator.jsonl", "link": "link.j
 QUEUED_LINES = 10_000  # more than two minutes of a vehicle with eight cameras
 # Records of numbers and the rules' own texts; redacting a decision takes twenty times as long as making it.
 WITHOUT_ADDRESSES = (DecisionMade, LinkSample, ReceptionReported, Telemetry)
+SYNC_S = 1.0  # a power failure loses about as much, and the queued lines
 RETRY_S = 1.0  # time between attempts to write to a full disk
 CLOSE_S = 5.0  # a disk that is stuck for longer does not keep the process from ending
 
@@ -141,8 +143,8 @@ class Log:
             file, self._file = self._file, None
         if writer:
             writer.close(_encoded(ended))
-        elif file:
-            file.close(keep=self._began is not None)
+        elif file and (why := file.close(keep=self._began is not None)):
+            raise RunError(f"{file.path}: lines may be missing: {why}")
 
     def discard(self) -> None:
         """Discard the log of a past drive that was not completed."""
@@ -185,18 +187,36 @@ class _File:
         except OSError as error:
             with suppress(OSError):
                 os.ftruncate(self._fd, self._size)
-            return (error.strerror or str(error)).lower()
+            return _reason(error)
         self._size += len(data)
         return None
 
-    def close(self, keep: bool) -> None:
-        os.close(self._fd)
+    def sync(self) -> str | None:
+        """Flush it to the disk; returns why lines may be missing, None if none are."""
+        try:
+            os.fdatasync(self._fd)
+        except OSError as error:
+            return None if error.errno == errno.EINVAL else _reason(error)  # some file systems cannot
+        return None
+
+    def close(self, keep: bool) -> str | None:
+        """Close or remove it; returns as `sync`."""
+        why = self.sync() if keep else None
+        try:
+            os.close(self._fd)
+        except OSError as error:
+            why = why or _reason(error)
         if keep:
-            return
+            return why
         self.path.unlink(missing_ok=True)
         if self._new:
             with suppress(OSError):  # it holds other files by now
                 self.path.parent.rmdir()
+        return None
+
+
+def _reason(error: OSError) -> str:
+    return (error.strerror or str(error)).lower()
 
 
 class _Writer:
@@ -210,6 +230,7 @@ class _Writer:
         self._file, self._dropped, self._on_report = file, dropped, on_report
         self._queue: queue.Queue[bytes | None] = queue.Queue(QUEUED_LINES)
         self._lost = 0
+        self._reported = False  # that lines may be missing
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="log", daemon=True)
         self._thread.start()
@@ -236,10 +257,20 @@ class _Writer:
             self._on_report(f"{self._file.path.name}: {waiting} lines were not written")
 
     def _run(self) -> None:
+        synced = time.monotonic()
         while (data := self._queue.get()) is not None:
             if not self._write(data):
                 break
-        self._file.close(keep=True)
+            if time.monotonic() - synced >= SYNC_S:
+                self._report(self._file.sync())
+                synced = time.monotonic()
+        self._report(self._file.close(keep=True))
+
+    def _report(self, why: str | None) -> None:
+        """Report once that lines may be missing."""
+        if why and not self._reported:
+            self._reported = True
+            self._on_report(f"lines may be missing: {self._file.path.name}: {why}")
 
     def _write(self, data: bytes) -> bool:
         """Write a line, with retries; False if the log is closed before it is written."""
@@ -264,7 +295,7 @@ def check_free(directory: Path, side: str) -> None:
         if os.path.lexists(path) and not (path.is_file() and path.stat().st_size == 0):
             raise _refused(directory, f"already contains a drive ({FILES[side]}), choose another directory")
     except OSError as error:
-        raise _refused(directory, (error.strerror or str(error)).lower()) from None
+        raise _refused(directory, _reason(error)) from None
 
 
 def new_drive(parent: Path) -> Path:
@@ -294,7 +325,7 @@ def _create(directory: Path, side: str) -> int:
             directory, f"another process is about to write {FILES[side]}, choose another directory"
         ) from None
     except OSError as error:
-        raise _refused(directory, (error.strerror or str(error)).lower()) from None
+        raise _refused(directory, _reason(error)) from None
 
 
 def _remove_abandoned(path: Path) -> None:

@@ -89,11 +89,17 @@ def _csv(path: Path, columns: Sequence[Column]) -> _Text:
     index = [found.index(name) for name in names]
 
     def rows() -> Iterator[tuple[int, Sequence[str]]]:
+        line = 0
         with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
             reader = csv.reader(file)
-            next(reader)
-            for row in filter(None, reader):
-                yield reader.line_num, [row[i].strip() if i < len(row) else "" for i in index]
+            try:
+                for row in reader:
+                    if line and row:
+                        yield reader.line_num, [row[i].strip() if i < len(row) else "" for i in index]
+                    line = reader.line_num
+            except csv.Error as error:
+                rule = "must be CSV; is a closing quote missing?"
+                raise ModelError("file", f"{path}:{line + 1}: {error}", rule) from None
 
     with path.open(encoding="utf-8-sig", errors="replace") as file, warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # about an empty table, which `_checked` refuses

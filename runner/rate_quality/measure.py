@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
     from runner.rate_quality.metrics import Mask
 
+FILES = (".yaml", ".model.json", ".png", ".pdf")  # of a model, by the ends of their names
 LATER_ROUNDS = 0.3  # work that the adaptive plan is expected to add, as a share of the first round's
 
 
@@ -50,7 +51,8 @@ def measure(
     cache = Cache(cache_directory() / "points", on_note)
     alone = {name: (name,) for name in sequences if not any(name in members for members in study.pool.values())}
     models = {**alone, **study.pool}
-    _check_output(output, models)
+    inputs = [*study.masks.values(), *(clip for clip in sequences.values() if isinstance(clip, Path))]
+    _check_output(output, models, inputs)
     clips = {name: survey(path, cache, on_note) for name, path in sequences.items()}
     parallel = parallel_tasks(study.parallel)
     with open_executor(study.workers, study.scheduler, parallel) as executor:
@@ -60,8 +62,8 @@ def measure(
             yield _write(measured, output, sweeps)
 
 
-def _check_output(output: Path, models: Iterable[str]) -> None:
-    """Check before hours of work that models can be written there and would not overwrite other camera files.
+def _check_output(output: Path, models: Iterable[str], inputs: Iterable[Path]) -> None:
+    """Check before hours of work that models can be written there and would overwrite only models.
 
     raises  UserError
     """
@@ -72,10 +74,16 @@ def _check_output(output: Path, models: Iterable[str]) -> None:
     except OSError as error:
         rule = f"cannot be written to: {(error.strerror or str(error)).lower()}"
         raise UserError("command line", "output", repr(str(output)), rule) from None
-    for path in (output / f"{model}.yaml" for model in models):
-        if path.exists() and MARK not in path.read_text(encoding="utf-8", errors="replace"):
-            rule = "exists and was not written by tod-runner model; choose another directory"
-            raise UserError("command line", "output", repr(str(path)), rule)
+    read = {path.resolve() for path in inputs}
+    for model in models:
+        paths = [output / f"{model}{end}" for end in FILES]
+        replaceable = paths[0].is_file() and MARK in paths[0].read_text(encoding="utf-8", errors="replace")
+        for path in filter(Path.exists, paths):
+            if path.resolve() in read:
+                raise UserError("command line", "output", repr(str(path)), "is an input; choose another directory")
+            if not replaceable:
+                rule = "exists and was not written by tod-runner model; choose another directory"
+                raise UserError("command line", "output", repr(str(path)), rule)
 
 
 def _metric(study: Study, name: str) -> Metric:
@@ -229,8 +237,9 @@ def _write(measured: Measured, output: Path, sweeps: Sequence[Sweep]) -> str:
     """Write all files of a model; returns the line that reports them."""
     from runner.rate_quality.plots import plot
 
-    write_whole(output / f"{measured.name}.model.json", dumps(to_json(measured)))
+    # The YAML first: its mark lets the next run replace the others, see `_check_output`.
     write_whole(output / f"{measured.name}.yaml", to_yaml(measured).encode())
+    write_whole(output / f"{measured.name}.model.json", dumps(to_json(measured)))
     plot(measured, output / measured.name)
     choice = measured.choice
     pairs = zip(choice.scaling, choice.b_min, strict=True)

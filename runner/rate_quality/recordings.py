@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Any
 from runner.core.model import Camera, Recording
 from runner.errors import RunError, UserError
 from runner.redact import redacted
-from runner.system.files import unfinished
+from runner.system.files import put_in_place, unfinished
 
 INDEX = "recording.json"
 LEAST_S = 60  # a recording of open length needs space for at least this long
@@ -100,9 +99,7 @@ def keep(directory: Path, camera: str) -> Path:
     try:
         if path.exists():
             raise RunError(f"{path} was created in the meantime; the recording is {incomplete}")
-        _flush(incomplete)
-        incomplete.rename(path)
-        _flush(directory)
+        put_in_place(incomplete, path)
     except OSError as error:
         raise RunError(f"{incomplete} cannot become {path.name}: {error.strerror}") from None
     return path
@@ -124,15 +121,5 @@ def write_index(directory: Path, document: Mapping[str, Any]) -> None:
     try:
         with unfinished(directory / INDEX) as new:
             new.write_text(text + "\n", encoding="utf-8")
-            _flush(new)
     except OSError as error:
         raise RunError(f"{directory / INDEX} cannot be written: {error.strerror}; the videos are complete") from None
-
-
-def _flush(path: Path) -> None:
-    """Flush a file or a directory to the disk."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

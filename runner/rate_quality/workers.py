@@ -8,11 +8,11 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
-from multiprocessing import get_context
+from multiprocessing import active_children
 from typing import ParamSpec, TypeVar
 
 from runner.errors import RunError
-from runner.system.bound import die_with
+from runner.system.spawned import WorkerContext
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -36,15 +36,14 @@ def open_executor(workers: str, scheduler: str | None, parallel: int) -> Iterato
         with _dask(scheduler, parallel) as executor:
             yield executor
         return
-    # GStreamer's threads do not survive a fork.
     pool: Executor
-    if workers == "threads":
-        pool = ThreadPoolExecutor(parallel)
-    else:
-        # Without this, idle workers would wait forever for a killed process.
-        pool = ProcessPoolExecutor(parallel, get_context("spawn"), initializer=die_with, initargs=(os.getpid(),))
+    pool = ThreadPoolExecutor(parallel) if workers == "threads" else ProcessPoolExecutor(parallel, WorkerContext())
     try:
         yield pool
+    except BaseException:
+        for worker in active_children():  # tasks may take minutes
+            worker.kill()
+        raise
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 

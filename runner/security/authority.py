@@ -28,7 +28,15 @@ from runner.core.roles import VIEWERS, Role
 from runner.errors import RunError, UserError
 from runner.security import keyring
 from runner.security.broker_files import access_list, broker_settings
-from runner.security.certificates import Pair, is_host, new_authority, new_certificate, revocation_list, serial_of
+from runner.security.certificates import (
+    Pair,
+    is_host,
+    new_authority,
+    new_certificate,
+    revocation_list,
+    serial_of,
+    signing_key,
+)
 from runner.system.files import read_file, unfinished
 
 NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")  # as in MQTT topics; 64 is the longest common name of a certificate
@@ -136,7 +144,13 @@ class Authority:
 
     @property
     def _pair(self) -> Pair:
-        return Pair(_read(self._own / keyring.AUTHORITY), _read(self._own / AUTHORITY_KEY))
+        certificate, key = self._own / keyring.AUTHORITY, self._own / AUTHORITY_KEY
+        pair = Pair(_read(certificate), _read(key))
+        with _damage_reported(certificate):
+            serial_of(pair.certificate)
+        with _damage_reported(key):
+            signing_key(pair.key)
+        return pair
 
     def _create(self) -> None:
         pair = new_authority("tod-runner authority", self.now())
@@ -146,7 +160,9 @@ class Authority:
         self._write_issued([])  # last: marks the authority as complete
 
     def _issued(self) -> list[Issued]:
-        return msgspec.json.decode(_read(self._own / ISSUED), type=list[Issued])
+        path = self._own / ISSUED
+        with _damage_reported(path):
+            return msgspec.json.decode(_read(path), type=list[Issued])
 
     def _write_issued(self, issued: list[Issued]) -> None:
         _write(self._own / ISSUED, msgspec.json.format(msgspec.json.encode(issued)))
@@ -169,7 +185,10 @@ class Authority:
     def _in_use(self, issued: Issued) -> bool:
         """Whether a holder has this certificate: a killed run may not have written it."""
         certificate = self.directory / issued.name / keyring.CERTIFICATE
-        return not issued.revoked and certificate.exists() and serial_of(_read(certificate)) == int(issued.serial, 16)
+        if issued.revoked or not certificate.exists():
+            return False
+        with _damage_reported(certificate, f"rotate={issued.name} renews it"):
+            return serial_of(_read(certificate)) == int(issued.serial, 16)
 
     def _renew(self, name: str, role: Role, hosts: tuple[str, ...]) -> None:
         # Listed before anybody has it: a serial number unknown to the authority could never be revoked.
@@ -278,8 +297,15 @@ def _write(path: Path, content: bytes) -> None:
         mode = 0o644 if path.name in keyring.PUBLIC else 0o600
         with open(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
             file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
+
+
+@contextmanager
+def _damage_reported(path: Path, remedy: str = "restore it from a backup") -> Iterator[None]:
+    """raises RunError for a file with content that `tod-runner keys` does not write"""
+    try:
+        yield
+    except (ValueError, msgspec.MsgspecError) as error:
+        raise RunError(f"{path}: not as `tod-runner keys` writes it: {error}; {remedy}") from None
 
 
 @contextmanager

@@ -10,6 +10,7 @@ from datetime import datetime, timedelta
 from typing import NamedTuple
 
 from cryptography import x509
+from cryptography.exceptions import UnsupportedAlgorithm
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
@@ -90,7 +91,10 @@ def revocation_list(authority: Pair, revoked: Iterable[tuple[int, datetime]], no
 
 
 def serial_of(certificate: bytes) -> int:
-    """Serial number of a certificate, PEM."""
+    """Serial number of a certificate, PEM.
+
+    raises  ValueError
+    """
     return x509.load_pem_x509_certificate(certificate).serial_number
 
 
@@ -100,6 +104,20 @@ def serials_of(crl: bytes) -> frozenset[int]:
     raises  ValueError
     """
     return frozenset(entry.serial_number for entry in x509.load_pem_x509_crl(crl))
+
+
+def signing_key(key: bytes) -> ec.EllipticCurvePrivateKey:
+    """An authority's private key, PEM.
+
+    raises  ValueError
+    """
+    try:
+        loaded = serialization.load_pem_private_key(key, password=None)
+    except (TypeError, UnsupportedAlgorithm) as error:  # it has a passphrase
+        raise ValueError(str(error)) from None
+    if not isinstance(loaded, ec.EllipticCurvePrivateKey):
+        raise ValueError("the key does not belong to an elliptic curve")
+    return loaded
 
 
 def _builder(
@@ -151,9 +169,7 @@ def _general_name(host: str) -> x509.GeneralName:
 
 
 def _loaded(authority: Pair) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
-    key = serialization.load_pem_private_key(authority.key, password=None)
-    assert isinstance(key, ec.EllipticCurvePrivateKey)
-    return x509.load_pem_x509_certificate(authority.certificate), key
+    return x509.load_pem_x509_certificate(authority.certificate), signing_key(authority.key)
 
 
 def _pem(certificate: x509.Certificate) -> bytes:

@@ -11,7 +11,6 @@ import fcntl
 import multiprocessing
 import os
 import shutil
-import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
@@ -21,11 +20,16 @@ from pathlib import Path
 
 from runner.clips import View, clip_path
 from runner.core.model import Progress
+from runner.system import signals
+from runner.system.files import put_in_place
+from runner.system.spawned import WorkerContext
 
 SHORTEST_S = 4
 BYTES_PER_PIXEL = 0.15  # upper estimate of a clip's size, for the check of disk space
 UNFINISHED = ".part"
 REPORT_EVERY_S = 0.25  # of drive
+CHECK_S = 0.25  # between checks for a signal, while workers compile or render
+KILLED_S = 1.0  # a killed worker ends within this time, unless it is blocked in the kernel
 
 
 def render(views: Sequence[View], seconds: float, cache: Path, progress: Progress) -> None:
@@ -122,7 +126,8 @@ def _distribute(views: Sequence[View], seconds: float, cache: Path, world: Path,
         for pipe in workers:
             pipe.send(waiting.pop(0))
         while clips < len(views):
-            ready = wait(list(workers))
+            ready = wait(list(workers), CHECK_S)
+            signals.check()
             for pipe in (pipe for pipe in workers if pipe in ready):
                 report = _receive(pipe, workers[pipe])
                 if isinstance(report, int):
@@ -134,14 +139,14 @@ def _distribute(views: Sequence[View], seconds: float, cache: Path, world: Path,
                 progress(f"rendering the drive, {clips} of {len(views)} clips", min(done / total, 1.0))
     finally:
         for pipe, worker in workers.items():
-            worker.terminate()
-            worker.join()
+            worker.kill()
             pipe.close()
+        for worker in workers.values():
+            worker.join(KILLED_S)
 
 
 def _start_worker(seconds: float, cache: Path, world: Path) -> tuple[Connection, BaseProcess]:
-    """Start a fresh interpreter: a fork of a process that has used GStreamer or threads may hang."""
-    context = multiprocessing.get_context("spawn")
+    context = WorkerContext()
     ours, theirs = context.Pipe()
     worker = context.Process(target=_work, args=(theirs, seconds, cache, world), daemon=True)
     worker.start()
@@ -154,7 +159,7 @@ def _receive(pipe: Connection, worker: BaseProcess) -> int | None:
     try:
         report = pipe.recv()
     except (EOFError, ConnectionResetError):
-        worker.join()
+        worker.join(KILLED_S)
         raise RuntimeError(f"rendering the drive: a worker died with exit code {worker.exitcode}") from None
     if isinstance(report, str):
         raise RuntimeError(f"rendering the drive: {report}")
@@ -162,8 +167,7 @@ def _receive(pipe: Connection, worker: BaseProcess) -> int | None:
 
 
 def _work(pipe: Connection, seconds: float, cache: Path, world: Path) -> None:
-    """A worker's main loop: receives views, sends reports. The parent handles Ctrl-C and ends the worker."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """A worker's main loop: receives views, sends reports."""
     while True:
         try:
             view = pipe.recv()
@@ -180,7 +184,7 @@ def _work(pipe: Connection, seconds: float, cache: Path, world: Path) -> None:
 
 
 def _render_clip(view: View, seconds: float, cache: Path, world: Path, report: Callable[[int], None]) -> None:
-    """Render to a temporary file and rename it: a clip is complete or does not exist."""
+    """Render to a temporary file first: a clip is complete or does not exist."""
     from runner.apply import write_clip
     from runner.synthetic.picture import pictures
 
@@ -195,4 +199,4 @@ def _render_clip(view: View, seconds: float, cache: Path, world: Path, report: C
                 report(view.width * view.height * ((number - 1) % every + 1))
 
     write_clip(unfinished, counted(), view.width, view.height, view.fps)
-    unfinished.replace(clip)
+    put_in_place(unfinished, clip)

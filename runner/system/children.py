@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import IO
 
@@ -32,13 +33,14 @@ def environment() -> dict[str, str]:
 def end(process: subprocess.Popen[bytes] | subprocess.Popen[str], within_s: float) -> bool:
     """Wait for a process that has been asked to end, and kill it after a timeout.
 
-    returns  whether it ended without being killed
+    returns  whether it ended without being killed; a killed one that is blocked in the kernel may still run
     """
     try:
         process.wait(within_s)
     except subprocess.TimeoutExpired:
         process.kill()
-        process.wait(KILLED_S)
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(KILLED_S)
         return False
     return True
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 from collections.abc import Iterator
@@ -17,6 +18,25 @@ from runner.system.signals import urgent
 MAX_LINKS = 40  # as the kernel follows
 
 
+def flush(path: Path) -> None:
+    """Flush a file or a directory to the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno != errno.EINVAL:  # some file systems cannot flush directories
+            raise
+    finally:
+        os.close(descriptor)
+
+
+def put_in_place(part: Path, path: Path) -> None:
+    """Give a finished file its name: also after a power failure it is complete, or the previous one is there."""
+    flush(part)
+    part.replace(path)
+    flush(path.parent)
+
+
 @contextmanager
 def unfinished(path: Path) -> Iterator[Path]:
     """A temporary path to write to; the finished file replaces `path`, an unfinished one is removed."""
@@ -24,7 +44,7 @@ def unfinished(path: Path) -> Iterator[Path]:
     with urgent(lambda: part.unlink(missing_ok=True)):
         try:
             yield part
-            part.replace(path)
+            put_in_place(part, path)
         finally:
             part.unlink(missing_ok=True)
 
@@ -37,7 +57,10 @@ def unfinished_directory(path: Path) -> Iterator[Path]:
         try:
             above.mkdir()
             yield above / path.name
+            for each in above.rglob("*"):
+                flush(each)
             (above / path.name).rename(path)
+            flush(path.parent)
         finally:
             rmtree(above, ignore_errors=True)
 

@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM, the same for every verb.
+"""SIGINT, SIGTERM and SIGHUP, the same for every verb; with `nohup`, SIGHUP stays ignored.
 
 The first signal asks the verb to end. It raises KeyboardInterrupt in the main thread or, after `stopping`, sets a
 `Stop` that the verb checks. A second signal ends the process immediately, and so does a shutdown that exceeds its
@@ -25,7 +25,7 @@ from types import FrameType
 LIFELINE = "TOD_RUNNER_LIFELINE"  # environment variable: descriptor of a pipe whose other end is open in the parent
 END_S = 2.0  # how long an orderly shutdown may take
 URGENT_S = 0.5  # how long cleanup may take without an orderly shutdown
-NUMBERS = (signal.SIGINT, signal.SIGTERM)
+NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 Action = Callable[[], object]
 
@@ -46,7 +46,7 @@ class Stop:
 
     @property
     def status(self) -> int:
-        """Exit status of a verb that ends normally: 130 after Ctrl-C, 0 after SIGTERM or without a signal."""
+        """Exit status of a verb that ends normally: 130 after Ctrl-C, otherwise 0."""
         return 128 + signal.SIGINT if self.is_set() and _watch.number == signal.SIGINT else 0
 
     def set(self) -> None:
@@ -78,7 +78,8 @@ class _Watch:
         read, write = os.pipe()
         os.set_blocking(write, False)
         self._wakeup, self._over = write, False
-        before = [signal.signal(number, self._on_signal) for number in NUMBERS]
+        ignored = {signal.SIGHUP} if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN else set()
+        before = {number: signal.signal(number, self._on_signal) for number in NUMBERS if number not in ignored}
         wakeup = signal.set_wakeup_fd(write, warn_on_full_buffer=False)
         thread = threading.Thread(target=self._run, args=(read, _lifeline()), name="signals", daemon=True)
         thread.start()
@@ -90,7 +91,7 @@ class _Watch:
             # Joined first: it may still receive a signal, and Python reports one whose handler has been removed.
             thread.join(END_S)
             signal.set_wakeup_fd(wakeup)
-            for number, handler in zip(NUMBERS, before, strict=True):
+            for number, handler in before.items():
                 signal.signal(number, handler)
             if not thread.is_alive():
                 os.close(write)

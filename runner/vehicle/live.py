@@ -189,7 +189,8 @@ class _Console:
 
     def _run(self) -> None:
         while (line := self._lines.get()) is not None:
-            self._say(line)
+            with suppress(OSError):  # a closed pipe or a full disk must not end it
+                self._say(line)
 
 
 class _VehicleControl:

@@ -155,9 +155,17 @@ EXTRAS = {
 }
 
 
-def extra_of(module: str) -> str | None:
-    """The extra that provides a Python module; None: no extra does."""
-    return next((extra for extra, modules in EXTRAS.items() if module in modules), None)
+def import_problem(error: ImportError) -> str | None:
+    """What to tell the user about a library that cannot be imported; None for a mistake in this package."""
+    module = (error.name or "").partition(".")[0]
+    extra = next((extra for extra, modules in EXTRAS.items() if module in modules), None)
+    if isinstance(error, ModuleNotFoundError):
+        missing = f"the Python module {error.name} is not installed"
+        return f"{missing}: install the extra {extra}, see docs/install.md" if extra else None
+    if module == "runner":
+        return None
+    remedy = f"; reinstall the extra {extra}, see docs/install.md" if extra else ""
+    return f"{f'the Python module {module}' if module else 'a Python module'} does not load: {error}{remedy}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,9 +187,11 @@ class Arguments:
     def parse(verb: str, words: Sequence[str]) -> Arguments:
         """Parse the words. A path given to an argument may contain any character, since Hydra never sees it.
 
-        raises  UserError for a flag other than -m, for a name that only another verb takes or that is misspelt, and for
-                an argument without a value
+        raises  UserError for a flag other than -m, for a name that only another verb takes or that is misspelt, for an
+                argument without a value, and for a word that is not UTF-8
         """
+        for word in words:
+            _check_utf8("command line", "", word)
         own = (*VERBS[verb].arguments, "conf")
         sweeps = VERBS[verb].sweeps and "-m" in words
         words = [word for word in words if not (sweeps and word == "-m")]
@@ -205,6 +215,7 @@ class Arguments:
                 _check_name(verb, key)
                 overrides.append(word)
         conf = values.pop("conf", None) or os.environ.get("TOD_CONF")
+        _check_utf8("environment", "TOD_CONF", conf or "")
         return Arguments(verb, overrides, Path(conf) if conf else None, values, tuple(plain), sweeps)
 
     def runs(self) -> list[tuple[tuple[str, ...], Arguments]]:
@@ -272,6 +283,15 @@ def unknown_flag(word: str) -> UserError:
         return UserError("command line", "", word, f"must follow one of {sweeping}")
     rule = next((instead for names, instead in HYDRA_FLAGS.items() if name in names), "write NAME=VALUE, or --help")
     return UserError("command line", "", word, f"flags are not supported; {rule}")
+
+
+def _check_utf8(where: str, key: str, text: str) -> None:
+    """raises UserError for text with undecodable bytes: YAML, JSON and the log could not hold it"""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        found = text.encode("utf-8", "backslashreplace").decode()
+        raise UserError(where, key, found, "must be UTF-8") from None
 
 
 def _check_name(verb: str, key: str) -> None:

@@ -295,7 +295,8 @@ def _end(sides: Iterable[VerbProcess]) -> None:
         side.request_end()
     for side in sides:
         if not children.end(side.process, max(0.0, until - time.monotonic())):
-            say(f"{side.name} did not end within {SIDE_END_S:g} s and was killed")
+            left = " but still runs, blocked in the kernel" if side.poll() is None else ""
+            say(f"{side.name} did not end within {SIDE_END_S:g} s and was killed{left}")
 
 
 @contextmanager

@@ -82,8 +82,8 @@ def run(arguments: Arguments) -> int:
             stack.enter_context(_looped_vehicle(arguments, camera, [f"keys={keys.vehicle}"] if keys else []))
         operator = stack.enter_context(live_operator(own, arguments.conf))
         page = PageServer(operator.vehicle, operator.station, on_counter, keyring=page_keys)
-        stack.callback(page.stop)
         page.start()
+        stack.callback(page.stop)
         operator.station.listeners += [page, _Notes()]
         if not looped:
             say(f"show {page.url}counter on this machine's screen to camera {camera.name}")

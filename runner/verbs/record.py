@@ -34,7 +34,7 @@ from runner.plans import compile_plans, render_missing
 from runner.rate_quality import recordings
 from runner.system.signals import Stop, stopping
 from runner.verbs import Arguments
-from runner.verbs.screen import progress_bar, say, streaming
+from runner.verbs.screen import forgiving, progress_bar, say, streaming
 
 if TYPE_CHECKING:
     from runner.apply import Recorded, RecordingSide
@@ -150,11 +150,12 @@ class _Session:
             }
             recordings.write_index(self._directory, document)
         kept = [name for name in cameras if name in self._kept]
+        out, err = forgiving(sys.stdout), forgiving(sys.stderr)  # a closed pipe leaves the status as it is
         for name in kept:
-            print(self._line(name, cameras[name]))
+            print(self._line(name, cameras[name]), file=out)
         for name in kept:
             for warning in _warnings(self._ended[name]):
-                print(f"{name}: {warning}", file=sys.stderr)
+                print(f"{name}: {warning}", file=err)
 
     def _entry(self, camera: Camera, recorded: Recorded) -> dict[str, Any]:
         kept = camera.name in self._kept
@@ -231,7 +232,7 @@ def _check_sources(vehicle: Vehicle) -> None:
 def _shown(vehicle: Vehicle, files: Mapping[str, Path], duration_s: float | None) -> Iterator[Show]:
     """Progress of the recording: bars if its length is known, otherwise figures once a second."""
     if duration_s is not None:
-        with progress_bar() as progress:
+        with progress_bar(interrupts=False) as progress:  # a signal ends the recording in order
 
             def show_share(samples: Mapping[str, Recorded]) -> None:
                 for name, recorded in samples.items():

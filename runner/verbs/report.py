@@ -32,7 +32,9 @@ if TYPE_CHECKING:
     from runner.drive.read import Drive
     from runner.drive.statistics import DriveStatistics
 
-DOCUMENT = "report.json"
+PAGE, DOCUMENT = "index.html", "report.json"
+MARK = '<meta name="generator" content="tod-runner report">'  # in each page, see runner/drive/static/report.html
+MARK_WITHIN = 1000  # characters from the start of a page
 
 
 def run(arguments: Arguments) -> int:
@@ -74,7 +76,7 @@ def report(
         write_figures(made, output, progress)
         summary = document.to_json(drives, checks_by_label, [figure.name for figure in made], left_out)
         write_whole(output / DOCUMENT, dumps(summary))
-        index = output / "index.html"
+        index = output / PAGE
         write_whole(index, page(drives, checks_by_label, made, left_out).encode())
     show(drives, checks_by_label, left_out)
     return index
@@ -88,9 +90,19 @@ def check_report(output: Path, models: Path | None) -> None:
     above = next((path for path in (output, *output.parents) if path.exists()), Path())
     if not above.is_dir():
         raise UserError("command line", "output", repr(str(output)), f"must be a directory, but {above} is a file")
+    if (output / PAGE).exists() and not _is_report(output / PAGE):
+        rule = "exists and was not written by tod-runner report; choose another directory"
+        raise UserError("command line", "output", repr(str(output / PAGE)), rule)
     if models and not models.is_dir():
         raise UserError("command line", "models", repr(str(models)), "no such directory")
     _need_libraries()
+
+
+def _is_report(page: Path) -> bool:
+    if not page.is_file():
+        return False
+    with page.open(encoding="utf-8", errors="replace") as file:
+        return MARK in file.read(MARK_WITHIN)
 
 
 def _paths(arguments: Arguments) -> tuple[list[Path], Path]:

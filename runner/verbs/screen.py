@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from types import ModuleType
+from typing import IO, cast
 
 from runner.core.model import Progress
 from runner.errors import MissingBindings, RunError
@@ -30,32 +31,57 @@ def streaming() -> ModuleType:
     return apply
 
 
+class _Forgiving:
+    """A stream that drops what cannot be written."""
+
+    def __init__(self, stream: IO[str]) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        with suppress(OSError):
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        with suppress(OSError):
+            self._stream.flush()
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._stream, name)
+
+
+def forgiving(stream: IO[str]) -> IO[str]:
+    """A stream for output of work that must not end because of a closed pipe or terminal, or a full disk."""
+    return cast("IO[str]", _Forgiving(stream))
+
+
 def say(what: str) -> None:
-    """Print one line to standard error, with the time of day."""
+    """Print one line to standard error, with the time of day; it is dropped if it cannot be written."""
     now = time.time()
     clock = time.strftime("%H:%M:%S", time.localtime(now))
-    print(f"{clock}.{int(now * 1000) % 1000:03d} {printable(what)}", file=sys.stderr, flush=True)
+    print(f"{clock}.{int(now * 1000) % 1000:03d} {printable(what)}", file=forgiving(sys.stderr), flush=True)
 
 
 @contextmanager
-def progress_bar() -> Iterator[Progress]:
+def progress_bar(*, interrupts: bool = True) -> Iterator[Progress]:
     """Shows the progress of long work once it is reported. Without a terminal, prints a line for each tenth.
 
-    A signal interrupts work in the main thread when it reports its progress.
+    interrupts  whether a signal interrupts work in the main thread when it reports its progress
     """
+    check = signals.check if interrupts else _no_check
     if not sys.stderr.isatty():
-        yield _progress_lines()
+        yield _progress_lines(check)
         return
     from rich.console import Console
     from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
     from rich.progress import Progress as Bars
 
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-    with Bars(*columns, console=Console(stderr=True)) as bars:
+    with Bars(*columns, console=Console(file=forgiving(sys.stderr))) as bars:
         tasks: dict[str, int] = {}
 
         def progress(what: str, done: float) -> None:
-            signals.check()
+            check()
             if what not in tasks:
                 tasks[what] = bars.add_task(what, total=1.0)
             bars.update(tasks[what], completed=done)  # type: ignore[arg-type]
@@ -63,11 +89,15 @@ def progress_bar() -> Iterator[Progress]:
         yield progress
 
 
-def _progress_lines() -> Progress:
+def _no_check() -> None:
+    pass
+
+
+def _progress_lines(check: Callable[[], None]) -> Progress:
     tenths: dict[str, int] = {}
 
     def progress(what: str, done: float) -> None:
-        signals.check()
+        check()
         if int(done * 10) != tenths.get(what):
             tenths[what] = int(done * 10)
             say(f"{what}: {done:.0%}")

@@ -23,6 +23,7 @@ from runner.operator.station import CameraRow, Listener
 from runner.records import Note
 from runner.redact import printable
 from runner.system.signals import urgent
+from runner.verbs.screen import forgiving
 
 PLAIN_EVERY_S = 5.0
 NOTES = 4
@@ -30,10 +31,10 @@ MAX_PENDING = 1000
 
 
 class LiveTable(Listener):
-    """Shown in place on a terminal, every few seconds elsewhere."""
+    """Shown in place on a terminal, every few seconds elsewhere. Driving continues if it cannot be shown."""
 
     def __init__(self) -> None:
-        self._console = Console(width=None if sys.stdout.isatty() else 150)
+        self._console = _console()
         self._live = Live(console=self._console, auto_refresh=False) if sys.stdout.isatty() else None
         self._pending: deque[str] = deque(maxlen=MAX_PENDING)  # notes not shown yet
         self._notes: deque[str] = deque(maxlen=NOTES)
@@ -64,6 +65,10 @@ class LiveTable(Listener):
         elif time.monotonic() - self._shown >= PLAIN_EVERY_S:
             self._shown = time.monotonic()
             self._console.print(_table(rows, headline))
+
+
+def _console() -> Console:
+    return Console(file=forgiving(sys.stdout), width=None if sys.stdout.isatty() else 150)
 
 
 def _show_cursor() -> None:
@@ -128,7 +133,7 @@ def show_summary(meters: Mapping[str, ReceptionMeter], received: Mapping[str, An
             str(sample.lost),
             str(sample.rebuilt),
         )
-    Console(width=None if sys.stdout.isatty() else 150).print(table)
+    _console().print(table)
 
 
 def _share(value: float | None) -> str:

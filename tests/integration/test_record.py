@@ -141,9 +141,17 @@ def test_the_length_is_kept_to_the_frame_and_described(tmp_path):
 # --- how it ends ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 0)])
-def test_a_signal_ends_with_complete_files(tmp_path, number, status):
-    with process("record", *ONE, "source=test", f"output={tmp_path}") as child:
+@pytest.mark.parametrize(
+    ("number", "status", "words"),
+    [
+        (signal.SIGINT, 130, ()),
+        (signal.SIGTERM, 0, ()),
+        (signal.SIGHUP, 0, ()),
+        (signal.SIGINT, 130, ("duration_s=60",)),
+    ],
+)
+def test_a_signal_ends_with_complete_files(tmp_path, number, status, words):
+    with process("record", *ONE, "source=test", f"output={tmp_path}", *words) as child:
         part = tmp_path / ".rear.mkv.part"
         until(lambda: part.exists() and part.stat().st_size > 100_000)
         assert not (tmp_path / "rear.mkv").exists()

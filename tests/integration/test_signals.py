@@ -1,4 +1,4 @@
-"""Effects of SIGINT and SIGTERM on a process, whatever its main thread is busy with."""
+"""Effects of SIGINT, SIGTERM and SIGHUP on a process, whatever its main thread is busy with."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.slow  # starts and ends processes
 # 128 and the signal's number; or the signal itself, if it arrives after the interpreter has put back its handlers
 BY_SIGNALS = (130, 143, -signal.SIGINT, -signal.SIGTERM)
 
-SIGNALS = [signal.SIGINT, signal.SIGTERM]
+SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 LOCK = "lock = ctypes.create_string_buffer(64); ctypes.CDLL(None).pthread_mutex_lock(lock)"  # twice: blocks for ever
 
 
@@ -58,6 +58,13 @@ def test_a_signal_interrupts_the_main_thread(number: signal.Signals) -> None:
     child = started("ready(); time.sleep(60)")
     child.send_signal(number)
     assert ended(child)[:2] == (128 + number, "")
+
+
+def test_nohup_keeps_a_process_running() -> None:
+    child = started("ready(); time.sleep(60)", preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN))
+    child.send_signal(signal.SIGHUP)
+    child.send_signal(signal.SIGTERM)
+    assert ended(child)[:2] == (143, "")
 
 
 def test_an_interrupt_that_a_library_turns_into_another_error() -> None:
