@@ -21,7 +21,7 @@ from mcap.reader import make_reader
 from soak.signals import MARK, marked_processes
 
 from rig import LOOPBACK6, free_port, needs_root, process, run, small_robot, until
-from rtsp_client import client_hello
+from rtsp_client import RtspClient, client_hello
 from runner.core.commands import Command
 from runner.core.model import Endpoint
 from runner.core.roles import Role
@@ -469,6 +469,35 @@ def _revoked_while_watching(keys, plans, reports):
         assert not any("no longer accepted" in what for what in reports)
         changed(keys, "revoke", "bob")
         until(lambda: len([what for what in reports if "its keys are no longer accepted" in what]) >= len(CAMERAS))
+
+
+def client_of(plans, holder):
+    """A connection to the first camera, with a holder's keys, that has requested nothing but the methods."""
+    client = RtspClient(plans[0].operator[0].properties["location"], keys=holder)
+    assert client.ask("OPTIONS") == 200
+    return client
+
+
+def test_a_revoked_holder_that_watches_nothing_is_disconnected_too(keys):
+    with (
+        sending(keys) as (plans, reports),
+        client_of(plans, keys / "bob") as bob,
+        client_of(plans, keys / "alice") as alice,
+    ):
+        changed(keys, "revoke", "bob")
+        assert bob.ended()
+        until(lambda: "keys: refused an RTSP client at 127.0.0.1: its keys are no longer accepted" in reports)
+        assert alice.ask("OPTIONS") == 200
+
+
+def test_a_revoked_holder_starts_no_camera(keys, monkeypatch):
+    """Not even on a connection that is not closed yet."""
+    monkeypatch.setattr("runner.gst.server.WATCH_MS", 3_600_000)
+    monkeypatch.setattr("runner.security.keyring.CHECK_S", 0)
+    with sending(keys) as (plans, reports), client_of(plans, keys / "bob") as bob:
+        changed(keys, "revoke", "bob")
+        assert bob.ask("DESCRIBE", Accept="application/sdp") == 403
+        assert not any("pipeline built" in report for report in reports)
 
 
 def test_without_its_secret_an_operator_accepts_no_stream(keys, monkeypatch):
