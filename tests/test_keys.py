@@ -20,6 +20,7 @@ from runner.__main__ import main
 from runner.core.events import EVENTS
 from runner.core.roles import MAY_REQUEST, PEOPLE, Role, denial
 from runner.errors import RunError, UserError
+from runner.mqtt.login import Login
 from runner.security import keyring
 from runner.security.authority import Authority, Issued
 from runner.security.keyring import Keyring
@@ -126,6 +127,34 @@ def test_files_out_of_reach_are_read_again_when_they_are_back(authority, monkeyp
     monkeypatch.setattr(Path, "open", opened)  # only its owner has changed, which neither time nor size shows
     assert token.get() == b"new"
     assert [note.endswith("permission denied; the previous content stays in force") for note in notes] == [True]
+
+
+def test_new_keys_for_the_broker_count_once_they_are_complete(authority, monkeypatch):
+    """Otherwise a directory that is copied file by file would end the control link."""
+    monkeypatch.setattr(keyring, "CHECK_S", 0)
+    directory, notes = authority.directory / "a-controller", []
+    old_key = (directory / keyring.KEY).read_bytes()
+    login = Login(Keyring.of(directory), notes.append)
+    authority.rotate("a-controller")
+    new_key = (directory / keyring.KEY).read_bytes()
+    (directory / keyring.KEY).write_bytes(old_key)
+    assert [login.has_changed(), login.has_changed()] == [False, False]
+    assert ["own.crt" in note and "the previous content stays in force" in note for note in notes] == [True]
+    (directory / keyring.KEY).write_bytes(new_key)
+    assert login.has_changed()
+    login.refresh()
+    assert not login.has_changed()
+
+
+def test_the_broker_is_reached_with_the_last_keys_while_new_ones_cannot_be_read(authority, monkeypatch):
+    monkeypatch.setattr(keyring, "CHECK_S", 0)
+    directory = authority.directory / "a-controller"
+    login = Login(Keyring.of(directory), lambda note: None)
+    password = login.refresh()
+    for name in (keyring.KEY, keyring.REVOKED, keyring.SECRET):
+        (directory / name).unlink()
+    assert (login.has_changed(), login.refresh()) == (False, password)
+    assert login.context.cert_store_stats()["crl"] == 1
 
 
 @pytest.mark.parametrize("action", ["rotate", "revoke", "issue"])
