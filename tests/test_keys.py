@@ -21,8 +21,10 @@ from runner.core.events import EVENTS
 from runner.core.roles import MAY_REQUEST, PEOPLE, Role, denial
 from runner.errors import RunError, UserError
 from runner.mqtt.login import Login
+from runner.mqtt.messages import MAX_MESSAGE_BYTES
 from runner.security import keyring
 from runner.security.authority import Authority, Issued
+from runner.security.broker_files import broker_settings
 from runner.security.keyring import Keyring
 
 NOW = datetime(2026, 5, 1, tzinfo=UTC)
@@ -245,6 +247,13 @@ def test_all_others_learn_what_was_revoked(authority, action):
         assert not secret.exists()
         assert "a-watcher" not in people
         assert "a-watcher" not in passwords
+
+
+def test_the_broker_takes_every_message_and_keeps_no_session_for_good():
+    settings = dict(line.split(" ", 1) for line in broker_settings("/keys").splitlines())
+    header, topic = 5, 2 + 3 * 65  # MQTT 5.0, 2.1; the longest names
+    assert MAX_MESSAGE_BYTES + header + topic <= int(settings["max_packet_size"]) < 1.1 * MAX_MESSAGE_BYTES
+    assert settings["persistent_client_expiration"] == "1d"
 
 
 def test_all_problems_of_a_directory_are_reported_together(authority):
