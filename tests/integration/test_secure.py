@@ -6,11 +6,12 @@ import json
 import re
 import shutil
 import socket
+import ssl
 import subprocess
 import threading
 import time
 import uuid
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -21,11 +22,12 @@ from mcap.reader import make_reader
 from soak.signals import MARK, marked_processes
 
 from rig import LOOPBACK6, free_port, needs_root, process, run, small_robot, until
-from rtsp_client import RtspClient, client_hello
+from rtsp_client import RtspClient, client_hello, tls
 from runner.core.commands import Command
 from runner.core.model import Endpoint
 from runner.core.roles import Role
 from runner.drive.read import read_drive
+from runner.gst.pipeline import encrypt
 from runner.gst.secure import StreamLogin
 from runner.gst.server import NO_PASSWORD
 from runner.link import Limit, limited_link
@@ -529,6 +531,24 @@ def test_a_new_pipeline_is_not_ended_for_the_certificate_of_the_last_one(keys):
     until(login.withdrawn)
     assert login.prepare(pipeline, pipeline.get_by_name("client")) is None
     assert login.withdrawn() is None
+
+
+@pytest.mark.parametrize("element", ["srtsrc", "srtsink"])  # operator, vehicle
+def test_srt_uses_aes_256(element):
+    from gi.repository import Gst
+
+    pipeline = Gst.parse_launch(f"bin. ( {element} name=srt uri=srt://127.0.0.1:1 )")
+    encrypt(pipeline, "a passphrase")
+    assert int(pipeline.get_by_name("srt").get_property("pbkeylen")) == 256 // 8
+
+
+@pytest.mark.parametrize("version", [ssl.TLSVersion.TLSv1_2, ssl.TLSVersion.TLSv1_3])
+def test_the_broker_accepts_nothing_older_than_tls_1_3(keys, broker, version):
+    context = tls(keys / "alice")
+    context.maximum_version = version
+    refusal = pytest.raises(ssl.SSLError) if version < ssl.TLSVersion.TLSv1_3 else nullcontext()
+    with refusal, socket.create_connection((broker.host, broker.port), 60) as line, context.wrap_socket(line):
+        pass
 
 
 def test_a_peer_that_is_not_the_broker_is_left_until_the_broker_is_back(keys):
