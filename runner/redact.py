@@ -7,7 +7,9 @@ from typing import Any, TypeVar
 
 T = TypeVar("T")
 
-_USER = re.compile(r"(?<=://)[^/?#\s]*@")  # userinfo of RFC 3986, section 3.2.1
+# User name and password, as GStreamer reads them: they end at the first @, / or ?, and may contain # and blanks. To the
+# last @, since a password that contains one is no less secret for not working.
+_USER = re.compile(r"(?<=://)[^/?\n]*@")
 _NAMED = re.compile(r"(?i)((?<=[?&])(?:password|passwd|pwd)|\buser-pw)=[^&\s\"']+")  # in a query; property of rtspsrc
 
 

@@ -22,8 +22,11 @@ from runner.__main__ import main
 from runner.core.events import EVENTS
 from runner.core.roles import MAY_REQUEST, PEOPLE, Role, denial
 from runner.errors import RunError, UserError
+from runner.mqtt.login import Login
+from runner.mqtt.messages import MAX_MESSAGE_BYTES
 from runner.security import keyring
 from runner.security.authority import Authority, Issued
+from runner.security.broker_files import broker_settings
 from runner.security.keyring import Keyring
 
 NOW = datetime(2026, 5, 1, tzinfo=UTC)
@@ -130,6 +133,34 @@ def test_files_out_of_reach_are_read_again_when_they_are_back(authority, monkeyp
     assert [note.endswith("permission denied; the previous content stays in force") for note in notes] == [True]
 
 
+def test_new_keys_for_the_broker_count_once_they_are_complete(authority, monkeypatch):
+    """Otherwise a directory that is copied file by file would end the control link."""
+    monkeypatch.setattr(keyring, "CHECK_S", 0)
+    directory, notes = authority.directory / "a-controller", []
+    old_key = (directory / keyring.KEY).read_bytes()
+    login = Login(Keyring.of(directory), notes.append)
+    authority.rotate("a-controller")
+    new_key = (directory / keyring.KEY).read_bytes()
+    (directory / keyring.KEY).write_bytes(old_key)
+    assert [login.has_changed(), login.has_changed()] == [False, False]
+    assert ["own.crt" in note and "the previous content stays in force" in note for note in notes] == [True]
+    (directory / keyring.KEY).write_bytes(new_key)
+    assert login.has_changed()
+    login.refresh()
+    assert not login.has_changed()
+
+
+def test_the_broker_is_reached_with_the_last_keys_while_new_ones_cannot_be_read(authority, monkeypatch):
+    monkeypatch.setattr(keyring, "CHECK_S", 0)
+    directory = authority.directory / "a-controller"
+    login = Login(Keyring.of(directory), lambda note: None)
+    password = login.refresh()
+    for name in (keyring.KEY, keyring.REVOKED, keyring.SECRET):
+        (directory / name).unlink()
+    assert (login.has_changed(), login.refresh()) == (False, password)
+    assert login.context.cert_store_stats()["crl"] == 1
+
+
 @pytest.mark.parametrize("action", ["rotate", "revoke", "issue"])
 @pytest.mark.parametrize(("name", "changes"), [("a-watcher", True), ("car", True), ("a-predictor", False)])
 def test_srt_gets_a_new_secret_with_the_keys_that_reveal_it(authority, action, name, changes):
@@ -218,6 +249,13 @@ def test_all_others_learn_what_was_revoked(authority, action):
         assert not secret.exists()
         assert "a-watcher" not in people
         assert "a-watcher" not in passwords
+
+
+def test_the_broker_takes_every_message_and_keeps_no_session_for_good():
+    settings = dict(line.split(" ", 1) for line in broker_settings("/keys").splitlines())
+    header, topic = 5, 2 + 3 * 65  # MQTT 5.0, 2.1; the longest names
+    assert MAX_MESSAGE_BYTES + header + topic <= int(settings["max_packet_size"]) < 1.1 * MAX_MESSAGE_BYTES
+    assert settings["persistent_client_expiration"] == "1d"
 
 
 def test_all_problems_of_a_directory_are_reported_together(authority):

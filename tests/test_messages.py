@@ -59,6 +59,14 @@ def test_a_hostile_document_is_explained_quickly_and_briefly(problem: Callable[[
     assert len(text) < 5000
 
 
+@pytest.mark.parametrize("sender", ["", "anyone else", "x" * 65, "a\n"])
+@pytest.mark.parametrize("payload", [b'{"id": "1", "as_of": 0, "event": "operator_connected"}', b"invalid"])
+def test_a_request_of_an_invalid_sender_is_dropped(sender: str, payload: bytes) -> None:
+    """The vehicle itself is "", whose requests are all answered."""
+    with pytest.raises(ValueError, match="topic: an operator's id must be 1 to 64 letters, digits, _ and -"):
+        read_request(MqttMessage(f"tod/car/request/{sender}", payload, False))
+
+
 def test_an_id_that_its_reply_would_repeat_has_a_limited_length() -> None:
     def problem(identity: str) -> str | None:
         payload = json.dumps({"id": identity, "event": "total_set", "kbps": 1, "as_of": 0}).encode()

@@ -13,7 +13,7 @@ import shutil
 import socket
 import ssl
 import time
-from contextlib import AsyncExitStack, ExitStack, closing, contextmanager, suppress
+from contextlib import AsyncExitStack, ExitStack, closing, contextmanager, nullcontext, suppress
 from types import SimpleNamespace
 from urllib.parse import urlencode
 
@@ -164,7 +164,19 @@ def test_new_keys_take_effect_while_the_page_runs(keys, monkeypatch):
         (directory / keyring.KEY).write_bytes(new_key)
         second, answer = answered(port, keys, host=f"localhost:{port}")
         assert (answer.status, second != first) == (200, True)
-    assert len([note for note in notes if note.startswith("page: the previous certificate stays in force")]) == 1
+    reports = [note for note in notes if note.endswith("the previous content stays in force")]
+    assert [f"must be a certificate that matches {keyring.KEY}" in report for report in reports] == [True]
+
+
+@pytest.mark.parametrize("version", [ssl.TLSVersion.TLSv1_2, ssl.TLSVersion.TLSv1_3])
+def test_the_page_accepts_nothing_older_than_tls_1_3(keys, version):
+    context = ssl.create_default_context(cafile=keys.directory / "alice" / keyring.AUTHORITY)
+    context.maximum_version = version
+    refusal = pytest.raises(ssl.SSLError) if version < ssl.TLSVersion.TLSv1_3 else nullcontext()
+    with served(keyring=Keyring.of(keys.directory / "alice")) as (port, _), refusal:
+        line = socket.create_connection(("127.0.0.1", port), timeout=60)
+        with line, context.wrap_socket(line, server_hostname="127.0.0.1"):
+            pass
 
 
 def test_a_handshake_that_never_ends_is_closed(keys, monkeypatch):

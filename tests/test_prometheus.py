@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import shutil
+import socket
+import struct
 import subprocess
 import sys
 import urllib.error
@@ -26,9 +28,10 @@ CAMERA = CameraTelemetry(applied={}, frames=10, bytes=2000, encode_ms=4.0)
 TELEMETRY = Telemetry(1.0, None, None, {"front": CAMERA, "rear": CAMERA}, refused=3)
 
 
-def fetch(port: int, path: str) -> tuple[int, str]:
+def fetch(port: int, path: str, host: str = "") -> tuple[int, str]:
+    request = urllib.request.Request(f"http://127.0.0.1:{port}{path}", headers={"Host": host} if host else {})
     try:
-        with urllib.request.urlopen(f"http://127.0.0.1:{port}{path}", timeout=60) as answer:
+        with urllib.request.urlopen(request, timeout=60) as answer:
             return answer.status, answer.read().decode()
     except urllib.error.HTTPError as error:
         return error.code, error.read().decode()
@@ -58,6 +61,42 @@ def test_a_side_serves_its_figures_and_its_health() -> None:
         figures.close()
     with pytest.raises(urllib.error.URLError):
         fetch(port, "/health")
+
+
+def test_another_host_name_is_refused() -> None:
+    """A website that resolves its own name to this machine could otherwise read them in a browser."""
+    port = free_port()
+    figures = metrics_of("car", port)
+    figures.serve(lambda: None)
+    try:
+        for path in ("/metrics", "/health"):
+            for host in ("example.org", f"example.org:{port}", "127.0.0.1.example.org"):
+                assert fetch(port, path, host)[0] == 403
+            for host in ("127.0.0.1", f"localhost:{port}", "LOCALHOST"):
+                assert fetch(port, path, host)[0] == 200
+    finally:
+        figures.close()
+
+
+def test_a_client_that_is_silent_or_breaks_off_leaves_no_traceback(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    from runner.metrics import prometheus
+
+    monkeypatch.setattr(prometheus._Handler, "timeout", 0.1)
+    port = free_port()
+    figures = metrics_of("car", port)
+    figures.serve(lambda: None)
+    try:
+        with socket.create_connection(("127.0.0.1", port), 60) as silent:
+            assert silent.recv(1) == b""
+        with socket.create_connection(("127.0.0.1", port), 60) as broken:
+            broken.sendall(b"GET /health")
+            broken.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # it is reset
+        assert fetch(port, "/health")[0] == 200
+    finally:
+        figures.close()
+    assert capfd.readouterr().err == ""
 
 
 def test_without_a_port_nothing_is_served_and_nothing_is_loaded() -> None:

@@ -12,6 +12,12 @@ from runner.redact import printable
     ("text", "shown"),
     [
         ("rtsp://user:secret@camera/1", "rtsp://camera/1"),
+        ("rtsp://user:se#cret@camera/1#top", "rtsp://camera/1#top"),
+        ("rtsp://user:se@cr@et@camera", "rtsp://camera"),
+        ("RTSP://us er:se cret@camera/1", "RTSP://camera/1"),
+        ("rtsp://camera/1 of me@example.org", "rtsp://camera/1 of me@example.org"),
+        ("rtsp://camera/a@b?c=d@e", "rtsp://camera/a@b?c=d@e"),
+        ("rtsp://camera\nof me@example.org", "rtsp://camera\nof me@example.org"),
         ("a\x1b[2Jb\x07\r\x9b", "a\\x1b[2Jb\\x07\\r\\x9b"),
         ("left \u202eright", "left \\u202eright"),
         ("two\nlines\tand ü, 日本, 🚗", "two\nlines\tand ü, 日本, 🚗"),

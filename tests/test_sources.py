@@ -97,7 +97,10 @@ def test_what_cannot_be_asked(override: str, problem: str) -> None:
     assert str(raised.value).startswith(f"command line: {problem}")
 
 
-@pytest.mark.parametrize("address", ["rtsp://me:secret@10.0.0.1/x", "rtsp://10.0.0.1/x?user=me&password=secret"])
+@pytest.mark.parametrize(
+    "address",
+    ["rtsp://me:secret@10.0.0.1/x", "rtsp://me:secret#1@10.0.0.1/x", "rtsp://10.0.0.1/x?user=me&password=secret"],
+)
 def test_an_address_with_a_password_is_refused_and_not_shown(address: str) -> None:
     with pytest.raises(ConfigError) as raised:
         plans("source=rtsp", f'source.address="{address}"')

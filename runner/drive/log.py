@@ -41,6 +41,7 @@ FORMAT = 1
 WITHOUT_LOG = "the drive continues without its log"
 FILES = {"vehicle": "drive.jsonl", "operator": "operator.jsonl", "link": "link.jsonl"}  # by side
 QUEUED_LINES = 10_000  # more than two minutes of a vehicle with eight cameras
+QUEUED_BYTES = 64_000_000  # reports of others are logged, too, each up to 64 kB long
 # Records of numbers and the rules' own texts; redacting a decision takes twenty times as long as making it.
 WITHOUT_ADDRESSES = (DecisionMade, LinkSample, ReceptionReported, Telemetry)
 SYNC_S = 1.0  # a power failure loses about as much, and the queued lines
@@ -229,6 +230,7 @@ class _Writer:
     def __init__(self, file: _File, dropped: Callable[[int], bytes], on_report: Callable[[str], None]) -> None:
         self._file, self._dropped, self._on_report = file, dropped, on_report
         self._queue: queue.Queue[bytes | None] = queue.Queue(QUEUED_LINES)
+        self._put_bytes = self._taken_bytes = 0  # so far; each changed by one thread only
         self._lost = 0
         self._reported = False  # that lines may be missing
         self._closing = threading.Event()
@@ -237,13 +239,18 @@ class _Writer:
 
     def put(self, data: bytes) -> None:
         """Queue a line; to be called by one thread at a time."""
-        if self._lost and self._queue.maxsize - self._queue.qsize() > 1:
-            lost, self._lost = self._lost, 0
-            self._queue.put_nowait(self._dropped(lost))
-        try:
-            self._queue.put_nowait(data)
-        except queue.Full:
+        lines = [self._dropped(self._lost), data] if self._lost else [data]
+        size = sum(map(len, lines))
+        if (
+            self._queue.qsize() + len(lines) > self._queue.maxsize
+            or self._put_bytes - self._taken_bytes + size > QUEUED_BYTES
+        ):
             self._lost += 1
+            return
+        self._lost = 0
+        self._put_bytes += size
+        for line in lines:
+            self._queue.put_nowait(line)
 
     def close(self, last: bytes) -> None:
         """Write the queued lines and a last line, within a time limit."""
@@ -259,6 +266,7 @@ class _Writer:
     def _run(self) -> None:
         synced = time.monotonic()
         while (data := self._queue.get()) is not None:
+            self._taken_bytes += len(data)
             if not self._write(data):
                 break
             if time.monotonic() - synced >= SYNC_S:

@@ -30,6 +30,7 @@ class RtspConnection:
 
     viewer       its address and its operator
     cameras      those it watches, with the library's transport once it is set up
+    opening      whether it waits for the camera of its DESCRIBE to open
     described    camera of its last DESCRIBE: the library keeps it open for the client
     interleaved  whether this connection also carries video
     last_request monotonic time of its last complete request, s; before the first, of its start
@@ -50,7 +51,7 @@ class RtspConnection:
         self.viewer = StreamViewer(connection.get_ip(), since=time.monotonic())
         self.cameras: dict[str, GstRtspServer.RTSPStreamTransport | None] = {}
         self.described = ""
-        self.interleaved = False
+        self.opening = self.interleaved = False
         self.last_request = self._began = self._writable = time.monotonic()
         self._buffer = 0
         self._written: deque[tuple[float, int]] = deque()  # when, total bytes written by then

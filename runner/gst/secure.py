@@ -184,14 +184,18 @@ class ViewerCheck:
         holder = self._check.holder(certificate) if certificate else None
         return holder.name if isinstance(holder, Holder) and holder.name in self._known else None
 
+    def withdrawn(self, client: GstRtspServer.RTSPClient) -> str | None:
+        """Why a connection must end, to be asked once its handshake is over; None: it need not."""
+        return None if self.viewer(client) else "its keys are no longer accepted"
+
     def refusal(self, client: GstRtspServer.RTSPClient, token: GstRtspServer.RTSPToken) -> str | None:
         """Why a request is refused, by the client's certificate and the password that the token stands for.
 
         The library accepts the password of any user with any certificate.
         """
+        if why := self.withdrawn(client):
+            return why
         name, user = self.viewer(client), token.get_string(USER) if token else None
-        if name is None:
-            return "its keys are no longer accepted"
         return None if name == user else f"certificate belongs to {name}, password to {user}"
 
     def _accept(self, _auth: object, connection: Gio.TlsConnection, certificate: Gio.TlsCertificate, _: object) -> bool:

@@ -46,7 +46,7 @@ BACKLOG = 128  # connections waiting to be accepted; with the library's 5, furth
 # FIRST_REQUEST_S, or after CROWDED_S if there are more than CROWD of them.
 FIRST_REQUEST_S, CROWD, CROWDED_S = 5.0, 8, 1.0
 # A connection and its thread take three descriptors, and some more until it has ended. Beyond this many connections the
-# one that has waited longest for a first request is dropped.
+# oldest one that watches nothing is dropped, whatever it requests: a viewer watches within a second.
 DESCRIPTORS, RESERVED, LEAST, MOST = 5, 256, 16, 1000
 QUEUE_BYTES = 2_000_000  # more than a viewer may lag at any bitrate
 LAG_S = 1.0  # a TCP viewer that lags by more is disconnected
@@ -354,13 +354,13 @@ class CameraServer:
         if self._viewers:
             connection.refusal = NO_CERTIFICATE
         with self._changed:
+            others = list(self._connections.items())
             self._connections[client] = connection
             if self._stopped.is_set():
                 connection.close()
-            elif len(self._connections) > self._most:  # now: the library aborts the process without descriptors
-                now = time.monotonic()
-                silent = [other for other in self._connections.values() if other.unused_s(now) and not other.closed]
-                max(silent, key=lambda other: other.unused_s(now), default=connection).close()
+        if len(others) >= self._most:  # now: the library aborts the process without descriptors
+            idle = [other for each, other in others if not (other.closed or _watches(each, other))]
+            min(idle, key=lambda other: (other.opening, other.viewer.since), default=connection).close()
 
     def _on_closed(self, client: GstRtspServer.RTSPClient) -> None:
         with self._changed:
@@ -393,14 +393,22 @@ class CameraServer:
         self, client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext
     ) -> GstRtsp.RTSPStatusCode:
         camera, connection = self._cameras.get(_path(context)), self._connection(client)
+        withdrawn = self._viewers.withdrawn(client) if self._viewers else None
         if connection:
-            connection.last_request, connection.refusal = time.monotonic(), ""
+            connection.last_request, connection.refusal = time.monotonic(), withdrawn or ""
+        if withdrawn:
+            return FORBIDDEN
         if camera is None:
             return OK  # the library answers 404
         if _has_query(context):
             self._redirect(client, context)
             return MOVED
-        if not self._hold(client, camera):
+        if connection:
+            connection.opening = True
+        is_held = self._hold(client, camera)
+        if connection:
+            connection.opening = False
+        if not is_held:
             return UNAVAILABLE
         if connection:
             connection.described = camera.name
@@ -543,7 +551,7 @@ class CameraServer:
                 connection.close()
 
     def _watch_keys(self) -> None:
-        """Load new key files, which may arrive one by one, and close the streams of holders that may no longer watch.
+        """Load new key files, which may arrive one by one, and close connections of holders that may no longer watch.
 
         Apart from the other checks, so that no fault of theirs lets a revoked holder go on watching.
         """
@@ -552,8 +560,10 @@ class CameraServer:
         with self._changed:
             connections = list(self._connections.items())
         for client, connection in connections:
-            if (connection.cameras or client.session_filter(None)) and self._viewers.viewer(client) is None:
-                self._close(connection, "its keys are no longer accepted")
+            # Before a first request it may be in the handshake, where no certificate has been verified.
+            if not connection.unused_s(time.monotonic()) and (why := self._viewers.withdrawn(client)):
+                connection.refusal = "" if connection.cameras else why  # `_close` reports a viewer
+                self._close(connection, why)
 
     def _drop_silent(self, connections: Iterable[RtspConnection], now: float) -> None:
         """Close those whose client makes no request, to free threads for other handshakes."""
@@ -618,6 +628,11 @@ def _on_media_error(media: GstRtspServer.RTSPMedia, message: Gst.Message, camera
     if camera.media is not media or camera.prepared or concerns_file(message):
         GObject.signal_stop_emission_by_name(media, MEDIA_ERROR)
     return True
+
+
+def _watches(client: GstRtspServer.RTSPClient, connection: RtspConnection) -> bool:
+    """Whether a connection holds a camera or a session."""
+    return bool(connection.cameras or client.session_filter(None))
 
 
 def _end_other(client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext) -> bool:

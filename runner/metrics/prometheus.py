@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import shutil
+import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -24,6 +25,7 @@ from runner.records import Sample, Telemetry, VehicleState
 from runner.system.ports import check_port_free
 
 STOP_S = 1.0
+HOSTS = ("127.0.0.1", "localhost")
 
 Healthy = Callable[[], str | None]  # why the side does not work; None: it does
 Reading = Callable[[Any], float | None]  # of a record, or of its entry for a camera; None: unknown, left out
@@ -167,13 +169,20 @@ class _Handler(WSGIRequestHandler):
         """Nothing: each scrape would be a line."""
 
 
+class _Server(ThreadingWSGIServer):
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Print no traceback of a client that is silent or breaks the connection."""
+        if not isinstance(sys.exception(), ConnectionError | TimeoutError):
+            super().handle_error(request, client_address)
+
+
 @contextmanager
 def served(metrics: Metrics, port: int, healthy: Healthy) -> Iterator[None]:
     """Serve metrics and health on 127.0.0.1 for the duration of the block.
 
     raises  RunError if the port is in use
     """
-    endpoint = Endpoint("127.0.0.1", port)
+    endpoint = Endpoint(HOSTS[0], port)
     check_port_free(endpoint)
     metrics.healthy = healthy
     registry = CollectorRegistry(auto_describe=False)
@@ -181,18 +190,24 @@ def served(metrics: Metrics, port: int, healthy: Healthy) -> Iterator[None]:
     scrape = make_wsgi_app(registry)
 
     def app(environ: dict[str, Any], start: Any) -> Iterable[bytes]:
+        # No website may read them through a browser on this machine, by a name of its own (DNS rebinding).
+        is_own = environ.get("HTTP_HOST", "").lower().partition(":")[0] in HOSTS
         path = environ.get("PATH_INFO")
-        if path == "/metrics":
+        if is_own and path == "/metrics":
             text: Iterable[bytes] = scrape(environ, start)
             return text
-        why = None if path == "/health" else "expected /metrics or /health"
-        status = "404 Not Found" if why else "200 OK"
-        if why is None and (why := healthy()):
-            status = "503 Service Unavailable"
+        why: str | None
+        if not is_own:
+            status, why = "403 Forbidden", f"Host must be {' or '.join(HOSTS)}"
+        elif path != "/health":
+            status, why = "404 Not Found", "expected /metrics or /health"
+        else:
+            why = healthy()
+            status = "503 Service Unavailable" if why else "200 OK"
         start(status, [("Content-Type", "text/plain; charset=utf-8")])
         return [f"{why or 'ok'}\n".encode()]
 
-    with make_server(endpoint.host, port, app, ThreadingWSGIServer, _Handler) as server:
+    with make_server(endpoint.host, port, app, _Server, _Handler) as server:
         thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.1}, daemon=True)
         thread.start()
         try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ssl
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 from runner.core.roles import Role
@@ -12,15 +13,16 @@ from runner.security.keyring import Keyring, mqtt_password
 
 
 class Login:
-    """User name, password and TLS settings of a holder of keys. The files are reread for each connection.
+    """User name, password and TLS settings of a holder of keys. Each connection uses the files as they are then.
 
-    on_report  called with the problem of new files
+    on_report  called with the problem of new files: the previous ones then stay in force
+    raises     UserError if files cannot be used at first
     """
 
     def __init__(self, keyring: Keyring, on_report: Callable[[str], None]) -> None:
         self._keyring = keyring
         self._revoked = keyring.watched_revoked(on_report)
-        self._own = keyring.watched_certificate(on_report)
+        self._own, self._secret = keyring.watched_certificate(on_report), keyring.watched_secret(on_report)
         self._broker, self._used = 0, b""  # in use: serial number of the broker's certificate, own certificate
         self.user = keyring.holder.name
         self.context = ssl.create_default_context(cafile=keyring.authority)
@@ -32,12 +34,14 @@ class Login:
     def refresh(self) -> str:
         """Load the current certificate, key and revocation list; returns the password.
 
-        raises  OSError, ssl.SSLError, UserError for files that cannot be used
+        raises  OSError, UserError if certificate and key are just being replaced once more
         """
-        self._used = self._own.get()
-        self.context.load_cert_chain(self._keyring.certificate, self._keyring.key)
-        self.context.load_verify_locations(self._keyring.revocation_list)
-        return mqtt_password(self._keyring.secret)
+        if self._used != (own := self._own.get()):
+            self.context.load_cert_chain(self._keyring.certificate, self._keyring.key)
+            self._used = own
+        with suppress(OSError):  # `_revoked` reports it; the list that was loaded before stays in force
+            self.context.load_verify_locations(self._keyring.revocation_list)
+        return mqtt_password(self._secret.get())
 
     def check(self, connection: ssl.SSLSocket) -> None:
         """Identify the broker by the role in its certificate, whatever its address.

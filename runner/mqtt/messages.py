@@ -190,13 +190,16 @@ class ParsedRequest(NamedTuple):
 
 
 def read_request(message: MqttMessage) -> ParsedRequest:
-    """The request as received. The event itself is checked when its time is known."""
+    """The request as received. The event itself is checked when its time is known.
+
+    raises  ValueError for an invalid sender, whom nothing may be sent to: "" is this process
+    """
+    if not OPERATOR.fullmatch(message.sender):
+        raise ValueError(OPERATOR_RULE)
     try:
         document = read_message(message.payload)
     except ValueError as error:
         return ParsedRequest({}, problem=str(error))
-    if not OPERATOR.fullmatch(message.sender):
-        return ParsedRequest({}, problem=OPERATOR_RULE)
     identity, as_of = document.pop("id", None), document.pop("as_of", None)
     if not isinstance(identity, str) or not 0 < len(identity) <= MAX_ID:
         return ParsedRequest(document, problem=f"id: must be given, as text of 1 to {MAX_ID} characters")

@@ -51,8 +51,9 @@ def broker_settings(directory: str, host: str = "", port: int = PORT) -> str:
             f"password_file {directory}/passwords",
             f"acl_file {directory}/access",
             "persistence false",
+            "persistent_client_expiration 1d",  # of a session that a client leaves behind; neither side leaves one
             "set_tcp_nodelay true",
-            "max_packet_size 1100000",
+            "max_packet_size 1100000",  # the longest message that both sides accept (mqtt/messages.py), and its header
             f"listener {port} {host}".rstrip(),
             f"cafile {directory}/ca.crt",
             f"certfile {directory}/own.crt",

@@ -17,6 +17,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import hmac
+import ssl
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -176,6 +177,9 @@ class Keyring:
     def secret(self) -> bytes:
         return self.read(SECRET)
 
+    def watched_secret(self, on_report: Callable[[str], None]) -> Watched[bytes]:
+        return Watched(self.directory / SECRET, lambda: self.secret, on_report)
+
     def watched_token(self, on_report: Callable[[str], None]) -> Watched[bytes]:
         return Watched(self.directory / TOKEN, lambda: self.read(TOKEN), on_report)
 
@@ -230,7 +234,18 @@ class Keyring:
         return Watched(self.directory / HOLDER, lambda: self.holder, on_report)
 
     def watched_certificate(self, on_report: Callable[[str], None]) -> Watched[bytes]:
-        return Watched(self.certificate, lambda: self.read(CERTIFICATE), on_report)
+        """The certificate. A new one counts once its key is there, too: files are copied one by one."""
+        return Watched(self.certificate, self._usable_certificate, on_report)
+
+    def _usable_certificate(self) -> bytes:
+        """raises UserError if certificate and key do not match, or others may read the key"""
+        certificate = self.read(CERTIFICATE)
+        try:
+            ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(self.certificate, self.key)
+        except OSError as error:  # ssl.SSLError among them
+            rule = f"must be a certificate that matches {KEY}: {error}"
+            raise UserError("keys", CERTIFICATE, str(self.directory), rule) from None
+        return certificate
 
     def watched_revoked(self, on_report: Callable[[str], None]) -> Watched[frozenset[int]]:
         return Watched(self.revocation_list, self.revoked, on_report)

@@ -6,11 +6,12 @@ import json
 import re
 import shutil
 import socket
+import ssl
 import subprocess
 import threading
 import time
 import uuid
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -21,11 +22,12 @@ from mcap.reader import make_reader
 from soak.signals import MARK, marked_processes
 
 from rig import LOOPBACK6, free_port, needs_root, process, run, small_robot, until
-from rtsp_client import client_hello
+from rtsp_client import RtspClient, client_hello, tls
 from runner.core.commands import Command
 from runner.core.model import Endpoint
 from runner.core.roles import Role
 from runner.drive.read import read_drive
+from runner.gst.pipeline import encrypt
 from runner.gst.secure import StreamLogin
 from runner.gst.server import NO_PASSWORD
 from runner.link import Limit, limited_link
@@ -471,6 +473,35 @@ def _revoked_while_watching(keys, plans, reports):
         until(lambda: len([what for what in reports if "its keys are no longer accepted" in what]) >= len(CAMERAS))
 
 
+def client_of(plans, holder):
+    """A connection to the first camera, with a holder's keys, that has requested nothing but the methods."""
+    client = RtspClient(plans[0].operator[0].properties["location"], keys=holder)
+    assert client.ask("OPTIONS") == 200
+    return client
+
+
+def test_a_revoked_holder_that_watches_nothing_is_disconnected_too(keys):
+    with (
+        sending(keys) as (plans, reports),
+        client_of(plans, keys / "bob") as bob,
+        client_of(plans, keys / "alice") as alice,
+    ):
+        changed(keys, "revoke", "bob")
+        assert bob.ended()
+        until(lambda: "keys: refused an RTSP client at 127.0.0.1: its keys are no longer accepted" in reports)
+        assert alice.ask("OPTIONS") == 200
+
+
+def test_a_revoked_holder_starts_no_camera(keys, monkeypatch):
+    """Not even on a connection that is not closed yet."""
+    monkeypatch.setattr("runner.gst.server.WATCH_MS", 3_600_000)
+    monkeypatch.setattr("runner.security.keyring.CHECK_S", 0)
+    with sending(keys) as (plans, reports), client_of(plans, keys / "bob") as bob:
+        changed(keys, "revoke", "bob")
+        assert bob.ask("DESCRIBE", Accept="application/sdp") == 403
+        assert not any("pipeline built" in report for report in reports)
+
+
 def test_without_its_secret_an_operator_accepts_no_stream(keys, monkeypatch):
     """A listener without a passphrase would show the pictures of anybody who connects."""
     from gi.repository import Gst
@@ -500,6 +531,24 @@ def test_a_new_pipeline_is_not_ended_for_the_certificate_of_the_last_one(keys):
     until(login.withdrawn)
     assert login.prepare(pipeline, pipeline.get_by_name("client")) is None
     assert login.withdrawn() is None
+
+
+@pytest.mark.parametrize("element", ["srtsrc", "srtsink"])  # operator, vehicle
+def test_srt_uses_aes_256(element):
+    from gi.repository import Gst
+
+    pipeline = Gst.parse_launch(f"bin. ( {element} name=srt uri=srt://127.0.0.1:1 )")
+    encrypt(pipeline, "a passphrase")
+    assert int(pipeline.get_by_name("srt").get_property("pbkeylen")) == 256 // 8
+
+
+@pytest.mark.parametrize("version", [ssl.TLSVersion.TLSv1_2, ssl.TLSVersion.TLSv1_3])
+def test_the_broker_accepts_nothing_older_than_tls_1_3(keys, broker, version):
+    context = tls(keys / "alice")
+    context.maximum_version = version
+    refusal = pytest.raises(ssl.SSLError) if version < ssl.TLSVersion.TLSv1_3 else nullcontext()
+    with refusal, socket.create_connection((broker.host, broker.port), 60) as line, context.wrap_socket(line):
+        pass
 
 
 def test_a_peer_that_is_not_the_broker_is_left_until_the_broker_is_back(keys):

@@ -715,3 +715,14 @@ def test_idle_connections_take_no_descriptors_from_others(monkeypatch):
             assert connection.recv(1) == b""
         with watched(vehicle, SMALL_CAMERA):
             pass
+
+
+def test_connections_that_only_send_requests_do_not_keep_a_viewer_out(monkeypatch):
+    """They are not silent, but watch nothing: a request every few seconds would hold their places for good."""
+    monkeypatch.setattr("runner.gst.server.MOST", 16)
+    with serving(*SMALL, cameras=(SMALL_CAMERA,)) as vehicle, ExitStack() as stack, watched(vehicle, SMALL_CAMERA):
+        idle = [stack.enter_context(RtspClient(vehicle.url(SMALL_CAMERA))) for _ in range(15)]
+        assert {client.ask("OPTIONS") for client in idle} == {200}
+        with watched(vehicle, SMALL_CAMERA):
+            assert idle[0].ended()
+            assert idle[-1].ask("OPTIONS") == 200
