@@ -232,7 +232,7 @@ def test_an_interrupted_run_continues_where_it_stopped(clip, measured, tmp_path,
     assert points_of(tmp_path) == points_of(measured[0])
 
 
-@pytest.mark.parametrize("workers", ["threads", "processes"])
+@pytest.mark.parametrize("workers", [pytest.param("threads", marks=pytest.mark.soak), "processes"])
 def test_other_workers_find_the_same(clip, measured, tmp_path, cache, workers):
     words = (f"workers={workers}", "parallel=2", "plan=full", "metric=[mssim,psnr]")
     done = model("camera=front_center", f"sequence={clip}", f"output={tmp_path}", *words, *SMALL, cache=cache)

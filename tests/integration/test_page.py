@@ -201,7 +201,7 @@ def test_single_numbers_and_sliders_set_one_camera(page):
     until(lambda: field.input_value() == before)  # nothing was sent
 
 
-@pytest.mark.parametrize("mode", ["automatic", "collective"])
+@pytest.mark.parametrize("mode", ["automatic", pytest.param("collective", marks=pytest.mark.soak)])
 def test_a_camera_switched_off_frees_its_share(page, mode):
     before = choose(page, mode)
     toggle = page.locator("[data-camera=rear_center] .switch")

@@ -208,7 +208,10 @@ def test_why_a_layout_cannot_be_edited_or_saved(chromium, picture, tmp_path):
         assert where(page, "front") == "row 2, column 1, 1 high, 1 wide", "the draft is kept"
 
 
-@pytest.mark.parametrize("module", ["boot.js", "tiles.js", "video.js", "stream.js"])
+@pytest.mark.parametrize(
+    "module",
+    ["boot.js", "tiles.js", *(pytest.param(name, marks=pytest.mark.soak) for name in ("video.js", "stream.js"))],
+)
 def test_a_page_whose_modules_fail_to_load_loads_again(chromium, picture, module):
     """The last two are those of the worker."""
     with served(picture, None) as (server, _), chromium.new_context() as tab:
@@ -292,7 +295,7 @@ def colour_at(page, camera, across, down):
     return shown.getpixel((round(across * shown.width), round(down * shown.height)))
 
 
-@pytest.mark.parametrize("pressed", ["Space", "b"])
+@pytest.mark.parametrize("pressed", ["Space", pytest.param("b", marks=pytest.mark.soak)])
 def test_a_driver_is_warned_in_either_view(chromium, picture, pressed):
     """Out of focus, a picture that was lost before, another page that takes control."""
     with served(picture, None) as (server, _), opened(chromium, server.url, script=SOUND_BLOCKED) as page:

@@ -88,7 +88,13 @@ def index(directory: Path) -> dict[str, Any]:
 # --- contents of the files --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("clip", [path for path in CLIPS if "720p25" in path.name or "fisheye" in path.name], ids=str)
+RECORDED = [
+    *(path for path in CLIPS if "720p25" in path.name),
+    *(pytest.param(path, marks=pytest.mark.soak) for path in CLIPS if "fisheye" in path.name),
+]
+
+
+@pytest.mark.parametrize("clip", RECORDED, ids=str)
 def test_a_clip_is_recorded_bit_by_bit(tmp_path, clip):
     words = ("source=file", f'source.clip="{clip}"')
     done = run("record", *ONE, *words, f"output={tmp_path}", "duration_s=1.5")

@@ -115,7 +115,18 @@ def frames(operator):
     return {name: counters.frames for name, counters in operator.station.samples.items()}
 
 
-def test_an_ipv6_address_does_not_work_for_rtsp_with_keys(keys):
+@pytest.fixture
+def refusal(tod):
+    """Status and output of a verb that is expected to start nothing."""
+
+    def run(verb, *words):
+        status, out, err = tod(verb, *words, "duration_s=1")
+        return status, (out + err).strip()
+
+    return run
+
+
+def test_an_ipv6_address_does_not_work_for_rtsp_with_keys(keys, refusal):
     status, output = refusal("vehicle", *WORDS, f"keys={keys / NAME}", "media.host=::1")
     assert (status, output) == (
         2,
@@ -734,17 +745,11 @@ def test_nothing_on_the_wire_can_be_read(keys, encrypted, graph, tmp_path):
 # --- what is refused before anything starts ---------------------------------------------------------------------------
 
 
-def refusal(verb, *words):
-    with process(verb, *words, "duration_s=1") as child:
-        output, _ = child.communicate(timeout=60)
-    return child.returncode, output.strip()
-
-
 NEEDS_KEYS = "give keys=DIR, created by `tod-runner keys`, or insecure=true"
 
 
 @pytest.mark.parametrize("verb", ["vehicle", "operator", "demo", "latency", "latency loop=true", "ros"])
-def test_a_network_needs_keys(verb):
+def test_a_network_needs_keys(verb, refusal):
     """Refused before anything listens, whichever of the addresses is beyond this machine."""
     verb, *more = [*verb.split(), *(["camera=front"] if "latency" in verb else [])]
     media, control = "media.host=192.0.2.1", "control.host=192.0.2.2"
@@ -757,7 +762,7 @@ def test_a_network_needs_keys(verb):
 
 
 @pytest.mark.parametrize("verb", ["operator", "latency"])
-def test_a_page_on_a_network_needs_keys(verb):
+def test_a_page_on_a_network_needs_keys(verb, refusal):
     words = (*WORDS, *(["camera=front"] if verb == "latency" else []), "page.serve=true", "page.host=0.0.0.0")
     rule = "give keys=DIR, created by `tod-runner keys`; browsers play video by HTTPS only"
     status, output = refusal(verb, *words)
@@ -767,7 +772,7 @@ def test_a_page_on_a_network_needs_keys(verb):
     )
 
 
-def test_a_relay_cannot_read_what_keys_encrypt(keys, tmp_path):
+def test_a_relay_cannot_read_what_keys_encrypt(keys, refusal, tmp_path):
     words = (*WORDS, "link=relay", f"keys={keys}", f"log={tmp_path / 'drive'}")
     assert refusal("demo", *words) == (
         2,
@@ -775,14 +780,14 @@ def test_a_relay_cannot_read_what_keys_encrypt(keys, tmp_path):
     )
 
 
-def test_a_demo_names_the_keys_that_it_lacks(keys):
+def test_a_demo_names_the_keys_that_it_lacks(keys, refusal):
     changed(keys, "revoke", "alice")
     changed(keys, "revoke", "carol")
     status, output = refusal("demo", *WORDS, f"keys={keys}")
     assert (status, output) == (2, f"keys: {keys}: lacks keys: tod-runner keys output={keys} controller=NAME")
 
 
-def test_keys_of_another_role_are_refused(keys):
+def test_keys_of_another_role_are_refused(keys, refusal):
     status, output = refusal("vehicle", *WORDS, f"keys={keys / 'alice'}")
     assert (status, "people.json: no such file" in output) == (2, True)
     status, output = refusal("operator", *WORDS, f"keys={keys / 'pqos'}")
