@@ -199,11 +199,16 @@ def drag(page, begin, end, button="left"):
 def seen(page, name, guided=True):
     """Luma of a camera's box on the screen while its picture is live, and its guides, shown or not."""
 
-    def live():
-        is_live = page.evaluate("tod.measure()")["cameras"][name]["status"] == "live"
-        lines = guides(page, name)
-        return (lines if guided else not lines) if is_live else None
+    def camera():
+        return page.evaluate("tod.measure()")["cameras"][name]
 
+    def live():
+        lines = guides(page, name)
+        return (lines if guided else not lines) if camera()["status"] == "live" else None
+
+    # Size and guides apply from the next picture on, which is on the screen at the latest with the one after it.
+    due = camera()["drawn"] + 2
+    until(lambda: live() and camera()["drawn"] >= due)
     return on_screen(page.locator(f"[data-camera={name}] .picture"), live)
 
 
