@@ -68,4 +68,4 @@ def test_files_of_a_directory_reach_the_disk_before_it_gets_its_name(
     with unfinished_directory(path) as part:
         part.mkdir()
         (part / "metadata.yaml").touch()
-    assert seen == [("rosbag2", False), ("metadata.yaml", False), (tmp_path.name, True)]
+    assert seen == [("metadata.yaml", False), ("rosbag2", False), (tmp_path.name, True)]

@@ -31,7 +31,7 @@ def flush(path: Path) -> None:
 
 
 def put_in_place(part: Path, path: Path) -> None:
-    """Give a finished file its name: also after a power failure it is complete, or the previous one is there."""
+    """Give a finished file or directory its name: also after a power failure it is complete, or the previous one is there."""
     flush(part)
     part.replace(path)
     flush(path.parent)
@@ -57,10 +57,9 @@ def unfinished_directory(path: Path) -> Iterator[Path]:
         try:
             above.mkdir()
             yield above / path.name
-            for each in above.rglob("*"):
+            for each in (above / path.name).rglob("*"):
                 flush(each)
-            (above / path.name).rename(path)
-            flush(path.parent)
+            put_in_place(above / path.name, path)
         finally:
             rmtree(above, ignore_errors=True)
 
