@@ -33,6 +33,7 @@ ROBOT = ("vehicle=delivery_robot", "source=test", "fps_max=15")
 CONSTANT = ("pqos=constant", "pqos.kbps=3000")
 CAMERAS = ("front", "rear", "mast")
 ANSWERED_S, ATTEMPTS = 10.0, 6  # for a request
+PATIENCE_S = 60.0  # of another player: longer than any source is silent, as ffmpeg waits
 
 
 class System:
@@ -251,6 +252,7 @@ def player(system: System, camera: str, transport: str) -> Iterator[Callable[[],
         with system.viewer(camera) as client:
             with suppress(OSError, EOFError):  # refused, or nothing is sent
                 client.open(udp=transport == "udp")
+            client.tcp.settimeout(PATIENCE_S)
             client.read()
             yield client.is_reading
         return
