@@ -31,7 +31,7 @@ def flush(path: Path) -> None:
 
 
 def put_in_place(part: Path, path: Path) -> None:
-    """Give a finished file or folder its name: after a power failure it is complete or the previous one is there."""
+    """Name a finished file or directory: even after a power failure, it is complete or still the previous one."""
     flush(part)
     part.replace(path)
     flush(path.parent)
