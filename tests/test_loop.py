@@ -21,7 +21,16 @@ from runner.core.roles import SETTINGS, Role, denial
 from runner.core.step import step
 from runner.drive.log import Log
 from runner.plans import compile_plans
-from runner.records import Outcome, ReceptionReport, SpeedAdvice, SteeringAngle, Telemetry, VehicleState
+from runner.records import (
+    Outcome,
+    ReceptionReport,
+    ReceptionReported,
+    SpeedAdvice,
+    SteeringAngle,
+    Telemetry,
+    UnitReceived,
+    VehicleState,
+)
 from runner.security import keyring
 from runner.security.keyring import Person
 from runner.system.reports import MOST
@@ -379,6 +388,23 @@ def test_reports_of_a_revoked_operator_keep_nobody_present(tmp_path: Path, monke
             time.sleep(0.05)
         assert any(line.startswith("operator driver has been silent") for line in watched.reports)
         assert watched.loop.refused > refused
+
+
+def test_the_frames_that_an_operator_without_control_reports_are_not_logged() -> None:
+    watched, unit = Watched(), UnitReceived("front", 0.0, 0.1, 1000, True)
+    logged: list[Any] = []
+    watched.loop.log.record = logged.append  # type: ignore[method-assign]
+    with watched.running():
+        for operator in ("driver", "watcher"):
+            watched.loop.take(Request(operator, {"event": "operator_connected"}))
+            until(lambda name=operator: f"operator {name} is present" in watched.reports)
+        for operator in ("driver", "watcher"):
+            report = ReceptionReport(at=1.0, as_of=0.0, units=(unit,), packets=1, lost=0, damaged=("front",))
+            watched.loop.take(QueuedReport(operator, report))
+        until(lambda: len([line for line in logged if isinstance(line, ReceptionReported)]) == 2)
+    driver, watcher = (line.report for line in logged if isinstance(line, ReceptionReported))
+    assert (driver.units, driver.damaged) == ((unit,), ("front",))
+    assert (watcher.units, watcher.damaged, watcher.packets) == ((), UNSET, 1)
 
 
 def test_a_second_process_of_the_driver_neither_ends_control_nor_advises_a_speed() -> None:

@@ -102,13 +102,54 @@ def test_a_login_whose_body_never_comes_is_closed(monkeypatch):
         assert line.recv(1) == b""
 
 
+class OneSession:
+    """A login with one session that has access, until its token is replaced."""
+
+    def __init__(self):
+        self.token = b"token"
+        self.login = PageLogin(lambda: self.token)
+        challenge = self.login.challenge(time.monotonic())
+        answer = hmac.new(self.token, challenge.encode(), "sha256").hexdigest()
+        self.cookie = f"{COOKIE}={self.login.open(challenge, answer, time.monotonic())}"
+
+
+def test_messages_are_ignored_once_the_token_is_replaced(monkeypatch):
+    """Also on a connection whose pings do not get through, so that it is not closed yet."""
+    monkeypatch.setattr("runner.page.server.PING_S", 60)
+    changed = OneSession()
+
+    async def drive(port, station):
+        own = f"http://localhost:{port}"
+        headers = {"Cookie": changed.cookie}
+        async with (
+            aiohttp.ClientSession(headers=headers) as session,
+            session.ws_connect(f"{own}/live?viewer=me", origin=own.replace("http", "https")) as ws,
+        ):
+            await ws.send_json({"take_control": True})
+            while (await ws.receive_json()).get("holder") != "you":
+                pass
+            await ws.send_json({"attention": "hidden"})
+            await ws.send_json({"clock": 1})
+            while "page_ms" not in await ws.receive_json():
+                pass
+            assert station.attention is Attention.HIDDEN
+            changed.token = b"another"
+            await ws.send_json({"release_control": True})
+            await ws.send_json({"clock": 1})
+            with pytest.raises(TimeoutError):
+                while "page_ms" not in await ws.receive_json(timeout=1):
+                    pass
+            assert station.attention is Attention.HIDDEN
+
+    with served(login=changed.login) as (port, station):
+        asyncio.run(drive(port, station))
+
+
 def test_connections_without_access_replace_each_other_and_close_none_with_access(monkeypatch):
     """Otherwise a stranger could take all descriptors of the process that shows the pictures."""
     monkeypatch.setattr("runner.page.server.MAX_STRANGERS", 5)
-    login = PageLogin(lambda: b"token")
-    challenge = login.challenge(time.monotonic())
-    session = login.open(challenge, hmac.new(b"token", challenge.encode(), "sha256").hexdigest(), time.monotonic())
-    with served(login=login) as (port, _), ExitStack() as stack:
+    changed = OneSession()
+    with served(login=changed.login) as (port, _), ExitStack() as stack:
 
         def connected(path, cookie=""):
             line = stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=60))
@@ -116,12 +157,12 @@ def test_connections_without_access_replace_each_other_and_close_none_with_acces
             assert line.recv(65536).startswith(b"HTTP/1.1 200")
             return line
 
-        driver = connected("/", f"Cookie: {COOKIE}={session}\r\n")
+        driver = connected("/", f"Cookie: {changed.cookie}\r\n")
         strangers = [connected("/login") for _ in range(8)]
         for line in strangers[:3]:
             while line.recv(65536):
                 pass
-        driver.sendall(f"GET / HTTP/1.1\r\nHost: localhost:{port}\r\nCookie: {COOKIE}={session}\r\n\r\n".encode())
+        driver.sendall(f"GET / HTTP/1.1\r\nHost: localhost:{port}\r\nCookie: {changed.cookie}\r\n\r\n".encode())
         assert driver.recv(1)
         strangers[-1].settimeout(0.1)
         with suppress(TimeoutError):

@@ -16,6 +16,7 @@ from gi.repository import Gio, GLib, Gst, GstRtsp, GstRtspServer
 from runner.core.roles import Role
 from runner.errors import RunError, UserError
 from runner.gst.pipeline import encrypt
+from runner.gst.srtp import provide_rtcp_key
 from runner.security.keyring import Holder, Keyring, Watched, rtsp_password, srt_passphrase
 
 USER = "user"  # field of a token of the server library: whose password it stands for
@@ -120,6 +121,7 @@ class StreamLogin:
         client.set_property("user-id", keyring.holder.name)
         client.set_property("user-pw", rtsp_password(keyring.secret, self._vehicle))
         client.connect("accept-certificate", self._accept)
+        provide_rtcp_key(client)
 
     def _accept(self, _client: Gst.Element, _connection: object, certificate: Gio.TlsCertificate, _: object) -> bool:
         self._accepted = certificate if self._check.verify(certificate) == self._expected else None

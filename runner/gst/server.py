@@ -25,6 +25,7 @@ from runner.graph import Plan, rtsp_url
 from runner.gst.connections import RtspConnection
 from runner.gst.memory import give_back
 from runner.gst.pipeline import Build, CameraPipeline
+from runner.gst.srtp import set_master_key
 from runner.gst.timers import every
 from runner.gst.video_files import concerns_file
 from runner.gst.viewers import admit, operator_of, over_uplink
@@ -42,6 +43,7 @@ HELD_S = 5.0  # how long an open camera then waits for the next request
 CLOSE_S = 2.0  # how long connections may take to end when the server stops
 TEARDOWN_S = 5.0  # how long a camera that is reopened waits for the end of its previous pipeline
 BACKLOG = 128  # connections waiting to be accepted; with the library's 5, further viewers would retry after 1 s
+MAX_BODY_BYTES = 65_536  # of a request; the library's limit is 4 GB
 # TLS handshakes wait in a pool of ten threads, to which GLib adds slowly. A client without a request is dropped after
 # FIRST_REQUEST_S, or after CROWDED_S if there are more than CROWD of them.
 FIRST_REQUEST_S, CROWD, CROWDED_S = 5.0, 8, 1.0
@@ -163,6 +165,7 @@ class CameraServer:
         self._server.set_address(media.host)
         self._server.set_service(str(media.port))
         self._server.set_backlog(BACKLOG)
+        self._server.set_content_length_limit(MAX_BODY_BYTES)
         self._threads = GstRtspServer.RTSPThreadPool()
         self._threads.set_max_threads(-1)  # one per client
         self._server.set_thread_pool(self._threads)
@@ -744,6 +747,8 @@ def _on_element(pipeline: Gst.Bin, parent: Gst.Bin, element: Gst.Element, built:
         element.set_property("max-size-buffers", 0)
         element.set_property("max-size-time", 0)
         element.set_property("max-size-bytes", QUEUE_BYTES)
+    if factory == "srtpenc":
+        set_master_key(element)
     camera = built()
     if camera and factory == "rtprtxsend":
         camera.requests.add_store(element)

@@ -364,10 +364,9 @@ class PageServer(Listener):
         self._broadcast_control()
         tasks = [asyncio.create_task(_send(ws, viewer)), asyncio.create_task(self._ping(ws, request))]
         try:
-            await self._listen(ws, viewer)
+            await self._listen(ws, viewer, request)
         except TimeoutError:
-            if request.transport:
-                request.transport.abort()  # a close frame would not be answered either
+            _abort(request)
         finally:
             for task in tasks:
                 task.cancel()
@@ -377,24 +376,28 @@ class PageServer(Listener):
             self._broadcast_control()
         return ws
 
-    async def _listen(self, ws: web.WebSocketResponse, viewer: PageViewer) -> None:
-        """Handle a viewer's messages until it disconnects.
+    async def _listen(self, ws: web.WebSocketResponse, viewer: PageViewer, request: web.Request) -> None:
+        """Handle a viewer's messages, as long as it has access, until it disconnects.
 
         raises  TimeoutError if it makes no progress: pings share the connection with the video and must be answered
         """
         while (message := await ws.receive(UNRESPONSIVE_S)).type not in CLOSE_TYPES:
             if message.type is WSMsgType.PING:
                 await asyncio.wait_for(ws.pong(message.data), UNRESPONSIVE_S)
-            elif message.type in (WSMsgType.TEXT, WSMsgType.BINARY):
+            elif message.type in (WSMsgType.TEXT, WSMsgType.BINARY) and self._has_access(request):
                 self._on_message(viewer, message.data)
 
     async def _ping(self, ws: web.WebSocketResponse, request: web.Request) -> None:
         """Ping a viewer at intervals, as long as it has access; `_listen` notices if it does not answer."""
-        with suppress(ConnectionError):  # `_listen` ends the connection
+        try:
             while self._has_access(request):
                 await asyncio.sleep(PING_S)
-                await ws.ping()
-            await ws.close(message=b"log in again")
+                await asyncio.wait_for(ws.ping(), UNRESPONSIVE_S)
+            await asyncio.wait_for(ws.close(message=b"log in again"), UNRESPONSIVE_S)
+        except ConnectionError:
+            pass  # `_listen` ends the connection
+        except TimeoutError:
+            _abort(request)
 
     def _has_access(self, request: web.Request) -> bool:
         return self._login is None or self._login.accepts(request.cookies.get(COOKIE), time.monotonic())
@@ -580,6 +583,12 @@ class _FaultHandler(logging.Handler):
         text = f"page: {record.getMessage()}" + (f": {type(error).__name__}: {error}" if error else "")
         if not isinstance(error, HttpProcessingError):
             self._on_report(text)
+
+
+def _abort(request: web.Request) -> None:
+    """End the connection of a viewer that would not answer a close frame."""
+    if request.transport:
+        request.transport.abort()
 
 
 async def _send(ws: web.WebSocketResponse, viewer: PageViewer) -> None:

@@ -36,6 +36,7 @@ from runner.records import (
     CameraTelemetry,
     Outcome,
     Position,
+    ReceptionReport,
     ReceptionReported,
     SpeedAdvice,
     SteeringAngle,
@@ -315,7 +316,7 @@ class ControlLoop:
                 (item.sender, item.report.run): t
             }
         reported = ReceptionReported(t, item.sender, item.sender == self._operators.in_control, item.report)
-        self.log.record(reported)
+        self.log.record(reported if reported.in_control else replace(reported, report=_totals(reported.report)))
         link = self._uplink.take(reported)
         if self._uplink.has_rival:
             self._report_once(f"{item.sender}: two processes of this operator send reception reports; one is ignored")
@@ -549,6 +550,11 @@ class ControlLoop:
         if self._position is None or (age_s := t - self._position.t) > POSITION_S:
             return None
         return Position.of(self._position if age_s <= SPEED_S else replace(self._position, speed_mps=None))
+
+
+def _totals(report: ReceptionReport) -> ReceptionReport:
+    """A report without its frames and cameras. Nothing uses those of a watcher, who could fill the disk by them."""
+    return replace(report, units=(), damaged=UNSET)
 
 
 def _without_reasons(state: VehicleState) -> VehicleState:

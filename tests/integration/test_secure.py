@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 import json
+import os
 import re
 import shutil
 import socket
@@ -511,6 +513,26 @@ def test_a_revoked_holder_starts_no_camera(keys, monkeypatch):
         changed(keys, "revoke", "bob")
         assert bob.ask("DESCRIBE", Accept="application/sdp") == 403
         assert not any("pipeline built" in report for report in reports)
+
+
+def test_srtp_keys_come_from_the_systems_generator(keys, monkeypatch):
+    """GStreamer's own are outputs of a generator that also makes the nonces which the server hands to everybody."""
+    drawn = []
+
+    def draw(count):
+        drawn.append(os.urandom(count))
+        return drawn[-1]
+
+    monkeypatch.setattr("runner.gst.srtp.token_bytes", draw)
+    with sending(keys) as (plans, _), watching(plans, keys / "alice") as (seen, _):
+        until(lambda: min(seen().values()) > 10, every_s=0.1)
+        assert len(drawn) == 2 * len(CAMERAS)  # of each camera's video, and of what the operator sends for it
+        with client_of(plans, keys / "bob") as bob:
+            assert bob.ask("DESCRIBE", Accept="application/sdp") == 200
+            offered = re.findall(r"a=key-mgmt:mikey (\S+)", bob.body)
+    assert offered
+    assert all(any(key in base64.b64decode(each) for key in drawn) for each in offered)
+    assert len(set(drawn)) == len(drawn)
 
 
 def test_without_its_secret_an_operator_accepts_no_stream(keys, monkeypatch):

@@ -534,6 +534,13 @@ def test_a_request_that_is_never_finished_times_out(begun):
         assert client.ended()
 
 
+def test_a_request_whose_body_would_fill_the_memory_is_refused():
+    with serving() as vehicle, RtspClient(vehicle.url()) as client:
+        assert client.ask("OPTIONS") == 200
+        assert client.ask("SET_PARAMETER", Content_Length=4_000_000_000) == 413
+        assert client.ended()
+
+
 # --- sockets ----------------------------------------------------------------------------------------------------------
 
 

@@ -173,7 +173,7 @@ def rtsp(system: System, rng: random.Random, count: int) -> None:
                 head += [f"Transport: {rng.choice(TRANSPORTS)}"] * rng.randrange(2)
                 head += [f"Session: {rng.randrange(10**8)}"] * rng.randrange(2)
                 head += [f"Range: npt={rng.choice(('0.000-', 'now-', '-1-', 'x', '9' * 40))}"] * rng.randrange(2)
-                head += [f"Content-Length: {rng.choice((0, 5, -1, 10**12, 'x'))}"] * (rng.random() < 0.1)
+                head += [f"Content-Length: {rng.choice((0, 5, -1, 4 * 10**9, 10**12, 'x'))}"] * (rng.random() < 0.1)
                 sock.sendall(corrupted(rng, "\r\n".join([*head, "", ""]).encode()))
                 sent += 1
                 with suppress(OSError):
