@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from helpers import CONF, Drive, vehicle
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from runner.configuration.rule_lists import call_rule, check_order
@@ -383,6 +383,15 @@ EVENT = st.sampled_from(list(EVENTS)).flatmap(
 )
 PASSING = st.tuples(EVENT, st.sampled_from([0, 0.1, 0.6, 1.5, 4]))  # and the s that pass before the event
 
+# The first measurement that the cap sees is 0.6 s old, and an event follows that it does not read.
+OLD_MEASUREMENT = [
+    ({"event": "operator_disconnected"}, 0),
+    ({"event": "mode_selected", "mode": "single"}, 0),
+    ({"event": "link_measured", "kbps": 0, "queue_ms": 0, "state": "clear"}, 0),
+    ({"event": "operator_connected"}, 0.6),
+    ({"event": "steering_reported", "rad": 0.2}, 0),
+]
+
 
 def reading_everything(vehicle: Vehicle) -> Vehicle:
     """The vehicle with rules that do not state what they read."""
@@ -397,6 +406,7 @@ def reading_everything(vehicle: Vehicle) -> Vehicle:
 @pytest.mark.parametrize("modes", sorted(path.stem for path in (CONF / "modes").glob("*.yaml")))
 @settings(max_examples=40)
 @given(events=st.lists(PASSING, min_size=10, max_size=40))
+@example(events=OLD_MEASUREMENT)
 def test_declaring_reads_changes_no_decision(modes: str, events: list[tuple[dict[str, Any], float]]) -> None:
     stated = vehicle(f"modes={modes}")
     everything = reading_everything(stated)

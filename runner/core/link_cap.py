@@ -196,8 +196,15 @@ def update_cap(
     cap, full = _adapt_overuse(cap, t, limit), limit
     cap = cap._replace(trust=update_trust(cap.trust, t, least_trust, position))
     limit = believed_limit(cap, limit, least_trust)
-    if link.t <= cap.measured:
-        return _handle_silence(cap, link, t, limit)
+    if link.t > cap.measured:
+        cap = _handle_measurement(cap, link, t, limit, full, least_trust)
+    return _handle_silence(cap, link, t, limit)
+
+
+def _handle_measurement(
+    cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps, least_trust: Fraction
+) -> LinkCap:
+    """The cap after a new measurement, under a limit as believed and in full."""
     cap = _record(cap._replace(measured=link.t, began=min(t, cap.began)), link, t)
     if link.state is LinkState.STALLED:
         return _handle_stall(cap, link, t, limit)
@@ -479,7 +486,10 @@ def _halve(cap: LinkCap, stall: Stall, t: float, limit: Kbps) -> LinkCap:
 
 
 def _handle_silence(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:
-    """Without a report the link may be down: halve the cap once per silent period."""
+    """Without a report the link may be down: halve the cap once per silent period.
+
+    Also right after a measurement, which may be old: rules do not see every event.
+    """
     longest = max(SILENCE_S, 2 * _rtt_s(link) + 3 * REPORT_S)
     if t - max(link.t, cap.changed, cap.idle) < longest:
         return cap
