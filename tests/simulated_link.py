@@ -245,7 +245,7 @@ def drive(
 
 
 def _first_cap(limit: float, start: Fraction, predicted: bool) -> LinkCap:
-    return start_cap(UNCAPPED._replace(alone=not predicted), None, 0.0, Fraction(limit), start)
+    return start_cap(UNCAPPED._replace(alone=not predicted, predicted=predicted), None, 0.0, Fraction(limit), start)
 
 
 def _send_frame(queue: Queue, t: float, size: int, is_lost: Callable[[], bool]) -> tuple[list[float], int]:

@@ -249,6 +249,18 @@ def test_a_link_known_to_be_narrow_is_probed_from_what_it_carries() -> None:
     assert max(steps) < 1.1
 
 
+def test_a_doubted_prediction_that_becomes_stale_is_followed_no_further_than_before() -> None:
+    drive = Drive("vehicle=delivery_robot", "modes=safe")
+    drive.accept("bitrate_predicted", t=0, kbps=4000, valid_s=20)
+    for t in range(4, 13, 2):  # each time that it is followed, the queue grows
+        measured(drive, t, 2800, "filling", 60)
+        for n in range(1, 48):
+            measured(drive, t + n / 25, 2800)
+    assert drive.run.memory["cap_by_link"].trust.share < 0.8
+    totals = [measured(drive, 14 + n / 25, 4000) for n in range(200)]
+    assert all(after < 1.1 * before for before, after in pairwise(totals[140:160]))
+
+
 def test_a_prediction_that_returns_restores_the_total_at_once() -> None:
     """What the link carried was measured under another limit, the sum of all b_full."""
     drive = Drive("vehicle=tum_q7", "modes=safe")

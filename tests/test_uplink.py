@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import csv
+import random
 from bisect import bisect_right
+from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
+from itertools import pairwise
 
 import pytest
 from hypothesis import given
@@ -15,7 +18,7 @@ from simulated_link import Link, ShortFlows, busy, drive, jitter, stalls, steps,
 from soak import reports
 
 from runner.core.events import LinkMeasured, PositionReported
-from runner.core.link_cap import LEAST, LinkCap, Most, Overuse, update_cap
+from runner.core.link_cap import LEAST, LastLimit, LinkCap, Most, Overuse, follow, start_cap, update_cap
 from runner.core.trust import (
     KNOWN_S,
     METRES_PER_DEGREE,
@@ -380,6 +383,120 @@ def test_a_place_that_is_doubted_again_is_remembered_longest() -> None:
 def test_distance(lat: float, lon: float, other: float, near: bool) -> None:
     """0.001 degrees of longitude are 111 m at the equator and 56 m at 60 degrees north."""
     assert is_near(PositionReported(t=0, lat=lat, lon=lon), PositionReported(t=0, lat=lat, lon=other)) is near
+
+
+# --- predictions that are always too high -----------------------------------------------------------------------------
+
+
+def reported(
+    cap: LinkCap, limit: float, *reports: tuple[float, str, int, float], least: Fraction = Fraction(1)
+) -> list[float]:
+    """The cap after each report: (t, state, kbit/s, wait in the queue in ms)."""
+    caps = []
+    for t, state, kbps, queue_ms in reports:
+        link = LinkMeasured(t=t, kbps=Fraction(kbps), queue_ms=queue_ms, loss=0.0, state=LinkState(state), rtt_ms=30)
+        cap = update_cap(cap, link, t, Fraction(limit), least)
+        caps.append(limit if cap.kbps is None else float(cap.kbps))
+    return caps
+
+
+def capped(carried: float, limit: float, kbps: float, t: float = 10.0, **other: object) -> LinkCap:
+    """The cap of a link that proved at t to carry so much of its limit."""
+    overuse = Overuse(t, Fraction(carried), Fraction(limit))
+    state: dict[str, object] = {"changed": t, "measured": t, "short": t, "began": 0.0, "predicted": True}
+    return LinkCap(kbps=Fraction(kbps), overuse=overuse, limit=LastLimit(Fraction(limit), 0.0, Fraction(0)))._replace(
+        **{**state, **other}  # type: ignore[arg-type]
+    )
+
+
+def varying(seed: int, low: float, high: float) -> Callable[[float], float]:
+    """A capacity that is another one each second."""
+    rng = random.Random(seed)
+    levels = [rng.uniform(low, high) for _ in range(60)]
+    return lambda t: levels[int(t)]
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_predictions_that_are_always_too_high_cost_little_latency_once_known(seed: int) -> None:
+    """The link falls with the prediction, and so does the cap, before a queue shows it."""
+    kbps = varying(seed, 2000, 6000)
+    right, high = (
+        drive(Link(kbps, one_way_s=0.02), lambda t, share=share: share * kbps(t), 40, cameras=4, fps=10)  # type: ignore[misc]
+        for share in (0.95, 1.42)
+    )
+    assert high.wait_ms(0.99, since=5) <= 1.5 * right.wait_ms(0.99, since=5)
+    assert high.kbps(5, 40) >= 0.92 * right.kbps(5, 40)
+
+
+def test_the_known_capacity_falls_with_the_prediction() -> None:
+    """A short queue seems to be jitter while less is sent than the link carried before."""
+    cap = capped(4000, 5700, 4000, t=5.0)
+    caps = reported(
+        cap,
+        3990,
+        (10.20, "filling", 2800, 35),
+        (10.24, "filling", 2800, 50),
+        (10.28, "filling", 2800, 60),
+        (10.50, "clear", 2400, 0),
+        (10.66, "clear", 2400, 0),
+    )
+    assert max(caps) <= 2800
+
+
+def test_a_rate_that_is_measured_under_another_prediction_keeps_their_ratio() -> None:
+    """Link and prediction rise by 1.43: that the link carries more does not mean that the prediction is right."""
+    cap = capped(2800, 3990, 2400)
+    rise = ((10.24, "draining", 3300, 40), (10.36, "draining", 3900, 30))
+    clear = [(10.44 + n * 0.04, "clear", 2400, 0) for n in range(20)]
+    assert max(reported(cap, 5700, *rise, *clear)) <= 4000
+
+
+def test_a_prediction_that_falls_soon_after_it_proved_too_high_was_not_late() -> None:
+    cap, link = capped(4000, 5700, 3680), {10: 4000, 11: 3000, 12: 4000}
+    for second, kbps in link.items():
+        for n in range(25):
+            t = second + n / 25
+            measured = LinkMeasured(t=t, kbps=Fraction(kbps), queue_ms=0, state=LinkState.CLEAR, rtt_ms=30)
+            cap = update_cap(cap, measured, t, Fraction(round(kbps * 1.425)))
+            assert cap.kbps is not None
+            assert cap.kbps <= 1.05 * kbps
+
+
+def test_an_operators_total_that_falls_lowers_no_cap_below_it() -> None:
+    """Only a prediction that falls says something about the link."""
+    cap = follow(capped(3000, 6000, 2800), Fraction(3500), is_prediction=False)
+    assert reported(cap, 3500, (10.04, "clear", 2800, 0)) == [2800]
+
+
+def test_an_outage_is_not_mistaken_for_a_longer_path() -> None:
+    """The last waits in the queue seem not to drain, although less arrives than before."""
+    link = Link(steps((0, 4000), (4, 1500), (4.25, 0), (6, 4000)))
+    done = drive(link, steps((0, 6000), (4, 2100), (6, 6000)), 8, cameras=4, fps=10)
+    outage = [(t, cap, state) for t, cap, state in done.caps if 4.6 < t < 6]
+    assert {state for _, _, state in outage} == {"stalled"}
+    assert all(after[1] <= before[1] for before, after in pairwise(outage))
+
+
+def test_a_cap_recovers_although_most_cameras_send_next_to_nothing() -> None:
+    """They keep their shares; one of four sends all of its own."""
+    cap, t = LinkCap(kbps=Fraction(500), measured=10.0, changed=10.0, began=0.0), 10.0
+    for _ in range(100):
+        t += 0.1
+        kbps = Fraction(119) if cap.kbps is None else cap.kbps / 4
+        cap = update_cap(cap, LinkMeasured(t=t, kbps=kbps, queue_ms=0, state=LinkState.CLEAR), t, Fraction(4000))
+    assert cap.kbps is None
+
+
+def test_an_operator_that_connects_over_a_narrow_link_has_as_long_as_others_until_its_first_picture() -> None:
+    cap = start_cap(capped(300, 6000, 300, idle=100.0), None, 100.0, Fraction(6000), HALF)
+    assert [update_cap(cap, None, t, Fraction(6000)).kbps for t in (102.5, 104.9, 105.1)] == [300, 300, None]
+
+
+def test_a_place_that_was_left_without_measurements_is_doubted_again() -> None:
+    trust = Trust(Fraction(4, 5), 100.0, places=(DoubtedPlace(laps(0), 100.0, Fraction(4, 5)),))
+    cap = update_cap(capped(300, 6000, 300, t=100.0, trust=trust), None, 110.0, Fraction(6000))
+    assert (cap.kbps, cap.trust.share) == (None, 1)
+    assert update_trust(cap.trust, 151, HALF, laps(150)).share < 0.9
 
 
 MEASURED = st.tuples(

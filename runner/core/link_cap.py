@@ -8,12 +8,13 @@ When an operator connects, the cap starts at a share of the limit.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from fractions import Fraction
 from typing import NamedTuple
 
 from runner.core.events import LinkMeasured, PositionReported
 from runner.core.model import Kbps, exact
-from runner.core.trust import LATE_S, UNDOUBTED, Trust, add_doubt, relieve, thousandths, update_trust
+from runner.core.trust import FALL_S, LATE_S, UNDOUBTED, Trust, add_doubt, relieve, thousandths, update_trust
 from runner.core.uplink import LinkState
 
 DRAIN_MS = 400  # a queue should drain within about this time ...
@@ -25,6 +26,7 @@ LOSING_S = 0.3  # a loss share that has only fallen for longer reflects earlier 
 RESERVE = Fraction(23, 25)  # share of what the link carried up to which recovery is fast
 FAST = Fraction(3, 2)  # increase in each step
 CAREFUL, DOUBLING = Fraction(1, 50), 8  # first increase beyond that, and the number of steps that double it
+HELD_S = 2.0  # after an overuse that proved a prediction too high, until the first careful increase
 TESTED = 3  # a cap grows up to this multiple of what arrives
 BEGIN_S, BEGIN = 2.0, Fraction(5, 4)  # until then the capacity is too uncertain: the cap is tied to what arrives
 SETTLE_S = 0.15  # beyond the round trip, until the effect of a cut shows
@@ -33,6 +35,7 @@ STEP_S = 0.1  # of recovery, on top of the round trip
 START_S = 5.0  # until the first pictures of all cameras have arrived and are reported
 UNMEASURED_S = 2.0  # a present operator that reports nothing for longer does not measure the link
 FRESH_S = 1.0  # an older measurement does not replace a prediction
+FELL = Fraction(9, 10)  # share of the known capacity below which the link has fallen
 BELIEVED = Fraction(24, 25)  # share of what the link carried that a doubted limit is lowered to
 LONGEST_RTT_S = 1.0  # a longer round trip does not delay the recovery further
 LEAST = Fraction(50)  # kbit/s; recovery in factors cannot start from 0
@@ -58,11 +61,19 @@ SILENCE_S = 0.3  # without a report, or with empty reports, for this long the ca
 
 
 class Overuse(NamedTuple):
-    """The last overuse of the link: its time (t), and the capacity and the limit then, kbit/s."""
+    """The last overuse of the link: its time (t), and the capacity and the limit then, kbit/s.
+
+    fell  whether the link carried clearly less than was known: a limit that follows was only late
+    """
 
     t: float
     carried: Kbps
     limit: Kbps
+    fell: bool = False
+
+    def known(self, limit: Kbps) -> Kbps:
+        """The capacity under another limit, if both have changed alike."""
+        return self.carried * limit / self.limit
 
 
 class Lowering(NamedTuple):
@@ -192,8 +203,9 @@ def update_cap(
     """
     if link is None:
         unmeasured = t - max(cap.measured, cap.changed, cap.idle)
-        return _reset(cap) if unmeasured > (START_S if cap.provisional else UNMEASURED_S) else cap
-    cap, full = _adapt_overuse(cap, t, limit), limit
+        has_started = cap.measured >= cap.connected and not cap.provisional
+        return _reset(cap) if unmeasured > (UNMEASURED_S if has_started else START_S) else cap
+    cap, full = _adapt_overuse(_fall_with_limit(cap, t, limit), t, limit), limit
     cap = cap._replace(trust=update_trust(cap.trust, t, least_trust, position))
     limit = believed_limit(cap, limit, least_trust)
     if link.t > cap.measured:
@@ -213,15 +225,27 @@ def _handle_measurement(
     if (link.state is LinkState.FILLING or unanswered) and link.kbps:
         if cap.stall and cap.before:  # after a stall the link carries less than before
             cap = cap._replace(before=min(cap.before, link.kbps))
-        if _may_be_jitter(cap, link):
-            cap = _cut_by_jitter(cap, link, t, limit, full)
-            carried = cap.overuse.carried if cap.overuse else None
-        else:
-            cap, carried = _cut(cap, link, t, limit, full), link.kbps
-        return _doubt_limit(cap, carried, t, full, least_trust)
+        cut = _cut_by_jitter if _may_be_jitter(cap, link) else _cut
+        return _doubt_limit(cut(cap, link, t, limit, full), t, least_trust)
     if link.state is LinkState.CLEAR and not lossy:  # a queue that was full from the start looks empty
-        return _recover(_resume(cap, limit), link, t, limit, full)
-    return _raise_known(cap, link, t)
+        return _recover(_resume(cap, t, limit), link, t, limit, full)
+    return _raise_known(cap, link, t, full)
+
+
+def _fall_with_limit(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
+    """The cap when a prediction falls: a link that carries a constant share of it has fallen, too.
+
+    Not below what it is then known to carry, and not if the link has fallen before, and the prediction follows.
+    """
+    last, before = cap.overuse, cap.limit.kbps
+    if not cap.predicted or cap.kbps is None or last is None or limit >= before:
+        return cap
+    if last.fell and t - last.t <= LATE_S:
+        return cap
+    in_force = min(before, cap.kbps)
+    return cap._replace(
+        kbps=_short(min(in_force, max(in_force * limit / before, RESERVE * min(limit, last.known(limit)))))
+    )
 
 
 def _adapt_overuse(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
@@ -230,7 +254,7 @@ def _adapt_overuse(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
     rose = limit > known.kbps > 0
     cap = cap._replace(limit=LastLimit(limit, t, known.kbps) if rose else known._replace(kbps=limit))
     last = cap.overuse
-    if last is None or limit >= last.limit or last.carried >= last.limit or t - last.t > LATE_S:
+    if last is None or not last.fell or limit >= last.limit or last.carried >= last.limit or t - last.t > LATE_S:
         return cap
     followed = max(limit, last.carried)
     trust = relieve(cap.trust, last.t, followed / last.limit)
@@ -253,7 +277,7 @@ def start_cap(cap: LinkCap, link: LinkMeasured | None, since: float | None, limi
 
 def _reset(cap: LinkCap) -> LinkCap:
     """A new cap that keeps only the places where limits proved too high, and what it is about."""
-    trust = Trust(places=cap.trust.places)
+    trust = Trust(places=tuple(replace(place, near=False) for place in cap.trust.places))
     return LinkCap(trust=trust, connected=cap.connected, measured=cap.measured, predicted=cap.predicted)
 
 
@@ -262,11 +286,12 @@ def believed_limit(cap: LinkCap, limit: Kbps, least_trust: Fraction) -> Kbps:
     return limit if cap.trust.share == 1 or least_trust == 1 or cap.alone else limit * cap.trust.share
 
 
-def _doubt_limit(cap: LinkCap, carried: Kbps | None, t: float, limit: Kbps, least: Fraction) -> LinkCap:
+def _doubt_limit(cap: LinkCap, t: float, least: Fraction) -> LinkCap:
     """Doubt the limit after a cut, if it has been too high for some time."""
-    if cap.changed != t or carried is None or cap.alone or least == 1:
+    last = cap.overuse
+    if cap.changed != t or last is None or cap.alone or least == 1:
         return cap
-    share = min(Fraction(1), thousandths(BELIEVED * carried / limit))
+    share = min(Fraction(1), thousandths(BELIEVED * last.carried / last.limit))
     return cap._replace(trust=add_doubt(cap.trust, t, share))
 
 
@@ -298,7 +323,8 @@ def follow(cap: LinkCap, limit: Kbps, is_prediction: bool) -> LinkCap:
     """The cap under a limit of this kind. Only a prediction that rises means that the link carries more than it did."""
     if cap.predicted and is_prediction:
         return cap
-    return cap._replace(predicted=is_prediction, overuse=cap.overuse and cap.overuse._replace(limit=limit))
+    last, before = cap.overuse and cap.overuse._replace(limit=limit), cap.limit._replace(kbps=limit)
+    return cap._replace(predicted=is_prediction, overuse=last, limit=before)
 
 
 def mark_idle(cap: LinkCap, t: float) -> LinkCap:
@@ -377,17 +403,18 @@ def _cut_by_jitter(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full
     With jitter, at most as much arrives as is sent. Mistaken for the capacity, it would lower the cap repeatedly.
     """
     sent = _in_force(cap, limit)
-    known = cap.overuse.carried if cap.overuse else sent
+    known = cap.overuse.known(full) if cap.overuse else sent
     if cap.overuse and sent <= RESERVE * known and _is_short(link):
-        return _raise_known(cap, link, t)
-    cap = _cut(cap, link, t, limit, full)
-    if cap.overuse is None:
-        return cap
-    return cap._replace(overuse=cap.overuse._replace(carried=max(known, cap.overuse.carried)))
+        return _raise_known(cap, link, t, full)
+    return _cut(cap, link, t, limit, full, known)
 
 
-def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps) -> LinkCap:
-    """full  the limit before doubts"""
+def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps, known: Kbps = Fraction(0)) -> LinkCap:
+    """A cut to less than arrives, if one is due.
+
+    full   the limit before doubts
+    known  what the link is known to carry under it, although less arrives
+    """
     assert link.kbps is not None
     drain = 1 - exact(link.queue_ms or 0) / DRAIN_MS
     lossy = (link.loss or 0) > LOSSY  # the full queue drops packets, which hides its true length
@@ -404,10 +431,12 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps) ->
         target = max(target, DEEPEST * _in_force(cap, limit))
     settled = t - cap.changed >= SETTLE_S + _rtt_s(link)
     if target >= _in_force(cap, limit) or not (settled or (link.queue_ms or 0) > cap.queue_ms):
-        return _raise_known(_lower_known(cap, carried, link, t), link, t)
+        seen = _limit_seen(cap, link, t, full)
+        return _raise_known(_lower_known(cap, max(carried, known * seen / full), link, t, seen), link, t, full)
+    seen = _limit_seen(cap, link, t, full)
     return cap._replace(
         kbps=_short(target),
-        overuse=Overuse(t, carried, cap.limit.before if t - cap.limit.t < SEEN_S + _rtt_s(link) else full),
+        overuse=_overuse(cap.overuse, t, max(carried, _short(known * seen / full)), seen),
         queue_ms=link.queue_ms or 0.0,
         steps=0,
         changed=t,
@@ -416,28 +445,44 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps) ->
     )
 
 
-def _lower_known(cap: LinkCap, carried: Kbps, link: LinkMeasured, t: float) -> LinkCap:
+def _overuse(last: Overuse | None, t: float, carried: Kbps, limit: Kbps) -> Overuse:
+    """A new overuse after the last one; cuts within FALL_S belong to the same fall of the link."""
+    has_fallen = carried < FELL * (last.known(limit) if last else limit)
+    return Overuse(t, carried, limit, has_fallen or (last is not None and last.fell and t - last.t < FALL_S))
+
+
+def _limit_seen(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> Kbps:
+    """The limit under which a rate was measured: after a rise, for some time the one before."""
+    return cap.limit.before if _is_recent(cap.limit.t, link, t) else limit
+
+
+def _lower_known(cap: LinkCap, carried: Kbps, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:
     """Lower the known capacity if the link proves to carry less than at its last overuse, and no cut is due."""
-    if cap.overuse is None or carried >= cap.overuse.carried:
+    if cap.overuse is None or carried >= (known := cap.overuse.known(limit)):
         return cap
-    known = max(cap.overuse.carried, cap.lowering.known if _is_recent(cap.lowering.t, link, t) else carried)
-    return cap._replace(overuse=cap.overuse._replace(carried=carried), lowering=Lowering(t, known))
+    known = max(known, cap.lowering.known if _is_recent(cap.lowering.t, link, t) else carried)
+    return cap._replace(overuse=_known_now(cap.overuse, carried, limit), lowering=Lowering(t, known))
 
 
-def _raise_known(cap: LinkCap, link: LinkMeasured, t: float) -> LinkCap:
+def _raise_known(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:
     """Raise the known capacity soon after an overuse, while its queue lasts, if more arrives than it.
 
     Likewise soon after a measurement that lowered it, but not above the value before. After a stall units arrive in
     bursts, and a measurement may include a pause between them.
     """
     last = cap.overuse
-    if last is None or link.kbps is None or link.kbps <= last.carried:
+    if last is None or link.kbps is None or link.kbps <= (known := last.known(limit)):
         return cap
     if _is_recent(last.t, link, t):
-        return cap._replace(overuse=last._replace(carried=link.kbps))
+        return cap._replace(overuse=_known_now(last, link.kbps, limit))
     if _is_recent(cap.lowering.t, link, t):
-        return cap._replace(overuse=last._replace(carried=max(last.carried, min(link.kbps, cap.lowering.known))))
+        return cap._replace(overuse=_known_now(last, max(known, min(link.kbps, cap.lowering.known)), limit))
     return cap
+
+
+def _known_now(last: Overuse, carried: Kbps, limit: Kbps) -> Overuse:
+    """The overuse with what the link carries under the current limit."""
+    return last._replace(carried=_short(carried), limit=limit)
 
 
 def _is_recent(since: float, link: LinkMeasured, t: float) -> bool:
@@ -453,19 +498,30 @@ def _recover(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps
         return cap._replace(kbps=None, provisional=False, changed=t)
     if cap.provisional and cap.before is None:
         return cap  # it does not grow before a rate has been measured
-    if link.kbps is not None and _sent(cap, limit) > TESTED * link.kbps:
-        return cap  # nor does a cap that static pictures are far from using
     steps, factor, last = cap.steps, FAST, cap.overuse
     if cap.provisional or (last and last.t - cap.began < BEGIN_S):
         factor = min(FAST, BEGIN * (link.kbps or 0) / cap.kbps)
     elif last:
-        factor = min(FAST, RESERVE * last.carried * full / last.limit / cap.kbps)
+        factor = min(FAST, RESERVE * last.known(full) / cap.kbps)
     if factor < 1 + CAREFUL:
+        if not _may_probe(cap, link, t, limit):
+            return cap
         factor, steps = min(FAST, 1 + CAREFUL * 2 ** (steps // DOUBLING)), steps + 1
     kbps = _short(cap.kbps * factor)
     if kbps >= limit:
         return cap._replace(kbps=None, provisional=False, steps=steps, changed=t)
     return cap._replace(kbps=kbps, steps=steps, changed=t)
+
+
+def _may_probe(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> bool:
+    """Whether the cap may grow beyond what the link is known to carry.
+
+    Not soon after the prediction proved too high, nor if static pictures are far from using the cap.
+    """
+    last = cap.overuse
+    if cap.predicted and last and t - last.t < HELD_S and last.carried < FELL * last.limit:
+        return False
+    return link.kbps is None or _sent(cap, limit) <= TESTED * link.kbps
 
 
 def _handle_stall(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:
@@ -496,14 +552,14 @@ def _handle_silence(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> 
     return _halve(cap, cap.stall or Stall(link.t, 0), t, limit)
 
 
-def _resume(cap: LinkCap, limit: Kbps) -> LinkCap:
+def _resume(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
     """After a stall, the first report with an empty queue restores half of the rate before it."""
     if cap.stall is None:
         return cap
     kbps = cap.kbps
-    if kbps is not None and cap.stall.halved and cap.before:
-        kbps = max(kbps, min(cap.before, limit) / 2)
-    return cap._replace(kbps=kbps, stall=None)
+    if kbps is None or not cap.stall.halved or not cap.before:
+        return cap._replace(stall=None)
+    return cap._replace(kbps=max(kbps, min(cap.before, limit) / 2), stall=None, changed=t)
 
 
 def _rtt_s(link: LinkMeasured) -> float:

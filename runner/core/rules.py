@@ -379,7 +379,7 @@ def cap_by_link(
         if alone:
             most = sum((camera.rate_quality.b_full for camera in cameras), allocation.ZERO)
             draft, asked, limit = draft.replaced(measured=True, total=most), limit, wire_kbps(cameras, most)
-            cap = probe(cap, state.t, asked, limit)._replace(replaced=state.t)
+            cap = probe(cap, state.t, believed_limit(cap, asked, least_trust), limit)._replace(replaced=state.t)
         else:
             cap = end_probe(cap)
         cap = follow(cap, limit, state.mode is Mode.AUTOMATIC and not alone)

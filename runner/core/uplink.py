@@ -198,15 +198,17 @@ def estimate(uplink: UplinkMemory, report: LinkReport) -> tuple[UplinkMemory, Li
         onset = max((u.arrived for u in uplink.units if u.queue <= EMPTY_S), default=uplink.units[0].arrived)
     else:
         onset = uplink.onset
-    queues = (*_entries_since(uplink.queues, report.at - STUCK_S), (report.at, queue, report.packets, report.lost))
+    stalled = report.at - last > _longest_gap(frame)
+    # In a stall nothing new is known of the queue, which would seem not to drain.
+    waits = () if stalled else _entries_since(uplink.queues, report.at - STUCK_S)
+    queues = (*waits, (report.at, queue, report.packets, report.lost))
     uplink = replace(uplink, onset=onset, queues=queues)
     fallen = onset is not None and queue + uplink.units[-1].playout > FALLEN_S
     own = min(frame, SLOW_S)
     kbps, since = _rate(uplink, last, max(FALLEN_RATE_S, own) if fallen else max(RATE_S, 3 * frame), queue, own)
-    uplink = replace(uplink, peak=max(0.0 if onset is None else uplink.peak, kbps or 0.0))
+    uplink = replace(uplink, peak=max(0.0 if onset is None or stalled else uplink.peak, kbps or 0.0))
     if _is_stuck(uplink, kbps):
         return _lengthen_path(uplink), LinkEstimate(kbps, 0.0, _loss(packets), LinkState.CLEAR)
-    stalled = report.at - last > _longest_gap(frame)
     state = LinkState.STALLED if stalled else _state(queues, queue, onset)
     if state in (LinkState.FILLING, LinkState.DRAINING) and kbps is not None:
         steady = FALLEN_RATE_S if fallen else STEADY_S
