@@ -148,8 +148,8 @@ def test_messages_are_ignored_once_the_token_is_replaced(monkeypatch):
 def test_connections_without_access_replace_each_other_and_close_none_with_access(monkeypatch):
     """Otherwise a stranger could take all descriptors of the process that shows the pictures."""
     monkeypatch.setattr("runner.page.server.MAX_STRANGERS", 5)
-    changed = OneSession()
-    with served(login=changed.login) as (port, _), ExitStack() as stack:
+    one = OneSession()
+    with served(login=one.login) as (port, _), ExitStack() as stack:
 
         def connected(path, cookie=""):
             line = stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=60))
@@ -157,12 +157,12 @@ def test_connections_without_access_replace_each_other_and_close_none_with_acces
             assert line.recv(65536).startswith(b"HTTP/1.1 200")
             return line
 
-        driver = connected("/", f"Cookie: {changed.cookie}\r\n")
+        driver = connected("/", f"Cookie: {one.cookie}\r\n")
         strangers = [connected("/login") for _ in range(8)]
         for line in strangers[:3]:
             while line.recv(65536):
                 pass
-        driver.sendall(f"GET / HTTP/1.1\r\nHost: localhost:{port}\r\nCookie: {changed.cookie}\r\n\r\n".encode())
+        driver.sendall(f"GET / HTTP/1.1\r\nHost: localhost:{port}\r\nCookie: {one.cookie}\r\n\r\n".encode())
         assert driver.recv(1)
         strangers[-1].settimeout(0.1)
         with suppress(TimeoutError):

@@ -18,7 +18,7 @@ from runner.gst.viewers import StreamViewer
 USER_TIMEOUT_MS = 2000  # the kernel closes a connection whose data stays unacknowledged for this long (RFC 5482)
 KEEPALIVE_S, KEEPALIVES = 2, 3  # a peer that answers none of this many probes, this far apart, is gone
 _SIOCOUTQ = 0x5411  # unacknowledged bytes (linux/sockios.h)
-_BYTES_ACKED, _MIN_RTT = 120, 148  # offsets in struct tcp_info (linux/tcp.h)
+_BYTES_ACKED, _BYTES_RECEIVED, _MIN_RTT = 120, 128, 148  # offsets in struct tcp_info (linux/tcp.h)
 BUFFER_S = 0.35  # of video in the send buffer, in addition to the round-trip time
 LEAST_BUFFER_BYTES = 16_384
 
@@ -33,7 +33,7 @@ class RtspConnection:
     opening      whether it waits for the camera of its DESCRIBE to open
     described    camera of its last DESCRIBE: the library keeps it open for the client
     interleaved  whether this connection also carries video
-    last_request monotonic time of its last complete request, s; before the first, of its start
+    last_request monotonic time of its last complete request, s; before the first, of its start; see `note_request`
     peer         its IP address and port
     closed       whether it was told to close
     refusal      reason for refusing it, as far as known; "" if it may
@@ -53,7 +53,7 @@ class RtspConnection:
         self.described = ""
         self.opening = self.interleaved = False
         self.last_request = self._began = self._writable = time.monotonic()
-        self._buffer = 0
+        self._buffer = self._received = 0
         self._written: deque[tuple[float, int]] = deque()  # when, total bytes written by then
 
     def __str__(self) -> str:
@@ -62,6 +62,21 @@ class RtspConnection:
     def unused_s(self, now: float) -> float:
         """How long it has waited for a first request, s; 0 afterwards. Over TLS it may be in the handshake."""
         return now - self.viewer.since if self.last_request == self._began else 0.0
+
+    def note_request(self) -> None:
+        """A request is complete. From its thread."""
+        self.last_request, self._received = time.monotonic(), self._bytes_received()
+
+    def unanswered_bytes(self) -> int:
+        """Bytes received since the last complete request: of the next one, and RTCP of interleaved video."""
+        return self._bytes_received() - self._received
+
+    def _bytes_received(self) -> int:
+        (received,) = struct.unpack_from("Q", self._tcp_info(), _BYTES_RECEIVED)
+        return int(received)
+
+    def _tcp_info(self) -> bytes:
+        return self._socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 256)
 
     def identify(self, operator: str | None) -> None:
         self.viewer = self.viewer._replace(operator=operator or "")
@@ -80,7 +95,7 @@ class RtspConnection:
                 reader exerts back-pressure on the encoder, and its data is no older than the buffer.
         """
         now = time.monotonic()
-        info = self._socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 256)
+        info = self._tcp_info()
         (acked,), (rtt_us,) = struct.unpack_from("Q", info, _BYTES_ACKED), struct.unpack_from("I", info, _MIN_RTT)
         self._resize_buffer(round(kbps * 125 * (BUFFER_S + rtt_us / 1e6)))
         (waiting,) = struct.unpack("i", ioctl(self._socket, _SIOCOUTQ, bytes(4)))

@@ -43,7 +43,8 @@ HELD_S = 5.0  # how long an open camera then waits for the next request
 CLOSE_S = 2.0  # how long connections may take to end when the server stops
 TEARDOWN_S = 5.0  # how long a camera that is reopened waits for the end of its previous pipeline
 BACKLOG = 128  # connections waiting to be accepted; with the library's 5, further viewers would retry after 1 s
-MAX_BODY_BYTES = 65_536  # of a request; the library's limit is 4 GB
+MAX_BODY_BYTES = 65_536  # of a request; the library's limit is 4 GB ...
+MAX_REQUEST_BYTES = 1_048_576  # ... and it has none for the number of headers
 # TLS handshakes wait in a pool of ten threads, to which GLib adds slowly. A client without a request is dropped after
 # FIRST_REQUEST_S, or after CROWDED_S if there are more than CROWD of them.
 FIRST_REQUEST_S, CROWD, CROWDED_S = 5.0, 8, 1.0
@@ -388,7 +389,7 @@ class CameraServer:
     def _on_answered(self, client: GstRtspServer.RTSPClient, _context: object) -> None:
         connection = self._connection(client)
         if connection:
-            connection.last_request = time.monotonic()
+            connection.note_request()
             if connection.refusal == NO_CERTIFICATE:
                 connection.refusal = NO_PASSWORD
 
@@ -398,7 +399,8 @@ class CameraServer:
         camera, connection = self._cameras.get(_path(context)), self._connection(client)
         withdrawn = self._viewers.withdrawn(client) if self._viewers else None
         if connection:
-            connection.last_request, connection.refusal = time.monotonic(), withdrawn or ""
+            connection.note_request()
+            connection.refusal = withdrawn or ""
         if withdrawn:
             return FORBIDDEN
         if camera is None:
@@ -535,10 +537,11 @@ class CameraServer:
         connection.close()
 
     def _watch_connections(self) -> None:
-        """Close readers that lag, and connections without a complete request."""
+        """Close readers that lag, and connections without a complete request or with one that does not end."""
         with self._changed:
             connections = list(self._connections.items())
             lags = {connection: self._lag(connection) for _, connection in connections if connection.interleaved}
+            endless = {each for _, each in connections if each.unanswered_bytes() > MAX_REQUEST_BYTES}
             now = time.monotonic()
             self._left = {name: until for name, until in self._left.items() if now < until}
             left = tuple(self._left)
@@ -550,6 +553,8 @@ class CameraServer:
         for client, connection in connections:
             if lags.get(connection, 0) > LAG_S:
                 self._close(connection, f"it lags by more than {LAG_S:g} s")
+            elif connection in endless:
+                self._close(connection, f"it sends a request of more than {MAX_REQUEST_BYTES} bytes")
             elif now - connection.last_request > self._media.session_timeout_s and not client.session_filter(None):
                 connection.close()
 

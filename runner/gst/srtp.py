@@ -1,6 +1,6 @@
 """Master keys of SRTP (RFC 3711) from the system's generator.
 
-GStreamer (1.22) draws them from GLib's generator, which is predictable: the server's digest nonces come from it, too.
+GStreamer draws them from GLib's generator, which is predictable: the server's digest nonces come from it, too.
 """
 
 from __future__ import annotations

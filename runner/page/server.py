@@ -218,8 +218,7 @@ class PageServer(Listener):
     def _expire(self, connection: RequestHandler) -> None:
         if connection in self._awaiting_request:
             self._awaiting_request.remove(connection)
-            if connection.transport:
-                connection.transport.abort()
+            _abort(connection.transport)
 
     def _limit_strangers(self) -> None:
         """Make room for a new connection: without a limit, strangers would take all of the process's descriptors."""
@@ -366,7 +365,7 @@ class PageServer(Listener):
         try:
             await self._listen(ws, viewer, request)
         except TimeoutError:
-            _abort(request)
+            _abort(request.transport)
         finally:
             for task in tasks:
                 task.cancel()
@@ -392,12 +391,12 @@ class PageServer(Listener):
         try:
             while self._has_access(request):
                 await asyncio.sleep(PING_S)
-                await asyncio.wait_for(ws.ping(), UNRESPONSIVE_S)
+                await ws.ping()
             await asyncio.wait_for(ws.close(message=b"log in again"), UNRESPONSIVE_S)
         except ConnectionError:
             pass  # `_listen` ends the connection
         except TimeoutError:
-            _abort(request)
+            _abort(request.transport)
 
     def _has_access(self, request: web.Request) -> bool:
         return self._login is None or self._login.accepts(request.cookies.get(COOKIE), time.monotonic())
@@ -585,10 +584,10 @@ class _FaultHandler(logging.Handler):
             self._on_report(text)
 
 
-def _abort(request: web.Request) -> None:
-    """End the connection of a viewer that would not answer a close frame."""
-    if request.transport:
-        request.transport.abort()
+def _abort(transport: asyncio.BaseTransport | None) -> None:
+    """End a connection whose peer would not answer."""
+    if isinstance(transport, asyncio.Transport):
+        transport.abort()
 
 
 async def _send(ws: web.WebSocketResponse, viewer: PageViewer) -> None:

@@ -541,6 +541,20 @@ def test_a_request_whose_body_would_fill_the_memory_is_refused():
         assert client.ended()
 
 
+def test_a_request_whose_headers_never_end_is_cut_off():
+    """Its session would be kept alive by RTCP."""
+    with serving() as vehicle, RtspClient(vehicle.url()) as client:
+        assert client.open(udp=True) == [200, 200, 200]
+        client.tcp.sendall(b"OPTIONS * RTSP/1.0\r\nCSeq: 9\r\n")
+        client.tcp.settimeout(1)
+        with suppress(OSError):  # once the server has closed, nothing is read any more
+            for _ in range(20_000):
+                client.tcp.sendall(b"X: " + b"a" * 1000 + b"\r\n")
+                time.sleep(1e-4)
+        assert client.ended()
+        until(lambda: any("it sends a request of more than 1048576 bytes" in what for what in vehicle.reported))
+
+
 # --- sockets ----------------------------------------------------------------------------------------------------------
 
 
