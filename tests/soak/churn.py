@@ -31,6 +31,7 @@ RESIZES, RECONNECTS, REBUILDS = 10_000, 1000, 3000
 # the operator's side varies by 10 MB from one rebuild to the next, and its lowest size levels off over some 2000.
 WARM = {"resizes": 2000, "reconnects": 150, "rebuilds": 500}
 EVERY_S = 0.5
+ENDING_S = 10.0  # until a process that is about to end has ended
 BLOCKS = 20  # of samples, since successive samples are not independent
 CONFIDENT = 2.1  # standard errors: 95 % for a line through this many means
 PER = 1000  # operations
@@ -125,9 +126,13 @@ def _measured(system: System, what: str, most: int, operations: Iterator[int]) -
         if time.monotonic() >= due:
             due = time.monotonic() + EVERY_S
             for name, child in system.processes.items():
-                assert child.poll() is None, f"{name} ended"
+                system.check_running(name)
                 for kind in RESOURCES:
-                    samples_by_kind.setdefault((name, kind), []).append((done, kind.read(child.pid)))
+                    try:
+                        samples_by_kind.setdefault((name, kind), []).append((done, kind.read(child.pid)))
+                    except (OSError, KeyError):  # it is ending
+                        child.wait(ENDING_S)
+                        system.check_running(name)
         if done >= warm + most:
             break
     print(f"  {warm + most} {what} in {time.monotonic() - began:.0f} s; growth per {PER}:", flush=True)

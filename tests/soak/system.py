@@ -33,6 +33,7 @@ ROBOT = ("vehicle=delivery_robot", "source=test", "fps_max=15")
 CONSTANT = ("pqos=constant", "pqos.kbps=3000")
 CAMERAS = ("front", "rear", "mast")
 ANSWERED_S, ATTEMPTS = 10.0, 6  # for a request
+FAULTS = {"PYTHONFAULTHANDLER": "1"}  # a side that crashes prints where
 PATIENCE_S = 60.0  # of another player: longer than any source is silent, as ffmpeg waits
 
 
@@ -112,11 +113,16 @@ class System:
                 stdout=output,
                 stderr=output,
                 cwd=CHECKOUT,
-                env={**os.environ, "PYTHONPATH": str(CHECKOUT), **self._environment.get(name, {})},
+                env={**os.environ, **FAULTS, "PYTHONPATH": str(CHECKOUT), **self._environment.get(name, {})},
             )
 
     def output(self, name: str) -> Path:
         return self.directory / f"{name}.txt"
+
+    def check_running(self, name: str) -> None:
+        """raises  AssertionError if a process has ended, with its status and the end of its output"""
+        if (status := self.processes[name].poll()) is not None:
+            raise AssertionError(f"{name} ended with status {status}: {self.output(name).read_text()[-2000:]}")
 
     def stop(self) -> None:
         for child in self.processes.values():
