@@ -35,7 +35,7 @@ STEP_S = 0.1  # of recovery, on top of the round trip
 START_S = 5.0  # until the first pictures of all cameras have arrived and are reported
 UNMEASURED_S = 2.0  # a present operator that reports nothing for longer does not measure the link
 FRESH_S = 1.0  # an older measurement does not replace a prediction
-FELL = Fraction(9, 10)  # share of the known capacity below which the link has fallen
+FELL = Fraction(9, 10)  # share of the known capacity below which the link has fallen, or of a prediction: too high
 BELIEVED = Fraction(24, 25)  # share of what the link carried that a doubted limit is lowered to
 LONGEST_RTT_S = 1.0  # a longer round trip does not delay the recovery further
 LEAST = Fraction(50)  # kbit/s; recovery in factors cannot start from 0
@@ -429,11 +429,9 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps, kn
     target = max(target, YIELDED * most * (CONTESTED + (1 - CONTESTED) * burst if _is_contested(cap) else 1))
     if cap.provisional:  # not all cameras may have started, so a low rate proves little
         target = max(target, DEEPEST * _in_force(cap, limit))
-    settled = t - cap.changed >= SETTLE_S + _rtt_s(link)
+    settled, seen = t - cap.changed >= SETTLE_S + _rtt_s(link), _limit_seen(cap, link, t, full)
     if target >= _in_force(cap, limit) or not (settled or (link.queue_ms or 0) > cap.queue_ms):
-        seen = _limit_seen(cap, link, t, full)
         return _raise_known(_lower_known(cap, max(carried, known * seen / full), link, t, seen), link, t, full)
-    seen = _limit_seen(cap, link, t, full)
     return cap._replace(
         kbps=_short(target),
         overuse=_overuse(cap.overuse, t, max(carried, _short(known * seen / full)), seen),

@@ -232,8 +232,7 @@ class PageServer(Listener):
         if oldest is None:
             raise ConnectionRefusedError("too many connections")
         del self._strangers[oldest]
-        assert oldest.transport
-        oldest.transport.abort()  # a close would wait for the peer's answer
+        _abort(oldest.transport)
 
     async def _close(self) -> None:
         self._server.close()
