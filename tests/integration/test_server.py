@@ -723,7 +723,8 @@ def test_the_reason_of_a_source_that_fails_is_reported_and_it_leaves_nothing():
         until(lambda: len(failures()) == 2)
         before = len(os.listdir("/proc/self/fd"))
         until(lambda: len(failures()) >= 6)
-        assert len(os.listdir("/proc/self/fd")) < before + 4, "each source left its bus behind"
+        # Two descriptors for each bus that is left. Sources that are just opening or closing have some too.
+        until(lambda: len(os.listdir("/proc/self/fd")) < before + 4)
 
 
 def test_idle_connections_take_no_descriptors_from_others(monkeypatch):
