@@ -9,8 +9,10 @@ import pytest
 from helpers import Command, UserConf, shared_cache
 from hypothesis import settings
 
-settings.register_profile("any machine", deadline=None)  # a busy one may take longer than 0.2 s for an example
-settings.load_profile("any machine")
+# A busy machine may take longer than 0.2 s for an example. The same examples in each run; `make soak` draws others.
+settings.register_profile("same", deadline=None, derandomize=True)
+settings.register_profile("random", deadline=None, derandomize=False, print_blob=True)
+settings.load_profile("same")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

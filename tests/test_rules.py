@@ -392,6 +392,13 @@ OLD_MEASUREMENT = [
     ({"event": "steering_reported", "rad": 0.2}, 0),
 ]
 
+# The cap starts under a limit, and an event follows that it does not read.
+NEW_OPERATOR = [
+    ({"event": "mode_selected", "mode": "single"}, 0),
+    ({"event": "operator_connected"}, 0.1),
+    ({"event": "steering_reported", "rad": 0.2}, 0),
+]
+
 
 def reading_everything(vehicle: Vehicle) -> Vehicle:
     """The vehicle with rules that do not state what they read."""
@@ -407,6 +414,7 @@ def reading_everything(vehicle: Vehicle) -> Vehicle:
 @settings(max_examples=40)
 @given(events=st.lists(PASSING, min_size=10, max_size=40))
 @example(events=OLD_MEASUREMENT)
+@example(events=NEW_OPERATOR)
 def test_declaring_reads_changes_no_decision(modes: str, events: list[tuple[dict[str, Any], float]]) -> None:
     stated = vehicle(f"modes={modes}")
     everything = reading_everything(stated)

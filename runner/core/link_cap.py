@@ -204,7 +204,7 @@ def update_cap(
     if link is None:
         unmeasured = t - max(cap.measured, cap.changed, cap.idle)
         has_started = cap.measured >= cap.connected and not cap.provisional
-        return _reset(cap) if unmeasured > (UNMEASURED_S if has_started else START_S) else cap
+        return _reset(cap, limit) if unmeasured > (UNMEASURED_S if has_started else START_S) else cap
     cap, full = _adapt_overuse(_fall_with_limit(cap, t, limit), t, limit), limit
     cap = cap._replace(trust=update_trust(cap.trust, t, least_trust, position))
     limit = believed_limit(cap, limit, least_trust)
@@ -272,13 +272,14 @@ def start_cap(cap: LinkCap, link: LinkMeasured | None, since: float | None, limi
     cap, kbps = cap._replace(connected=since), _short(limit * share)
     if link is not None or (cap.kbps is not None and cap.kbps <= kbps):
         return cap
-    return _reset(cap)._replace(kbps=kbps, provisional=True, idle=max(cap.idle, since), replaced=cap.replaced)
+    return _reset(cap, limit)._replace(kbps=kbps, provisional=True, idle=max(cap.idle, since), replaced=cap.replaced)
 
 
-def _reset(cap: LinkCap) -> LinkCap:
-    """A new cap that keeps only the places where limits proved too high, and what it is about."""
+def _reset(cap: LinkCap, limit: Kbps) -> LinkCap:
+    """A new cap under a limit, which keeps only the places where limits proved too high, and what it is about."""
     trust = Trust(places=tuple(replace(place, near=False) for place in cap.trust.places))
-    return LinkCap(trust=trust, connected=cap.connected, measured=cap.measured, predicted=cap.predicted)
+    known = NO_LIMIT._replace(kbps=limit)
+    return LinkCap(trust=trust, connected=cap.connected, measured=cap.measured, predicted=cap.predicted, limit=known)
 
 
 def believed_limit(cap: LinkCap, limit: Kbps, least_trust: Fraction) -> Kbps:
