@@ -426,8 +426,9 @@ class PageServer(Listener):
     def _broadcast_control(self) -> None:
         """Send each viewer the holder of control, and whether another window of its page has the focus or is hidden."""
         for viewer in self._viewers:
-            others = {other.attention for other in self._others(viewer)}
-            elsewhere, covered = Attention.WATCHING in others, Attention.HIDDEN in others
+            others = self._others(viewer)
+            elsewhere = any(other.focused for other in others)
+            covered = any(other.attention is Attention.HIDDEN for other in others)
             holder = self._control.holder_for(self._page_of(viewer))
             viewer.post("control", {"holder": holder, "elsewhere": elsewhere, "covered": covered})
         self._report_attention()
@@ -455,7 +456,7 @@ class PageServer(Listener):
             case {"counter": dict(found)} if self._on_counter and (reading := counter_reading(found)):
                 self._on_counter(reading)
             case {"attention": str(word)} if word in REPORTED:
-                viewer.attention = Attention(word)
+                viewer.attention, viewer.focused = Attention(word), document.get("focused") is True
                 self._broadcast_control()
             case {"select": str(name)} if name in self._index:
                 self._select(viewer, name)

@@ -32,6 +32,7 @@ class PageViewer:
     browser    see `runner.page.control.Window`
     monitor    see there
     attention  whether its user can see the pictures; None: not reported yet
+    focused    whether its browser's keys reach it
     selected   name of the selected camera; "": none yet
     """
 
@@ -40,6 +41,7 @@ class PageViewer:
     ) -> None:
         self.token, self.cameras, self.browser, self.monitor = token, cameras, browser, monitor
         self.attention: Attention | None = None
+        self.focused = False
         self.selected = ""
         self._burst = burst
         self._nonempty = asyncio.Event()

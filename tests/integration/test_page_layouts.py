@@ -281,7 +281,7 @@ def test_a_busy_page_delays_neither_pictures_nor_alarms_even_as_webgl_starts(chr
 
         if not passes(is_labelled):
             shot(page, "busy-unlabelled")
-            said = page.evaluate("Promise.all([localStorage['tod-straight'], tod.measure()])")
+            said = page.evaluate("Promise.all([JSON.stringify(localStorage), tod.measure()])")
             pytest.fail(f"{page.inner_text('#toasts')} {said}")
 
 

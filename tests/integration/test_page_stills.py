@@ -104,6 +104,21 @@ def test_lines_match_marks_in_a_straightened_fisheye_which_accepts_no_region(pag
     until(lambda: page.inner_text("[data-camera=fisheye] .shown") == "")
 
 
+def test_only_a_fisheye_of_this_vehicle_is_straightened_by_an_earlier_choice(page):
+    page.evaluate("localStorage['tod-straight:another'] = 'fisheye'")
+    page.evaluate("localStorage['tod-straight:marks'] = 'cropped'")  # it was a fisheye then
+    page.reload()
+    all_live(page)
+    assert not any(camera["straight"] for camera in measured(page).values())
+    page.evaluate("localStorage['tod-straight:marks'] = 'cropped fisheye'")
+    page.reload()
+    until(lambda: [name for name, camera in measured(page).items() if camera["straight"]] == ["fisheye"])
+
+
+def measured(page):
+    return page.evaluate("tod.measure()")["cameras"]
+
+
 def test_the_wheel_zooms_the_region_the_middle_button_moves_it_and_its_aspect_may_be_locked(page, station):
     def requested_roi():
         roi = until(lambda: getattr(station, "last_request", None))

@@ -46,8 +46,12 @@ export class Attention {
 
   /** Warning for an operator who may still see the page; null: none. */
   get warning() {
-    if (this.state === "slow") return "SLOW: this page draws fewer than 10 pictures a second";
-    if (this.state === "unfocused" && !this.elsewhere) return "OUT OF FOCUS: keys do not reach this page; click it";
-    return this.covered && !this.hidden ? "HIDDEN: another window of this page cannot be seen" : null;
+    if (this.hidden) return null;
+    const warnings = [
+      !this.focused && !this.elsewhere && "OUT OF FOCUS: keys do not reach this page; click it",
+      this.covered && "HIDDEN: another window of this page cannot be seen",
+      this.slow && "SLOW: this page draws fewer than 10 pictures a second",
+    ];
+    return warnings.filter(Boolean).join(" · ") || null;
   }
 }

@@ -1,6 +1,6 @@
 /** The bird's-eye view's place on the page: whether it is shown, and in which box. The worker draws it. */
 
-import { enlarge, listen, publish, store } from "./store.js";
+import { enlarge, listen, note, ofVehicle, publish, store } from "./store.js";
 import { BIRDSEYE, isTopView } from "./arrange.js";
 import { groundOf } from "./ground.js";
 import { showGround, transferGround } from "./link.js";
@@ -8,29 +8,31 @@ import { STALLED } from "./status.js";
 import { byId, displayName, setAttribute, setText } from "./format.js";
 
 const CHOICE = "tod-birdseye";
+let failure = ""; // why it cannot be drawn any more
 
 const cameras = () => (globalThis.boot.canShowVideo && store.hello?.dimensions ? store.hello.cameras.filter(isTopView) : []);
 
 /** By default it is shown only if all its cameras are calibrated. */
 function isChosen() {
-  const choice = localStorage.getItem(CHOICE);
+  const choice = localStorage.getItem(ofVehicle(CHOICE));
   return choice === null ? cameras().every(({ calibrated }) => calibrated) : choice === "on";
 }
 
 /** The size of the ground that it shows, m; null: it is off, or the vehicle has no camera that looks down. */
 export function birdseyeSize() {
   const dimensions = store.hello?.dimensions;
-  return dimensions && cameras().length && isChosen() ? groundOf(dimensions) : null;
+  return dimensions && !failure && cameras().length && isChosen() ? groundOf(dimensions) : null;
 }
 
 function choose(choice) {
-  localStorage.setItem(CHOICE, choice);
+  localStorage.setItem(ofVehicle(CHOICE), choice);
   publish("birdseye");
 }
 
 /** Cycle: in the row below the front camera, large in its place, off. */
 export function cycleBirdseye() {
   if (store.view !== "drive" || !cameras().length) return;
+  if (failure) return publish("toast", { text: failure, level: "problem" });
   if (!isChosen()) return choose("on");
   if (store.enlarged !== BIRDSEYE) return enlarge(BIRDSEYE);
   enlarge(null);
@@ -46,6 +48,15 @@ export function placeBirdseye(box) {
   setAttribute(byId("to-birdseye"), "aria-pressed", Boolean(box));
 }
 
+/** The worker could not draw it: the pictures of its cameras take its place. */
+function onFailed({ why }) {
+  failure = `The bird's-eye view cannot be drawn: ${why}`;
+  note({ text: failure, level: "problem" });
+  publish("toast", { text: failure, level: "problem" });
+  if (store.enlarged === BIRDSEYE) enlarge(null);
+  publish("birdseye");
+}
+
 /** Also shown here, since the worker may hang. */
 function refreshState() {
   const stalled = cameras().map(({ name }) => name).filter((name) => STALLED.includes(store.status[name]));
@@ -59,4 +70,5 @@ export function startBirdseye() {
   byId("birdseye").addEventListener("dblclick", () => enlarge(store.enlarged === BIRDSEYE ? null : BIRDSEYE));
   listen("hello", () => (byId("to-birdseye").hidden = !cameras().length));
   listen("hello status", refreshState);
+  listen("flat", onFailed);
 }

@@ -1,6 +1,6 @@
 /** The Drive view's figures: what a driver must not miss. */
 
-import { inControl, listen, mode, publish, store } from "./store.js";
+import { inControl, listen, mode, ofVehicle, publish, store } from "./store.js";
 import { worstOf } from "./ages.js";
 import { Attention } from "./attention.js";
 import { isGuided, nextChoice } from "./guides.js";
@@ -110,11 +110,11 @@ function refreshControl() {
 // --- lines on the ground ----------------------------------------------------------------------------------------------
 
 /** @returns {import("./guides.js").Choice} */
-const guidesChoice = () => /** @type {any} */ (localStorage.getItem(GUIDES)) ?? "calibrated";
+const guidesChoice = () => /** @type {any} */ (localStorage.getItem(ofVehicle(GUIDES))) ?? "calibrated";
 const placedCameras = () => (store.hello?.dimensions ? store.hello.cameras.filter(({ pose }) => pose) : []);
 
 export function toggleGuides() {
-  localStorage.setItem(GUIDES, nextChoice(placedCameras(), guidesChoice()));
+  localStorage.setItem(ofVehicle(GUIDES), nextChoice(placedCameras(), guidesChoice()));
   refreshGuides();
 }
 
@@ -139,7 +139,7 @@ function updateAttention() {
   const warning = inControl() ? attention.warning : holding.isLost ? withKey("CONTROL LOST: this page only watches; take control", "control") : null;
   byId("attention").hidden = warning === null;
   setText(byId("attention"), warning ?? "");
-  reportAttention(attention.state);
+  reportAttention(attention.state, isFocused && !hidden);
   if (message && inControl()) publish("toast", { text: message, level: "problem" });
 }
 

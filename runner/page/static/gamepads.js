@@ -26,7 +26,9 @@ function poll() {
 }
 
 function onConnected({ gamepad }) {
-  publish("toast", { text: `${nameOf(gamepad)} connected`, level: "hint" });
+  const isStandard = gamepad.mapping === "standard";
+  const text = isStandard ? "connected" : "connected: it numbers its buttons in its own order; check inputs.buttons";
+  publish("toast", { text: `${nameOf(gamepad)} ${text}`, level: isStandard ? "hint" : "problem" });
   pollTimer ??= setInterval(poll, POLL_MS);
 }
 

@@ -26,7 +26,7 @@ export class GroundView {
   count = 0; // of the pictures drawn
   /** @type {string[]} */
   drawn_labels = []; // labels of the cameras when the displayed picture was drawn
-  why = ""; // why there is no picture, for the operator
+  why = ""; // why it cannot be drawn any more, for the operator
   /** @type {RemoteWarp|null} */
   warp = null;
   /** @type {Stream[]} */
@@ -45,9 +45,10 @@ export class GroundView {
   /** @type {Dimensions|null} */
   dimensions = null;
 
-  /** @param {import("./steering.js").Steering} steering */
-  constructor(steering) {
+  /** @param {import("./steering.js").Steering} steering  @param {(why: string) => void} onFailed called once, for the operator */
+  constructor(steering, onFailed) {
     this.steering = steering;
+    this.onFailed = onFailed;
   }
 
   /** @param {OffscreenCanvas} picture  @param {OffscreenCanvas} lines */
@@ -76,7 +77,7 @@ export class GroundView {
 
   /** Otherwise a stale picture would appear when it is shown again. */
   clear() {
-    if (this.warp) this.order({ width: 1, height: 1 }, { x: 0, y: 0, width: 1, height: 1 }, []);
+    if (this.warp && !this.why) this.order({ width: 1, height: 1 }, { x: 0, y: 0, width: 1, height: 1 }, []);
     this.context?.reset();
   }
 
@@ -91,12 +92,10 @@ export class GroundView {
 
   /** Draw what has changed: pictures or their status. */
   draw() {
-    if (!this.isOn() || !this.canvas || !this.context) return;
+    if (!this.isOn() || !this.canvas || !this.context || this.why) return;
     const seen = this.streams.map((stream) => stream.fromAbove());
-    if (!this.why) {
-      this.prepare();
-      this.drawPictures(seen);
-    }
+    this.prepare();
+    this.drawPictures(seen);
     this.drawLines(seen);
   }
 
@@ -143,10 +142,12 @@ export class GroundView {
     }
   }
 
-  /** There will be no picture. @param {string} why */
+  /** There will be no more pictures. @param {string} why */
   fail(why) {
+    if (this.why) return;
     this.why = why;
     this.updateStreams();
+    this.onFailed(why);
   }
 
   /** Set which camera shows which part of the ground. @param {import("./framing.js").Rectangle[]} regions that the pictures show */
@@ -160,22 +161,21 @@ export class GroundView {
   // --- what does not change with every picture ------------------------------------------------------------------------
 
   drawLines(seen) {
-    const { context, display, dimensions, why } = this;
+    const { context, display, dimensions } = this;
     if (!context || !dimensions) return;
     const states = seen.map(({ label, status }) => [label, status]);
     const rad = this.steering.angleAt(Math.max(...seen.map(({ captured }) => captured).filter(Number.isFinite)));
-    const described = JSON.stringify([display, states, rad && Math.round(rad / STEERING_STEP_RAD), why]);
+    const described = JSON.stringify([display, states, rad && Math.round(rad / STEERING_STEP_RAD)]);
     if (described === this.drawn.lines) return;
     if (!clearTo(context, display)) return;
     this.drawn.lines = described;
     context.scale(display.ratio, display.ratio);
-    const size = Math.round(Math.min(22, Math.max(10, 0.045 * Math.min(display.width, display.height))));
+    const side = Math.min(display.width, display.height);
+    const size = Math.round(Math.max(10, Math.min(0.045 * side, Math.max(22, 0.026 * side)))); // on large screens the page's text grows, too
     const laid = groundPlacement(display, dimensions);
-    if (!why) drawDistances(context, dimensions, laid, size);
-    if (!why && rad !== null) drawPaths(context, pathGuides(dimensions, rad), laid);
-    if (why) coverWith(context, display); // the last picture, which would look like the present one
+    drawDistances(context, dimensions, laid, size);
+    if (rad !== null) drawPaths(context, pathGuides(dimensions, rad), laid);
     drawVehicle(context, dimensions, laid);
-    if (why) return drawLabel(context, display.width / 2, display.height / 4, size, `No bird's-eye view: ${why}`, RED, "#fff", display.width);
     drawScale(context, display, laid, size);
     if (this.streams.some(({ camera }) => !camera.calibrated)) labelPicture(context, ESTIMATED, { left: 0, top: 0, bottom: display.height });
     this.drawStates(context, laid, size, seen);
@@ -298,12 +298,6 @@ function drawLabel(context, x, y, size, label, back, fore, width) {
 function boxOf({ rear, front, right, left }, laid) {
   const [a, b] = [toBox({ x: front, y: left }, laid), toBox({ x: rear, y: right }, laid)];
   return { x: a.x, y: a.y, width: b.x - a.x, height: b.y - a.y };
-}
-
-/** Cover a canvas. @param {OffscreenCanvasRenderingContext2D} context  @param {{width: number, height: number}} display */
-function coverWith(context, { width, height }) {
-  context.fillStyle = "#000";
-  context.fillRect(0, 0, width, height);
 }
 
 /**

@@ -174,4 +174,4 @@ export function labelPicture(context, words, { left, top, bottom }, css = 1) {
   context.fillText(words, left + size / 2, bottom - 0.75 * size);
 }
 
-const fontSize = ({ top, bottom }, share, css) => Math.round(css * Math.min(22, Math.max(10, (share * (bottom - top)) / css)));
+const fontSize = ({ top, bottom }, share, css) => Math.round(Math.max(10 * css, share * (bottom - top)));

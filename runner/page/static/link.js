@@ -37,6 +37,7 @@ const handlers = {
   asked: () => worker.postMessage({ order: "ready" }),
   login: () => location.assign(`/login${location.search}${location.hash}`),
   crooked: (message) => publish("crooked", message),
+  flat: (message) => publish("flat", message),
   sent: ({ id, sent }) => sent || publish("unsent", id),
   answer({ id, value }) {
     questions.get(id)?.(value);
@@ -78,8 +79,8 @@ export function transferCanvas(name, element) {
   worker.postMessage({ order: "canvas", name, canvas }, [canvas]);
 }
 
-/** State whether the operator can see this page; the worker reports it to the station. @param {string} state */
-export const reportAttention = (state) => worker.postMessage({ order: "attention", state });
+/** State whether the operator can see this page, and its keys reach it; the worker reports it. @param {string} state  @param {boolean} focused */
+export const reportAttention = (state, focused) => worker.postMessage({ order: "attention", state, focused });
 
 /** @param {string[]} names of the cameras whose guides are shown */
 export const showGuides = (names) => worker.postMessage({ order: "guided", names });

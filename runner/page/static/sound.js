@@ -84,6 +84,7 @@ function onControl() {
 export function toggleSound() {
   if (isDriving && !isMuted() && context?.state !== "running") return;
   localStorage.setItem(KEY, isMuted() ? "no" : "yes");
+  if (!isMuted()) soundCurrent();
   refresh();
 }
 

@@ -115,6 +115,9 @@ export function listen(kinds, listener) {
   for (const kind of kinds.split(" ")) listeners.set(kind, [...(listeners.get(kind) ?? []), listener]);
 }
 
+/** A key of the browser's storage for a choice about this vehicle's cameras: another vehicle's may not be calibrated. */
+export const ofVehicle = (key) => `${key}:${store.hello?.vehicle}`;
+
 export function publish(kind, payload) {
   for (const listener of listeners.get(kind) ?? []) listener(payload);
 }

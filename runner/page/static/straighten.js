@@ -1,12 +1,13 @@
 /** Which fisheye pictures are straightened: the operator's choice per camera. The worker straightens them. */
 
-import { camera, listen, note, publish, store } from "./store.js";
+import { camera, listen, note, ofVehicle, publish, store } from "./store.js";
 import { canStraighten } from "./straight.js";
 import { showStraight } from "./link.js";
 
 const CHOICE = "tod-straight";
-const stored = () => new Set(localStorage.getItem(CHOICE)?.split(" "));
-let chosen = stored();
+const stored = () => new Set(localStorage.getItem(ofVehicle(CHOICE))?.split(" "));
+let chosen = new Set();
+let vehicle = ""; // whose cameras these are
 
 /** @param {string|null} name */
 export function isStraight(name) {
@@ -27,13 +28,19 @@ export function toggleStraight(name = store.selected) {
 function change(by) {
   chosen = stored();
   by(chosen);
-  localStorage.setItem(CHOICE, [...chosen].join(" "));
+  localStorage.setItem(ofVehicle(CHOICE), [...chosen].join(" "));
   applyChoice();
 }
 
 function applyChoice() {
   showStraight([...chosen]);
   publish("straight");
+}
+
+function onHello(hello) {
+  if (hello.vehicle !== vehicle) chosen = stored();
+  vehicle = hello.vehicle;
+  applyChoice();
 }
 
 /** The worker could not straighten a picture. */
@@ -45,6 +52,6 @@ function onStraightenFailed({ camera: name, why }) {
 }
 
 export function startStraight() {
-  listen("hello", applyChoice);
+  listen("hello", onHello);
   listen("crooked", onStraightenFailed);
 }

@@ -12,6 +12,7 @@ import { hasGpu } from "./picture.js";
 import { startWarps } from "./remote_warp.js";
 import { askPage, onPageReady } from "./resizing.js";
 import { Steering } from "./steering.js";
+import { canStraighten } from "./straight.js";
 import { Stream } from "./stream.js";
 import { drawInTurn } from "./turns.js";
 // Used only by other modules, but imported here so that all modules are fetched in parallel.
@@ -25,7 +26,6 @@ import "./pace.js";
 import "./projection.js";
 import "./overlay.js";
 import "./status.js";
-import "./straight.js";
 import "./straight_view.js";
 import "./warp.js";
 import "./yuv.js";
@@ -67,11 +67,12 @@ let guided = []; // cameras whose guides are shown
 let first = null; // camera whose picture is drawn first
 /** @type {string[]} */
 let straight = []; // cameras whose pictures are straightened
-const ground = new GroundView(station.steering);
+const ground = new GroundView(station.steering, (why) => toPage({ kind: "flat", why }));
 let isAsleep = true; // no animation frame is requested
 let tickedAt = now();
 let wasLate = false; // at the last tick
-let attention = ""; // of the operator, as the page states it
+/** @type {{attention: string, focused: boolean}|null} */
+let attention = null; // of the operator, as the page states it
 let reported = ""; // to the station
 let holder = ""; // of control, as the station last stated it
 let unanswered = 0; // reports since the page's main thread has last answered; not a time, which passes while this worker waits, too
@@ -177,7 +178,7 @@ function applyGuides() {
 }
 
 function applyStraight() {
-  for (const stream of streams) stream.straighten(straight.includes(stream.name));
+  for (const stream of streams) stream.straighten(canStraighten(stream.camera) && straight.includes(stream.name));
 }
 
 /** A picture cannot be straightened: show the original, and report why. */
@@ -243,9 +244,11 @@ function reportAges() {
 
 /** Report the operator's attention, which the station passes on while this page is in control; a page that hangs cannot. */
 function reportAttention() {
-  const isHung = unanswered >= HUNG && ["watching", "unfocused"].includes(attention);
-  const state = isHung ? "slow" : attention;
-  if (state !== reported && send({ attention: state })) reported = state;
+  if (!attention) return;
+  const isHung = unanswered >= HUNG && attention.attention !== "hidden";
+  const state = isHung ? { attention: "slow", focused: false } : attention;
+  const text = JSON.stringify(state);
+  if (text !== reported && send(state)) reported = text;
 }
 
 /** Draw what waits for canvases of new sizes. */
@@ -279,8 +282,8 @@ const orders = {
     onPageReady(drawResized);
     reportAttention();
   },
-  attention({ state }) {
-    attention = state;
+  attention({ state, focused }) {
+    attention = { attention: state, focused };
     reportAttention();
   },
   straight({ names }) {

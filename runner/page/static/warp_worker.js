@@ -9,7 +9,7 @@ import { Warp } from "./warp.js";
 const SOFTWARE = /swiftshader|llvmpipe|software|basic render/i;
 const LOST = "the browser dropped the WebGL context";
 
-/** @type {Map<number, {warp: Warp|null, why: string, isShown: boolean}>} by ID; why: there is no WebGL */
+/** @type {Map<number, {warp: Warp|null, why: string, isShown: boolean, gone: AbortController}>} by ID; why: there is no WebGL */
 const targets = new Map();
 /** @type {Map<number, import("./warp.js").Layer>} */
 const layers = new Map();
@@ -35,13 +35,13 @@ function warpFor(canvas) {
 
 const orders = {
   target({ target, canvas }) {
-    const isShown = canvas !== null;
+    const [isShown, gone] = [canvas !== null, new AbortController()];
     try {
       const warp = warpFor(canvas);
-      warp.canvas.addEventListener("webglcontextlost", () => postMessage({ kind: "lost", target, why: LOST }));
-      targets.set(target, { warp, why: "", isShown });
+      warp.canvas.addEventListener("webglcontextlost", () => postMessage({ kind: "lost", target, why: LOST }), { signal: gone.signal });
+      targets.set(target, { warp, why: "", isShown, gone });
     } catch (error) {
-      targets.set(target, { warp: null, why: error instanceof Error ? error.message : String(error), isShown });
+      targets.set(target, { warp: null, why: error instanceof Error ? error.message : String(error), isShown, gone });
     }
   },
   layer({ target, layer, places, points }) {
@@ -53,7 +53,10 @@ const orders = {
     layers.get(layer)?.dispose();
     layers.delete(layer);
   },
-  forget: ({ target }) => targets.delete(target),
+  forget({ target }) {
+    targets.get(target)?.gone.abort();
+    targets.delete(target);
+  },
   draw({ target, id, size, frame, drawn }) {
     const parts = drawn.map(({ layer, picture, ...fill }) => ({ ...fill, layer: layers.get(layer), picture: picture && receivedPicture(picture) }));
     const { warp, why, isShown } = targets.get(target) ?? { warp: null, why: LOST, isShown: true };
