@@ -11,7 +11,7 @@ from collections import deque
 from contextlib import suppress
 from fcntl import ioctl
 
-from gi.repository import GstRtspServer
+from gi.repository import Gio, GstRtspServer
 
 from runner.gst.viewers import StreamViewer
 
@@ -37,6 +37,7 @@ class RtspConnection:
     peer         its IP address and port
     closed       whether it was told to close
     refusal      reason for refusing it, as far as known; "" if it may
+    certificate  of its peer, from its first request on, over TLS
     """
 
     def __init__(self, client: GstRtspServer.RTSPClient, silent_s: int) -> None:
@@ -48,6 +49,7 @@ class RtspConnection:
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         self.peer = self._socket.getpeername()[:2]
         self.refusal, self.closed = "", False
+        self.certificate: Gio.TlsCertificate | None = None
         self.viewer = StreamViewer(connection.get_ip(), since=time.monotonic())
         self.cameras: dict[str, GstRtspServer.RTSPStreamTransport | None] = {}
         self.described = ""
@@ -62,6 +64,11 @@ class RtspConnection:
     def unused_s(self, now: float) -> float:
         """How long it has waited for a first request, s; 0 afterwards. Over TLS it may be in the handshake."""
         return now - self.viewer.since if self.last_request == self._began else 0.0
+
+    def read_certificate(self, client: GstRtspServer.RTSPClient) -> None:
+        """To be called over TLS, in its thread: this thread frees the library's connection without a lock."""
+        if self.certificate is None and (connection := client.get_connection()):
+            self.certificate = connection.get_tls().get_peer_certificate()
 
     def note_request(self) -> None:
         """A request is complete. From its thread."""

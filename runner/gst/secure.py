@@ -178,26 +178,23 @@ class ViewerCheck:
             self.auth.set_tls_certificate(own_certificate(self._keyring))
             self._used = own
 
-    def viewer(self, client: GstRtspServer.RTSPClient) -> str | None:
+    def viewer(self, certificate: Gio.TlsCertificate | None) -> str | None:
         """The holder of a client's certificate; None if it may no longer watch."""
-        connection = client.get_connection()  # None once it is closed
-        tls = connection.get_tls() if connection else None
-        certificate = tls.get_peer_certificate() if tls else None
         holder = self._check.holder(certificate) if certificate else None
         return holder.name if isinstance(holder, Holder) and holder.name in self._known else None
 
-    def withdrawn(self, client: GstRtspServer.RTSPClient) -> str | None:
-        """Why a connection must end, to be asked once its handshake is over; None: it need not."""
-        return None if self.viewer(client) else "its keys are no longer accepted"
+    def withdrawn(self, certificate: Gio.TlsCertificate | None) -> str | None:
+        """Why a client's connection must end, to be asked once its handshake is over; None: it need not."""
+        return None if self.viewer(certificate) else "its keys are no longer accepted"
 
-    def refusal(self, client: GstRtspServer.RTSPClient, token: GstRtspServer.RTSPToken) -> str | None:
+    def refusal(self, certificate: Gio.TlsCertificate | None, token: GstRtspServer.RTSPToken) -> str | None:
         """Why a request is refused, by the client's certificate and the password that the token stands for.
 
         The library accepts the password of any user with any certificate.
         """
-        if why := self.withdrawn(client):
+        if why := self.withdrawn(certificate):
             return why
-        name, user = self.viewer(client), token.get_string(USER) if token else None
+        name, user = self.viewer(certificate), token.get_string(USER) if token else None
         return None if name == user else f"certificate belongs to {name}, password to {user}"
 
     def _accept(self, _auth: object, connection: Gio.TlsConnection, certificate: Gio.TlsCertificate, _: object) -> bool:

@@ -389,6 +389,8 @@ class CameraServer:
     def _on_answered(self, client: GstRtspServer.RTSPClient, _context: object) -> None:
         connection = self._connection(client)
         if connection:
+            if self._viewers:
+                connection.read_certificate(client)
             connection.note_request()
             if connection.refusal == NO_CERTIFICATE:
                 connection.refusal = NO_PASSWORD
@@ -397,7 +399,9 @@ class CameraServer:
         self, client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext
     ) -> GstRtsp.RTSPStatusCode:
         camera, connection = self._cameras.get(_path(context)), self._connection(client)
-        withdrawn = self._viewers.withdrawn(client) if self._viewers else None
+        if connection and self._viewers:
+            connection.read_certificate(client)
+        withdrawn = self._viewers.withdrawn(connection and connection.certificate) if self._viewers else None
         if connection:
             connection.note_request()
             connection.refusal = withdrawn or ""
@@ -443,16 +447,21 @@ class CameraServer:
         """Admit a viewer, or refuse it for its keys, or because its copy of the stream would overload the uplink."""
         camera = next((c for c in self._cameras.values() if c.media is context.media), None)
         connection = self._connection(client)
-        if self._viewers and connection and (refusal := self._viewers.refusal(client, context.token)):
-            connection.refusal = refusal
-            return FORBIDDEN
+        if self._viewers and connection:
+            connection.read_certificate(client)
+            if refusal := self._viewers.refusal(connection.certificate, context.token):
+                connection.refusal = refusal
+                return FORBIDDEN
         if not _end_other(client, context):
             return NOT_NOW
         with self._changed:
             new_viewer = self._connections.get(client)
             if camera is None or new_viewer is None or not camera.is_open:
                 return UNAVAILABLE
-            new_viewer.identify(self._viewers.viewer(client) if self._viewers else operator_of(_user_agent(context)))
+            operator = (
+                self._viewers.viewer(new_viewer.certificate) if self._viewers else operator_of(_user_agent(context))
+            )
+            new_viewer.identify(operator)
             if camera.name in new_viewer.cameras:
                 return OK
             current = [c for c in self._connections.values() if camera.name in c.cameras]
@@ -566,10 +575,10 @@ class CameraServer:
         assert self._viewers
         self._refresh_keys(self._viewers)
         with self._changed:
-            connections = list(self._connections.items())
-        for client, connection in connections:
+            connections = list(self._connections.values())
+        for connection in connections:
             # Before a first request it may be in the handshake, where no certificate has been verified.
-            if not connection.unused_s(time.monotonic()) and (why := self._viewers.withdrawn(client)):
+            if not connection.unused_s(time.monotonic()) and (why := self._viewers.withdrawn(connection.certificate)):
                 connection.refusal = "" if connection.cameras else why  # `_close` reports a viewer
                 self._close(connection, why)
 

@@ -1,0 +1,66 @@
+"""An operator's side whose GStreamer hangs for a while, as on an overloaded machine."""
+
+from __future__ import annotations
+
+import time
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from runner.errors import RunError
+from runner.operator import live
+from runner.operator.live import LiveOperator
+
+HANGS = "GStreamer hangs: reading the receivers' counters takes more than 10 s"
+
+
+def operator(hangs: int, notes: list[str], samples: list[Any]) -> LiveOperator:
+    """An operator whose first samples fail."""
+    left = [RunError(HANGS)] * hangs
+
+    def sample(_sending: Any) -> dict[str, Any]:
+        if left:
+            raise left.pop()
+        return {}
+
+    side: Any = SimpleNamespace(sample=sample, stop=lambda: None)
+    station: Any = SimpleNamespace(
+        state=object(),
+        connect=lambda: None,
+        close=lambda: None,
+        may_report=lambda: False,
+        sending=dict,
+        take=samples.append,
+        note=notes.append,
+    )
+    log: Any = SimpleNamespace(begin=lambda: None, close=lambda: None)
+    return LiveOperator(SimpleNamespace(), station, log, lambda _on_unit: side)  # type: ignore[arg-type]
+
+
+def test_a_view_survives_a_machine_that_is_overloaded_for_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live, "SAMPLE_S", 0.01)
+    notes: list[str] = []
+    samples: list[Any] = []
+    running = operator(3, notes, samples)
+    running.start()
+    try:
+        end = time.monotonic() + 30
+        while not samples and time.monotonic() < end:
+            assert running.runs(0.01)
+        assert samples
+        assert notes == [f"a sample failed: {HANGS}"]
+    finally:
+        running.stop()
+
+
+def test_a_view_that_hangs_for_long_ends_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live, "SAMPLE_S", 0.01)
+    monkeypatch.setattr(live, "HUNG_S", 0.3)
+    running = operator(1_000_000, [], [])
+    running.start()
+    try:
+        with pytest.raises(RunError, match=HANGS):
+            running.runs(30)
+    finally:
+        running.stop()
