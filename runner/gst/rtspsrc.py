@@ -11,9 +11,10 @@ from gi.repository import GObject, Gst
 
 STREAM_ENDED = "the stream ended"
 # The client closes in a thread of its own, which frees its streams: up to `tcp-timeout` later if the server does not
-# answer. After this time it is stopped nevertheless, and uses what is being freed.
-TEARDOWN_S = 1.5
-FAILING_S = 1.5  # likewise after an error, while it fails to open a stream
+# answer. After this time it is stopped nevertheless, and uses what is being freed: an overloaded machine may need far
+# longer to free it, and whoever waits no longer has abandoned it (`runner.gst.aside`).
+TEARDOWN_S = 20.0
+FAILING_S = 20.0  # likewise after an error, while it fails to open a stream
 BYE = "on-bye-ssrc"  # signals of an RTP session (RFC 3550, section 6.6)
 SILENT = ("on-bye-timeout", "on-timeout")
 
