@@ -40,10 +40,18 @@ import stalls
 
 from rig import CHECKOUT
 
+DRAWS = 5  # of other examples for each property test
 
-def _tests(_seed: int, _scale: float) -> list[str]:
-    """Tests that `make test` excludes, and what `validate` finds in mutations of packaged files."""
-    commands = {"pytest": ("-m", "pytest", "-m", "soak"), "golden": ("tests/golden", "mutations")}
+
+def _tests(seed: int, scale: float) -> list[str]:
+    """Tests that `make test` excludes, other examples for its properties, and mutations of packaged files."""
+    properties = ("-m", "pytest", "-m", "hypothesis and not soak", "-n", "auto", "--hypothesis-profile=random")
+    draws = range(seed, seed + max(1, round(DRAWS * scale)))
+    commands = {
+        "pytest": ("-m", "pytest", "-m", "soak"),
+        **{f"properties with seed {draw}": (*properties, f"--hypothesis-seed={draw}") for draw in draws},
+        "golden": ("tests/golden", "mutations"),
+    }
     ended = {
         name: subprocess.run([sys.executable, *words], check=False, cwd=CHECKOUT).returncode
         for name, words in commands.items()
