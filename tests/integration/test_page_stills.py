@@ -12,7 +12,7 @@ import pytest
 from painted import CAMERAS, SIZE, STEERED, STEERED_RAD, WITHIN_PX, ends_of, found, native_pictures, paint
 from stills import MARKS, Station, on_screen, serving
 
-from browser import PADS, all_live, opened, shot, until
+from browser import PADS, all_live, measure, opened, shot, until
 from runner.records import Sample
 
 pytestmark = MARKS
@@ -109,14 +109,10 @@ def test_only_a_fisheye_of_this_vehicle_is_straightened_by_an_earlier_choice(pag
     page.evaluate("localStorage['tod-straight:marks'] = 'cropped'")  # it was a fisheye then
     page.reload()
     all_live(page)
-    assert not any(camera["straight"] for camera in measured(page).values())
+    assert not any(camera["straight"] for camera in measure(page).values())
     page.evaluate("localStorage['tod-straight:marks'] = 'cropped fisheye'")
     page.reload()
-    until(lambda: [name for name, camera in measured(page).items() if camera["straight"]] == ["fisheye"])
-
-
-def measured(page):
-    return page.evaluate("tod.measure()")["cameras"]
+    until(lambda: [name for name, camera in measure(page).items() if camera["straight"]] == ["fisheye"])
 
 
 def test_the_wheel_zooms_the_region_the_middle_button_moves_it_and_its_aspect_may_be_locked(page, station):
