@@ -113,6 +113,7 @@ class VehicleState:
     total_kbps  the same after rules have lowered it, such as the cap by the measured link
     fault       why the rules could not decide, so that an earlier decision stays in force
     attention   of the driver; absent: the operator in control states none
+    operator    id of the operator in control; absent: none
     """
 
     t: float = field(compare=False)
@@ -124,6 +125,7 @@ class VehicleState:
     online: bool = True
     asked_kbps: Number | None = None
     attention: Attention | UnsetType = UNSET
+    operator: str | UnsetType = UNSET
 
     @property
     def total_words(self) -> str:

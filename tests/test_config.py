@@ -515,7 +515,15 @@ def test_a_base_that_does_not_exist(conf: UserConf, tod: Command) -> None:
         ),
         (["inputs.keys.view=d"], "inputs.keys.drawer: 'd': is already assigned to view"),
         (["inputs.buttons.theme=0"], "inputs.buttons.theme: 0: is already assigned to enlarge"),
-        (["inputs.buttons.view=3.5"], "inputs.buttons.view: 3.5: must be a whole number or null"),
+        (["inputs.buttons.view=3.5"], "inputs.buttons.view: 3.5: must be a whole number or text or null"),
+        (
+            ["inputs.buttons.view=axis6"],
+            "inputs.buttons.view: 'axis6': must be a number, or like axis6- or hat9-left",
+        ),
+        (
+            ["inputs.buttons.view=hat9-up", "inputs.buttons.map=hat9-up"],
+            "inputs.buttons.map: 'hat9-up': is already assigned to view",
+        ),
         (["~cameras.nothing"], "Could not delete from config. 'cameras.nothing' does not exist."),
     ],
 )

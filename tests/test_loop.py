@@ -309,6 +309,21 @@ def test_attention_of_the_operator_in_control_is_published_until_control_passes(
     assert reported == [f"operator driver is {what}" for what in expected]
 
 
+def test_the_published_state_names_the_operator_in_control() -> None:
+    watched = Watched()
+
+    def named() -> Any:
+        return next((state.operator for state in reversed(watched.of(VehicleState))), None)
+
+    with watched.running():
+        until(lambda: named() is UNSET)
+        for sender, event in (("driver", "operator_connected"), ("other", "operator_connected")):
+            watched.loop.take(Request(sender, {"event": event}))
+        until(lambda: named() == "driver")
+        watched.loop.take(Request("driver", {"event": "operator_disconnected"}))
+        until(lambda: (watched.loop.take(Request("other", {"event": "operator_connected"})), named() == "other")[1])
+
+
 def test_a_repeated_request_is_not_answered_before_what_it_asks_for_is_applied(monkeypatch: pytest.MonkeyPatch) -> None:
     watched = Watched()
     watched.side.watch("front", "rear", "mast")

@@ -483,11 +483,11 @@ class Inputs:
     """Keys and buttons of the operator's page, by action; None: the action has none.
 
     keys     names in the browser's KeyboardEvent.key
-    buttons  numbers in the browser's Gamepad API
+    buttons  numbers in the browser's Gamepad API, or directions of an axis as the page names them
     """
 
     keys: Mapping[str, str | None] = field(default_factory=dict)
-    buttons: Mapping[str, int | None] = field(default_factory=dict)
+    buttons: Mapping[str, int | str | None] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for kind, given in (("keys", self.keys), ("buttons", self.buttons)):

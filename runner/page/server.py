@@ -175,7 +175,7 @@ class PageServer(Listener):
         middlewares = [self._on_request_complete, self._add_headers, self._check_access]
         app = web.Application(middlewares=middlewares, client_max_size=MAX_BODY)
         app.router.add_get("/live", self._on_viewer)
-        app.router.add_get("/plotly.js", lambda _: _send_file(self._plotly))
+        app.router.add_get("/plotly.js", _file_handler(self._plotly))
         app.router.add_get("/", _static_handler(STATIC / "index.html"))
         app.router.add_get("/counter", _static_handler(STATIC / "counter.html"))
         if self._login:
@@ -403,8 +403,9 @@ class PageServer(Listener):
     def _send_current_state(self, viewer: PageViewer) -> None:
         viewer.selected = next((other.selected for other in self._others(viewer) if other.selected), "")
         introduction = _introduction(self._vehicle, viewer.cameras)
-        current = {"layout": self._layout(), "selected": viewer.selected or None, "answer_s": self._station.answer_s}
-        viewer.post("hello", introduction | current)
+        station = {"operator": self._station.identity, "answer_s": self._station.answer_s}
+        current = {"layout": self._layout(), "selected": viewer.selected or None}
+        viewer.post("hello", introduction | station | current)
         viewer.post("state", state_to_json(self._station.state))
         viewer.post("history", self._history.columns())
         for note in self._notes:
@@ -657,5 +658,10 @@ def _static_handler(file: Path) -> Any:
     return serve
 
 
-async def _send_file(path: Path) -> web.FileResponse:
-    return web.FileResponse(path)
+def _file_handler(path: Path) -> Any:
+    """A handler that sends a large file from disk."""
+
+    async def send(_request: web.Request) -> web.FileResponse:
+        return web.FileResponse(path)
+
+    return send

@@ -504,9 +504,11 @@ class ControlLoop:
         }
         fault = self._run.fault
         total, asked = plain(decision.total), plain(decision.asked)
-        attention = self._run.state.attention or UNSET
+        attention, operator = self._run.state.attention or UNSET, self._in_control or UNSET
         decided = (decision.mode, total, cameras, fault)
-        return VehicleState(self._now(), self._cause, *decided, asked_kbps=asked, attention=attention)
+        return VehicleState(
+            self._now(), self._cause, *decided, asked_kbps=asked, attention=attention, operator=operator
+        )
 
     def _answered(self, pending: _PendingReply, applied: Mapping[str, KnobValues]) -> bool:
         """Answer a request if all its knob values are applied or it has timed out; returns whether it is answered."""

@@ -239,8 +239,9 @@ PADS = """() => {
   Object.defineProperty(navigator, "getGamepads", { value: () => (polls++, [...pads, null]) });
   globalThis.plug = (name) => {
     const buttons = Array.from({ length: 17 }, () => ({ pressed: false }));
+    const axes = [0, 0];
     const vibrationActuator = { playEffect: async (kind, { duration }) => vibrations.push([kind, duration]) };
-    pads.push({ index: 0, id: `${name} (Vendor: 046d Product: c24f)`, connected: true, buttons, vibrationActuator });
+    pads.push({ index: 0, id: `${name} (Vendor: 046d)`, connected: true, buttons, axes, vibrationActuator });
     dispatchEvent(Object.assign(new Event("gamepadconnected"), { gamepad: pads[0] }));
   };
   globalThis.unplug = () => dispatchEvent(Object.assign(new Event("gamepaddisconnected"), { gamepad: pads.pop() }));

@@ -9,6 +9,7 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -38,6 +39,7 @@ from runner.core.model import plain
 from runner.core.step import start, step
 from runner.h264.access_unit import read_unit
 from runner.page.server import PageServer
+from runner.page.viewer import PageViewer
 from runner.records import CameraState, Outcome, VehicleState, applied_to_json
 
 pytestmark = [pytest.mark.gst, needs_browser]
@@ -59,7 +61,8 @@ class Station(SimpleNamespace):
             for name, setting in run.decision.settings.items()
         }
         state = VehicleState(1.0, "", run.decision.mode, plain(run.decision.total), cameras)
-        super().__init__(state=state, note=print, answer_s=1.0, attention=None, requests=[], seen=[])
+        own = {"identity": "anna", "answer_s": 1.0}
+        super().__init__(state=state, note=print, attention=None, requests=[], seen=[], **own)
 
     def captured_here(self, camera, captured):
         return captured
@@ -295,14 +298,23 @@ def colour_at(page, camera, across, down):
     return shown.getpixel((round(across * shown.width), round(down * shown.height)))
 
 
+COUNT_TONES = """void (OscillatorNode = class extends OscillatorNode {
+  start(at) { globalThis.tones = (globalThis.tones ?? 0) + 1; super.start(at); }
+})"""
+
+
+def tones(page):
+    """Four for a lost picture; on a busy machine there may be others."""
+    return page.evaluate("globalThis.tones ?? 0")
+
+
 @pytest.mark.parametrize("pressed", ["Space", pytest.param("b", marks=pytest.mark.soak)])
 def test_a_driver_is_warned_in_either_view(chromium, picture, pressed):
     """Out of focus, a picture that was lost before, another page that takes control."""
     with served(picture, None) as (server, _), opened(chromium, server.url, script=SOUND_BLOCKED) as page:
         all_live(page)
         controlling(page)
-        count = "start(at) { globalThis.tones = (globalThis.tones ?? 0) + 1; super.start(at); }"
-        page.evaluate(f"void (OscillatorNode = class extends OscillatorNode {{ {count} }})")
+        page.evaluate(COUNT_TONES)
         assert page.inner_text("#sound-configure") == "✕ Sound blocked"
         shot(page, "sound-blocked")
         if pressed == "Space":
@@ -317,35 +329,81 @@ def test_a_driver_is_warned_in_either_view(chromium, picture, pressed):
         until(lambda: "No key reached this page" in page.inner_text("#toasts"))
         assert page.evaluate("tod.view") == "configure"
 
-        def tones():
-            """Four for a lost picture; on a busy machine there may be others."""
-            return page.evaluate("globalThis.tones ?? 0")
-
-        before = tones()
+        before = tones(page)
         page.evaluate("Object.defineProperty(document, 'hidden', {get: () => true, configurable: true})")
         page.evaluate("document.dispatchEvent(new Event('visibilitychange'))")
-        until(lambda: tones() >= before + 4)
+        until(lambda: tones(page) >= before + 4)
         page.evaluate("delete document.hidden; document.dispatchEvent(new Event('visibilitychange'))")
         page.keyboard.press("t")
         until(lambda: page.evaluate("tod.control") == "nobody")
         server.silent.add("rear")
         until(lambda: measure(page)["rear"]["status"] == "lost")
-        before = tones()
+        before = tones(page)
         take_control(page)
-        until(lambda: tones() >= before + 4)
+        until(lambda: tones(page) >= before + 4)
         server.silent.clear()
         all_live(page)
-        before = tones()
+        before = tones(page)
         with opened(chromium, server.url) as other:
             take_control(other)
             until(lambda: page.inner_text("#attention") == "CONTROL LOST: this page only watches; take control (t)")
             assert "CONTROL LOST: another page is in control" in page.inner_text("#toasts")
-            until(lambda: tones() >= before + 4)
+            until(lambda: tones(page) >= before + 4)
             shot(page, "control-lost-configure")
             page.keyboard.press("v")
             shot(page, "control-lost-drive")
         take_control(page, "#drive-control")
         until(lambda: "CONTROL LOST" not in page.inner_text("#attention"))
+
+
+def test_a_driver_is_warned_if_the_vehicle_has_another_operator_in_control(chromium, picture):
+    with served(picture, None) as (server, station), opened(chromium, server.url) as page:
+        all_live(page)
+        controlling(page)
+        viewing(page, "drive")
+        page.evaluate(COUNT_TONES)
+        before = tones(page)
+        server.on_state(replace(station.state, operator="bob"))
+        until(lambda: page.inner_text("#attention") == "NOT IN CONTROL: operator bob is")
+        assert "CONTROL LOST: operator bob is in control" in page.inner_text("#toasts")
+        until(lambda: tones(page) >= before + 4)
+        shot(page, "other-operator-drive")
+        page.keyboard.press("v")
+        assert page.inner_text("#holder") == "Operator bob is in control"
+        shot(page, "other-operator-configure")
+        server.on_state(replace(station.state, operator="anna"))
+        until(page.locator("#attention").is_hidden)
+        assert page.inner_text("#holder") == "You are in control"
+
+
+def test_a_driver_is_alerted_to_a_picture_lost_in_a_monitor_only(chromium, picture, monkeypatch):
+    withheld, show = set(), PageViewer.show
+
+    def show_others(viewer, camera, unit):
+        if not (viewer.monitor and camera in withheld):
+            show(viewer, camera, unit)
+
+    monkeypatch.setattr(PageViewer, "show", show_others)
+    with served(picture, None) as (server, _), opened(chromium, server.url) as page:
+        all_live(page)
+        controlling(page)
+        page.evaluate(COUNT_TONES)
+        viewing(page, "drive")
+        monitor = page.context.new_page()
+        visit(monitor, f"{server.url}?show=front,mast")
+        all_live(monitor)
+        before = tones(page)
+        withheld.add(2)
+        until(lambda: page.inner_text("#alarms") == "✕ LOST mast (monitor)")
+        until(lambda: tones(page) >= before + 4)
+        page.bring_to_front()
+        shot(page, "lost-in-a-monitor")
+        withheld.clear()
+        until(lambda: page.inner_text("#alarms") == "")
+        withheld.add(2)
+        until(lambda: page.inner_text("#alarms") == "✕ LOST mast (monitor)")
+        monitor.close()
+        until(lambda: page.inner_text("#alarms") == "")
 
 
 def test_keys_act_on_the_cameras_after_a_button_was_clicked(chromium, picture):

@@ -1,12 +1,13 @@
 /** The Drive view's figures: what a driver must not miss. */
 
-import { inControl, listen, mode, ofVehicle, publish, store } from "./store.js";
+import { inControl, listen, mode, ofVehicle, otherOperator, publish, store } from "./store.js";
 import { worstOf } from "./ages.js";
 import { Attention } from "./attention.js";
 import { isGuided, nextChoice } from "./guides.js";
 import { holding, toggleControl } from "./header.js";
 import { withKey } from "./hints.js";
 import { reportAttention, showGuides } from "./link.js";
+import { monitored } from "./monitored.js";
 import { SHAPES } from "./tiles.js";
 import { limitReasons } from "./total.js";
 import { byId, displayName, latency, setAttribute, setText, whole } from "./format.js";
@@ -76,20 +77,27 @@ function linkWords() {
   return reason ? `limited: ${reason.slice(reason.indexOf(": ") + 2)}` : "connected";
 }
 
-/** The pictures that are not live; in the Configure view, those that the enlarged one hides. */
+/** The pictures that are not live, in monitors as well; in the Configure view, those that the enlarged one hides. */
 function refreshAlarms() {
-  showAlarms(byId("alarms"), names());
+  showAlarms(byId("alarms"), names(), monitored());
   const hidden = store.view === "configure" && store.enlarged ? names().filter((name) => name !== store.enlarged) : [];
   byId("hidden-alarms").hidden = !showAlarms(byId("hidden-alarms"), hidden);
 }
 
-/** Show pictures by status: FROZEN front left, rear. Returns whether there are any. */
-function showAlarms(element, cameras) {
-  const found = ALARMS.map((status) => ({ status, own: cameras.filter((name) => store.status[name] === status) })).filter(({ own }) => own.length);
-  const texts = found.map(({ status, own }) => `${SHAPES[status]} ${WORDS[status] ?? status.toUpperCase()} ${own.map(displayName).join(", ")}`);
+/** Show pictures by status: FROZEN front left, rear (monitor). Returns whether there are any. */
+function showAlarms(element, cameras, others = /** @type {ReturnType<typeof monitored>} */ ([])) {
+  const found = ALARMS.map((status) => ({ status, pictures: picturesOf(status, cameras, others) })).filter(({ pictures }) => pictures.length);
+  const texts = found.map(({ status, pictures }) => `${SHAPES[status]} ${WORDS[status] ?? status.toUpperCase()} ${pictures.join(", ")}`);
   setText(element, texts.join("  "));
   setAttribute(element, "data-level", found.some(({ status }) => STALLED.includes(status)) ? "late" : "near");
   return found.length > 0;
+}
+
+/** What to call the pictures of a status. One in a monitor counts if the page's own picture of that camera is in another status. */
+function picturesOf(status, cameras, others) {
+  const own = cameras.filter((name) => store.status[name] === status);
+  const elsewhere = others.filter((other) => other.status === status && !own.includes(other.camera)).map(({ camera }) => camera);
+  return [...own.map(displayName), ...[...new Set(elsewhere)].map((name) => `${displayName(name)} (monitor)`)];
 }
 
 /** Make the words smaller where they would be cut off. */
@@ -136,11 +144,17 @@ function updateAttention() {
   if (hidden && !attention.hidden && inControl()) publish("unseen");
   const { elsewhere, covered } = store;
   const message = attention.update({ hidden, focused: isFocused, elsewhere, covered, slow }, performance.now());
-  const warning = inControl() ? attention.warning : holding.isLost ? withKey("CONTROL LOST: this page only watches; take control", "control") : null;
+  const warning = warningText();
   byId("attention").hidden = warning === null;
   setText(byId("attention"), warning ?? "");
   reportAttention(attention.state, isFocused && !hidden);
   if (message && inControl()) publish("toast", { text: message, level: "problem" });
+}
+
+function warningText() {
+  if (!inControl()) return holding.isLost ? withKey("CONTROL LOST: this page only watches; take control", "control") : null;
+  const other = otherOperator();
+  return [other && `NOT IN CONTROL: operator ${other} is`, attention.warning].filter(Boolean).join(" · ") || null;
 }
 
 export function startDrive() {
@@ -157,8 +171,8 @@ export function startDrive() {
   });
   document.addEventListener("visibilitychange", updateAttention);
   new ResizeObserver(fitWords).observe(words);
-  listen("hello state sample ages status control socket requests view enlarged", refresh);
-  listen("control socket view ages", updateAttention);
+  listen("hello state sample ages status monitored control socket requests view enlarged", refresh);
+  listen("control socket state view ages", updateAttention);
   listen("hello view", refreshGuides);
   addEventListener("storage", refreshGuides); // chosen in another window
   refresh();

@@ -19,7 +19,9 @@ const nameOf = ({ id }) => id.replace(/\s*\(.*/, "") || "gamepad";
 
 function poll() {
   if (!document.hasFocus()) return presses.reset(); // browsers report no change meanwhile
-  for (const button of presses.poll(pads())) {
+  const pressed = presses.poll(pads());
+  if (pressed.length) publish("pressed", pressed);
+  for (const button of pressed) {
     const action = ACTIONS[actionOf(store.hello?.inputs.buttons ?? {}, button) ?? ""];
     if (!document.querySelector("dialog[open]")) action?.run();
   }
@@ -27,7 +29,7 @@ function poll() {
 
 function onConnected({ gamepad }) {
   const isStandard = gamepad.mapping === "standard";
-  const text = isStandard ? "connected" : "connected: it numbers its buttons in its own order; check inputs.buttons";
+  const text = isStandard ? "connected" : "connected: it numbers its buttons in its own order; press ? to see what each is called, and check inputs.buttons";
   publish("toast", { text: `${nameOf(gamepad)} ${text}`, level: isStandard ? "hint" : "problem" });
   pollTimer ??= setInterval(poll, POLL_MS);
 }

@@ -1,6 +1,6 @@
 /** The header: vehicle, mode, totals and control; and the banner when vehicle or station is offline. */
 
-import { inControl, listen, mode, note, publish, store } from "./store.js";
+import { inControl, listen, mode, note, otherOperator, publish, store } from "./store.js";
 import { pending, request, showProblem, whyNoControl } from "./requests.js";
 import { send } from "./link.js";
 import { withKey } from "./hints.js";
@@ -14,6 +14,9 @@ const UNKNOWN = "▲ Age of the pictures unknown: no capture times, or no answer
 const HOLDERS = { you: "You are in control", another: "Another page is in control", nobody: "Nobody is in control" };
 
 let clockKnownAt = performance.now(); // when the clock offset was last known, or could not be measured
+
+/** @type {string|null} */
+let other = null; // the operator of another station, if the vehicle has that one in control
 
 export const holding = new Holding();
 const buttons = [...byId("modes").querySelectorAll("button")];
@@ -29,8 +32,18 @@ function onControl() {
   if (store.view === "monitor") return;
   const isLost = holding.update(store.holder);
   if (holding.isReleasing) send({ release_control: true }); // the first one may have been lost with its connection
-  if (!isLost) return;
-  const text = `CONTROL LOST: ${HOLDERS[store.holder].toLowerCase()}`;
+  if (isLost) reportLoss(HOLDERS[store.holder].toLowerCase());
+}
+
+/** The vehicle may have passed control to the operator of another station while this page is in control of this one. */
+function onState() {
+  const before = other;
+  other = otherOperator();
+  if (other && other !== before && inControl() && store.view !== "monitor") reportLoss(`operator ${other} is in control`);
+}
+
+function reportLoss(why) {
+  const text = `CONTROL LOST: ${why}`;
   note({ text, level: "problem" });
   showProblem(text);
   publish("deposed");
@@ -71,8 +84,9 @@ function refreshModes() {
 
 function refreshControl() {
   const button = byId("take-control", HTMLButtonElement);
-  setText(byId("holder"), store.connected ? HOLDERS[store.holder] : "");
-  setAttribute(byId("holder"), "data-holder", store.holder);
+  const rival = otherOperator();
+  setText(byId("holder"), !store.connected ? "" : rival ? `Operator ${rival} is in control` : HOLDERS[store.holder]);
+  setAttribute(byId("holder"), "data-holder", rival ? "another" : store.holder);
   setText(button, store.holder === "you" ? "Release" : "Take control");
   button.classList.toggle("strong", store.connected && store.holder !== "you");
   button.disabled = !store.connected;
@@ -134,6 +148,7 @@ export function startHeader() {
   });
   byId("help-open").addEventListener("click", () => publish("help"));
   listen("control", onControl);
+  listen("state", onState);
   listen("hello state control requests socket", refresh);
   listen("sample socket state", refreshTotals);
   listen("ages", refreshSkew);

@@ -5,7 +5,7 @@ import { ACTIONS } from "./actions.js";
 import { labelOf } from "./hints.js";
 import { selectMode } from "./header.js";
 import { actionOf, keyOf } from "./presses.js";
-import { byId, make } from "./format.js";
+import { byId, make, setText } from "./format.js";
 
 const MODES = { s: "single", a: "automatic", c: "collective" };
 const CHORD_MS = 2500;
@@ -89,9 +89,12 @@ function keyTables() {
 export function startKeys() {
   const help = byId("help", HTMLDialogElement);
   const close = make("form", { method: "dialog" }, make("button", { autofocus: true }, "Close"));
+  const pressed = make("p", { id: "pressed", role: "status" });
+  listen("pressed", (names) => setText(pressed, `Pressed: ${names.join(" or ")}`));
   listen("help", () => {
     if (help.open) return;
-    help.replaceChildren(make("h2", { id: "help-title" }, "Keys and buttons"), keyTables(), close);
+    setText(pressed, "");
+    help.replaceChildren(make("h2", { id: "help-title" }, "Keys and buttons"), keyTables(), pressed, close);
     help.showModal();
   });
   addEventListener("keydown", onKeyDown);

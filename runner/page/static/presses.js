@@ -1,20 +1,38 @@
 /** Detects button presses of gamepads and wheels. Pure. */
 
-/** @typedef {{index: number, buttons: readonly {pressed: boolean}[]}} Pad as the Gamepad API reports it */
+const END = 0.5; // an axis that is further from its middle counts as pressed
+const DIRECTIONS = ["up", null, "right", null, "down", null, "left", null]; // of a cross reported as one axis, from -1 to 1; null: between two
+const TOLERANCE = 0.1; // of a step between directions
+
+/** @typedef {{index: number, buttons: readonly {pressed: boolean}[], axes?: readonly number[]}} Pad as the Gamepad API reports it */
+
+/** What is held: numbers of buttons, and names of axes: axis6-, axis6+, hat9-left. @param {Pad} pad  @returns {(number|string)[]} */
+function heldOf({ buttons, axes = [] }) {
+  const numbers = buttons.flatMap(({ pressed }, i) => (pressed ? [i] : []));
+  const ends = axes.flatMap((value, i) => (Math.abs(value) > END && Math.abs(value) <= 1 ? [`axis${i}${value < 0 ? "-" : "+"}`] : []));
+  return [...numbers, ...ends, ...axes.flatMap((value, i) => directionOf(value).map((direction) => `hat${i}-${direction}`))];
+}
+
+/** The direction if an axis reports that of a cross, which is beyond 1 while nothing is pressed. @param {number} value  @returns {string[]} */
+function directionOf(value) {
+  const step = ((value + 1) * (DIRECTIONS.length - 1)) / 2;
+  const direction = Math.abs(step - Math.round(step)) <= TOLERANCE ? DIRECTIONS[Math.round(step)] : null;
+  return direction ? [direction] : [];
+}
 
 export class Presses {
-  /** @type {Map<number, Set<number>>} by pad, the buttons held at the last poll */
+  /** @type {Map<number, Set<number|string>>} by pad, the buttons held at the last poll */
   held = new Map();
 
   /**
    * The buttons pressed since the last poll, each once. A button that is held when a pad connects counts only after it was
    * released.
    * @param {Pad[]} pads all connected pads
-   * @returns {number[]}
+   * @returns {(number|string)[]}
    */
   poll(pads) {
     const before = this.held;
-    this.held = new Map(pads.map(({ index, buttons }) => [index, new Set(buttons.flatMap(({ pressed }, i) => (pressed ? [i] : [])))]));
+    this.held = new Map(pads.map((pad) => [pad.index, new Set(heldOf(pad))]));
     const pressed = [...this.held].flatMap(([index, held]) => [...held].filter((button) => before.has(index) && !before.get(index)?.has(button)));
     return [...new Set(pressed)];
   }

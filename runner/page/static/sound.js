@@ -5,6 +5,7 @@
 
 import { listen, publish, store } from "./store.js";
 import { Alarm, worstKind } from "./alarm.js";
+import { monitored } from "./monitored.js";
 import { withKey } from "./hints.js";
 import { byId, setAttribute, setText } from "./format.js";
 
@@ -41,7 +42,7 @@ function onPress(event) {
 }
 
 function onAudioState() {
-  const kind = worstKind(Object.values(store.status));
+  const kind = currentKind();
   if (isDriving && kind) play(kind); // the browser blocked its tone
   refresh();
 }
@@ -65,10 +66,12 @@ function sound(kind) {
 }
 
 /** Sound for the worst picture, which may have gone wrong before this page had control. */
-const soundCurrent = () => isDriving && sound(worstKind(Object.values(store.status)));
+const soundCurrent = () => isDriving && sound(currentKind());
+const currentKind = () => worstKind([...Object.values(store.status), ...monitored().map(({ status }) => status)]);
 
-function onStatus({ camera, status }) {
-  const kind = alarm.due(camera, status, performance.now());
+/** @param {string} picture  @param {string} status */
+function onStatus(picture, status) {
+  const kind = alarm.due(picture, status, performance.now());
   if (isDriving) sound(kind);
 }
 
@@ -106,7 +109,8 @@ export function startSound() {
   for (const kind of ["pointerup", "keydown"]) addEventListener(kind, onPress, true);
   listen("control", onControl);
   listen("hello", refresh);
-  listen("status", onStatus);
+  listen("status", ({ camera, status }) => onStatus(camera, status));
+  listen("monitored", ({ picture, status }) => onStatus(picture, status));
   listen("deposed unseen", () => sound("lost"));
   addEventListener("storage", refresh); // muted in another window
   setInterval(() => {

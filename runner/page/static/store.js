@@ -25,9 +25,9 @@ const listeners = new Map();
  * @property {number} weight
  * @property {number[]} scaling factors, rising
  * @property {number} b_full_kbps
- * @typedef {{vehicle: string, cameras: Camera[], layout: Layout, selected: string|null, dimensions: import("./guides.js").Dimensions|null, inputs: Inputs, answer_s: number, late_ms: number}} Hello selected: in another window of this page; answer_s: the station
+ * @typedef {{vehicle: string, cameras: Camera[], layout: Layout, selected: string|null, dimensions: import("./guides.js").Dimensions|null, inputs: Inputs, operator: string, answer_s: number, late_ms: number}} Hello selected: in another window of this page; operator: id of this station's; answer_s: the station
  *   answers a request within this time; late_ms: a picture older than this is late
- * @typedef {{keys: Record<string, string|null>, buttons: Record<string, number|null>}} Inputs by action
+ * @typedef {{keys: Record<string, string|null>, buttons: Record<string, number|string|null>}} Inputs by action
  * @typedef {{places: Places, own: Places, problem: string|null}} Layout of the Configure view: places in force, the vehicle's own,
  *   and why a layout cannot be saved
  * @typedef {import("./layout.js").Places} Places
@@ -49,7 +49,8 @@ const listeners = new Map();
  * @property {string} reason
  * @property {string} [fault]
  * @property {Applied} applied
- * @typedef {{online: boolean, mode: string, total_kbps: number, asked_kbps?: number|null, cameras: Record<string, Decision>}} State
+ * @typedef {{online: boolean, mode: string, total_kbps: number, asked_kbps?: number|null, cameras: Record<string, Decision>, operator?: string}} State operator: the one that the
+ *   vehicle has in control
  * @typedef {{fps: number, kbps: number, allocated_kbps: number, scaling: number|null, width: number, height: number,
  *   latency_ms: number|null, lost: number, rebuilt: number, buffer_ms: number|null, stages_ms?: Stages|null}} CameraSample
  * @typedef {Record<"capture"|"encode"|"link"|"buffer"|"decode", number|null>} Stages
@@ -166,6 +167,12 @@ export const camera = (name) => store.hello?.cameras.find((each) => each.name ==
 export const decisionOf = (name) => (store.state?.online && name ? store.state.cameras[name] : undefined);
 export const mode = () => (store.state?.online ? store.state.mode : null);
 export const inControl = () => store.connected && store.holder === "you";
+
+/** Another station's operator whom the vehicle has in control; null: there is none. */
+export function otherOperator() {
+  const operator = store.connected && store.state?.online ? store.state.operator : undefined;
+  return operator && operator !== store.hello?.operator ? operator : null;
+}
 
 /** Select a camera in all windows of this page. */
 export function select(name) {
