@@ -1,9 +1,10 @@
 /** The bird's-eye view's place on the page: whether it is shown, and in which box. The worker draws it. */
 
-import { enlarge, listen, note, ofVehicle, publish, store } from "./store.js";
+import { enlarge, listen, ofVehicle, publish, store } from "./store.js";
 import { BIRDSEYE, isTopView } from "./arrange.js";
 import { groundOf } from "./ground.js";
 import { showGround, transferGround } from "./link.js";
+import { reportProblem, showProblem } from "./requests.js";
 import { STALLED } from "./status.js";
 import { byId, displayName, setAttribute, setText } from "./format.js";
 
@@ -32,7 +33,7 @@ function choose(choice) {
 /** Cycle: in the row below the front camera, large in its place, off. */
 export function cycleBirdseye() {
   if (store.view !== "drive" || !cameras().length) return;
-  if (failure) return publish("toast", { text: failure, level: "problem" });
+  if (failure) return showProblem(failure);
   if (!isChosen()) return choose("on");
   if (store.enlarged !== BIRDSEYE) return enlarge(BIRDSEYE);
   enlarge(null);
@@ -51,8 +52,7 @@ export function placeBirdseye(box) {
 /** The worker could not draw it: the pictures of its cameras take its place. */
 function onFailed({ why }) {
   failure = `The bird's-eye view cannot be drawn: ${why}`;
-  note({ text: failure, level: "problem" });
-  publish("toast", { text: failure, level: "problem" });
+  reportProblem(failure);
   if (store.enlarged === BIRDSEYE) enlarge(null);
   publish("birdseye");
 }

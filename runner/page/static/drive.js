@@ -8,6 +8,7 @@ import { holding, toggleControl } from "./header.js";
 import { withKey } from "./hints.js";
 import { reportAttention, showGuides } from "./link.js";
 import { monitored } from "./monitored.js";
+import { showProblem } from "./requests.js";
 import { SHAPES } from "./tiles.js";
 import { limitReasons } from "./total.js";
 import { byId, displayName, latency, setAttribute, setText, whole } from "./format.js";
@@ -148,7 +149,7 @@ function updateAttention() {
   byId("attention").hidden = warning === null;
   setText(byId("attention"), warning ?? "");
   reportAttention(attention.state, isFocused && !hidden);
-  if (message && inControl()) publish("toast", { text: message, level: "problem" });
+  if (message && inControl()) showProblem(message);
 }
 
 function warningText() {

@@ -1,8 +1,9 @@
 /** Buttons of gamepads and wheels, through the browser's Gamepad API, which must be polled. */
 
-import { listen, note, publish, store } from "./store.js";
+import { listen, publish, store } from "./store.js";
 import { ACTIONS } from "./actions.js";
 import { actionOf, Presses } from "./presses.js";
+import { reportProblem } from "./requests.js";
 
 const POLL_MS = 15;
 const EFFECTS = {
@@ -35,9 +36,7 @@ function onConnected({ gamepad }) {
 }
 
 function onDisconnected({ gamepad }) {
-  const text = `${nameOf(gamepad)} disconnected: its buttons no longer work`;
-  note({ text, level: "problem" });
-  publish("toast", { text, level: "problem" });
+  reportProblem(`${nameOf(gamepad)} disconnected: its buttons no longer work`);
   if (pads().length) return;
   clearInterval(pollTimer);
   pollTimer = undefined;

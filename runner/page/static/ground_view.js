@@ -7,6 +7,7 @@ import { groundOf, groundPlacement, latticeOf, outline, sharesOf, sightOf, trian
 import { COLOURS, ESTIMATED, labelPicture, STEERING_STEP_RAD } from "./guide_lines.js";
 import { pathGuides } from "./guides.js";
 import { AMBER, frame, RED } from "./overlay.js";
+import { ENOUGH } from "./pace.js";
 import { RemoteWarp, UNANSWERED } from "./remote_warp.js";
 import { resize } from "./resizing.js";
 import { MOVING, STALLED } from "./status.js";
@@ -165,7 +166,8 @@ export class GroundView {
     if (!context || !dimensions) return;
     const states = seen.map(({ label, status }) => [label, status]);
     const rad = this.steering.angleAt(Math.max(...seen.map(({ captured }) => captured).filter(Number.isFinite)));
-    const described = JSON.stringify([display, states, rad && Math.round(rad / STEERING_STEP_RAD)]);
+    const words = this.words();
+    const described = JSON.stringify([display, words, states, rad && Math.round(rad / STEERING_STEP_RAD)]);
     if (described === this.drawn.lines) return;
     if (!clearTo(context, display)) return;
     this.drawn.lines = described;
@@ -177,8 +179,15 @@ export class GroundView {
     if (rad !== null) drawPaths(context, pathGuides(dimensions, rad), laid);
     drawVehicle(context, dimensions, laid);
     drawScale(context, display, laid, size);
-    if (this.streams.some(({ camera }) => !camera.calibrated)) labelPicture(context, ESTIMATED, { left: 0, top: 0, bottom: display.height });
+    if (words) labelPicture(context, words, { left: 0, top: 0, bottom: display.height });
     this.drawStates(context, laid, size, seen);
+  }
+
+  /** What a driver must know of the whole view: poses may be estimated, and without a GPU it moves in steps. */
+  words() {
+    const fps = this.warp?.fps ?? Infinity;
+    const isEstimated = this.streams.some(({ camera }) => !camera.calibrated);
+    return [isEstimated && ESTIMATED, fps < ENOUGH && `${fps} PICTURES/S`].filter(Boolean).join(" · ");
   }
 
   drawStates(context, laid, size, seen) {

@@ -1,7 +1,7 @@
 /** The header: vehicle, mode, totals and control; and the banner when vehicle or station is offline. */
 
-import { inControl, listen, mode, note, otherOperator, publish, store } from "./store.js";
-import { pending, request, showProblem, whyNoControl } from "./requests.js";
+import { inControl, listen, mode, otherOperator, publish, store } from "./store.js";
+import { pending, reportProblem, request, showProblem, whyNoControl } from "./requests.js";
 import { send } from "./link.js";
 import { withKey } from "./hints.js";
 import { Holding } from "./holding.js";
@@ -43,9 +43,7 @@ function onState() {
 }
 
 function reportLoss(why) {
-  const text = `CONTROL LOST: ${why}`;
-  note({ text, level: "problem" });
-  showProblem(text);
+  reportProblem(`CONTROL LOST: ${why}`);
   publish("deposed");
 }
 

@@ -1,7 +1,7 @@
 /** Whether this page draws enough of the pictures it receives. Pure; ms. */
 
 const WINDOW_MS = 2000;
-const ENOUGH = 10; // pictures per second, from which a driver can judge movement
+export const ENOUGH = 10; // pictures per second, from which a driver can judge movement
 const SHARE = 0.8; // of the pictures of a camera that sends fewer
 
 /** Counts the pictures of one camera: due to be drawn, and drawn. */

@@ -51,6 +51,12 @@ export function showProblem(text) {
   publish("toast", { text, level: "problem" });
 }
 
+/** Show a problem in a toast, and keep it in the news. */
+export function reportProblem(text) {
+  note({ text, level: "problem" });
+  showProblem(text);
+}
+
 function onReply({ id, result, reason }) {
   const entry = requests.pending.get(id);
   if (!entry) return;
@@ -63,8 +69,7 @@ function onReply({ id, result, reason }) {
 }
 
 function reportFailure(text) {
-  note({ text, level: "problem" });
-  showProblem(text);
+  reportProblem(text);
 }
 
 listen("reply", onReply);

@@ -1,8 +1,9 @@
 /** Which fisheye pictures are straightened: the operator's choice per camera. The worker straightens them. */
 
-import { camera, listen, note, ofVehicle, publish, store } from "./store.js";
+import { camera, listen, ofVehicle, publish, store } from "./store.js";
 import { canStraighten } from "./straight.js";
 import { showStraight } from "./link.js";
+import { reportProblem } from "./requests.js";
 
 const CHOICE = "tod-straight";
 const stored = () => new Set(localStorage.getItem(ofVehicle(CHOICE))?.split(" "));
@@ -46,9 +47,7 @@ function onHello(hello) {
 /** The worker could not straighten a picture. */
 function onStraightenFailed({ camera: name, why }) {
   change((choice) => choice.delete(name));
-  const problem = { text: `${name}: the picture cannot be straightened: ${why}`, level: "problem" };
-  publish("toast", problem);
-  note(problem);
+  reportProblem(`${name}: the picture cannot be straightened: ${why}`);
 }
 
 export function startStraight() {

@@ -4,6 +4,7 @@
  */
 
 import { enlarge, inControl, listen, publish, store } from "./store.js";
+import { showProblem } from "./requests.js";
 import { openTab } from "./tabs.js";
 import { byId } from "./format.js";
 
@@ -58,7 +59,7 @@ export async function toggleFullScreen() {
     if (document.fullscreenElement) await document.exitFullscreen();
     else await document.documentElement.requestFullscreen({ navigationUI: "hide" });
   } catch (error) {
-    publish("toast", { text: `full screen failed: ${error instanceof Error ? error.message : error}`, level: "problem" });
+    showProblem(`full screen failed: ${error instanceof Error ? error.message : error}`);
   }
 }
 
