@@ -6,7 +6,8 @@ time limit; files are still complete or absent, since `urgent` registers the nec
 
 This does not happen in signal handlers. The interpreter writes the number of each signal to a pipe
 (signal.set_wakeup_fd), and a thread reads it: a second signal cannot interrupt the handling of the first, and a main
-thread that is busy in a C library delays nothing.
+thread that is busy in a C library delays nothing. Only the exception comes from a handler. Python discards one that is
+raised in a destructor or a callback of a weak reference, as of each module that is imported; it is then raised again.
 
 A process with a lifeline (see `runner.system.children`) treats the end of its parent as SIGTERM.
 """
@@ -16,6 +17,7 @@ from __future__ import annotations
 import os
 import select
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -23,6 +25,7 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 
 LIFELINE = "TOD_RUNNER_LIFELINE"  # environment variable: descriptor of a pipe whose other end is open in the parent
+AGAIN_S = 0.01  # after a discarded exception: by then Python has reported it
 END_S = 2.0  # how long an orderly shutdown may take
 URGENT_S = 0.5  # how long cleanup may take without an orderly shutdown
 NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -68,19 +71,23 @@ class _Watch:
         self.urgent: list[Action] = []
         self.delivered = False  # whether the main thread has been notified
         self.interrupted = False  # whether the main thread was interrupted by an exception
+        self._discarded = False  # whether Python has discarded that exception
+        self._repeated = 0  # signals that this process sends itself and that have not been read yet
         self._deadline: float | None = None
 
     @contextmanager
     def handled(self) -> Iterator[None]:
         """Handle the signals, and restore the previous handlers at the end."""
         self.number, self.stop, self._deadline = 0, Stop(), None
-        self.delivered = self.interrupted = False
+        self.delivered = self.interrupted = self._discarded = False
+        self._repeated = 0
         read, write = os.pipe()
         os.set_blocking(write, False)
         self._wakeup, self._over = write, False
         ignored = {signal.SIGHUP} if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN else set()
         before = {number: signal.signal(number, self._on_signal) for number in NUMBERS if number not in ignored}
         wakeup = signal.set_wakeup_fd(write, warn_on_full_buffer=False)
+        self._report_unraisable, sys.unraisablehook = sys.unraisablehook, self._on_unraisable
         thread = threading.Thread(target=self._run, args=(read, _lifeline()), name="signals", daemon=True)
         thread.start()
         try:
@@ -90,6 +97,7 @@ class _Watch:
             self._wake()
             # Joined first: it may still receive a signal, and Python reports one whose handler has been removed.
             thread.join(END_S)
+            sys.unraisablehook = self._report_unraisable
             signal.set_wakeup_fd(wakeup)
             for number, handler in before.items():
                 signal.signal(number, handler)
@@ -103,6 +111,20 @@ class _Watch:
         if self.stop is None and not self.delivered:
             self.delivered = self.interrupted = True
             raise KeyboardInterrupt
+
+    def _on_unraisable(self, unraisable: sys.UnraisableHookArgs) -> None:
+        """Called by the interpreter with an exception that it discards."""
+        if self.interrupted and unraisable.exc_type is KeyboardInterrupt:
+            self._discarded = True
+            self._wake()
+        else:
+            self._report_unraisable(unraisable)
+
+    def _interrupt_again(self) -> None:
+        time.sleep(AGAIN_S)
+        self._discarded = self.delivered = False
+        self._repeated += 1
+        signal.pthread_kill(threading.main_thread().ident or 0, self.number)
 
     def _run(self, wakeup: int, lifeline: int | None) -> None:
         ready = select.poll()
@@ -118,10 +140,15 @@ class _Watch:
             if wakeup in found:
                 for number in filter(NUMBERS.__contains__, os.read(wakeup, 64)):
                     self._take(number)
+            if self._discarded:
+                self._interrupt_again()
             if self._deadline is not None and time.monotonic() >= self._deadline:
                 self._end("shutdown timed out: ending now")
 
     def _take(self, number: int) -> None:
+        if self._repeated:
+            self._repeated -= 1
+            return
         if self._deadline is not None or (self.stop and self.stop.is_set()):
             self._end("second signal: ending now")
         self.number = self.number or number

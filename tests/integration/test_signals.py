@@ -67,6 +67,25 @@ def test_nohup_keeps_a_process_running() -> None:
     assert ended(child)[:2] == (143, "")
 
 
+@pytest.mark.parametrize("times", [1, 3])
+def test_an_interrupt_that_python_discards_is_repeated(times: int) -> None:
+    """In a destructor, as in the callback of a weak reference that every import has."""
+    child = started(
+        f"""\
+        class Slow:
+            def __del__(self):
+                time.sleep(60)
+        ready()
+        for _ in range({times}):
+            slow = Slow()
+            del slow
+        time.sleep(60)
+        """
+    )
+    child.send_signal(signal.SIGINT)
+    assert ended(child)[:2] == (130, "")
+
+
 def test_an_interrupt_that_a_library_turns_into_another_error() -> None:
     child = started(
         """\
