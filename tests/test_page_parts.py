@@ -70,7 +70,7 @@ def served(*overrides, layouts=None, login=None, keyring=None, note=print):
     No window is dropped for its silence: most clients here answer pings only while they receive.
     """
     port = free_port()
-    station = SimpleNamespace(state=None, note=note, identity="anna", answer_s=1.0, attention=None)
+    station = SimpleNamespace(state=None, note=note, user="anna", answer_s=1.0, attention=None)
     page = PageServer(vehicle(f"page.port={port}", *overrides), station, layouts=layouts, keyring=keyring)
     page._login = login or page._login
     with pytest.MonkeyPatch.context() as patch:

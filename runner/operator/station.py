@@ -110,7 +110,8 @@ class Station:
     def __init__(self, vehicle: Vehicle, settings: agreement.SettingsByPath, keyring: Keyring | None = None) -> None:
         self._vehicle, self._settings = vehicle, settings
         login = Login(keyring, self.note) if keyring else None
-        self.identity = login.user if login else uuid.uuid4().hex[:12]  # of this operator
+        self.user = login.user if login else None  # this operator's name in its keys; None: it has none
+        self.identity = self.user or uuid.uuid4().hex[:12]  # of this operator
         self.answer_s = answer_s(vehicle.expires_s)
         self.listeners: list[Listener] = []
         self.state: VehicleState | None = None  # None: the vehicle is offline

@@ -403,7 +403,7 @@ class PageServer(Listener):
     def _send_current_state(self, viewer: PageViewer) -> None:
         viewer.selected = next((other.selected for other in self._others(viewer) if other.selected), "")
         introduction = _introduction(self._vehicle, viewer.cameras)
-        station = {"operator": self._station.identity, "answer_s": self._station.answer_s}
+        station = {"operator": self._station.user, "answer_s": self._station.answer_s}
         current = {"layout": self._layout(), "selected": viewer.selected or None}
         viewer.post("hello", introduction | station | current)
         viewer.post("state", state_to_json(self._station.state))

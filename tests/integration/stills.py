@@ -61,7 +61,7 @@ class Station(SimpleNamespace):
                 roi = dict(zip(("x", "y", "width", "height"), camera.roi, strict=True))
                 self.step(event="roi_set", camera=name, **roi)
         self.units = {name: self.encoded(name, picture) for name, picture in pictures.items()}
-        super().__init__(state=self.published(), note=print, identity="anna", answer_s=1.0, attention=None)
+        super().__init__(state=self.published(), note=print, user="anna", answer_s=1.0, attention=None)
 
     def step(self, **event):
         self.run = step(self.vehicle, self.run, parse({"t": 0, **event}))

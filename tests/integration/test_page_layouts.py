@@ -61,7 +61,7 @@ class Station(SimpleNamespace):
             for name, setting in run.decision.settings.items()
         }
         state = VehicleState(1.0, "", run.decision.mode, plain(run.decision.total), cameras)
-        own = {"identity": "anna", "answer_s": 1.0}
+        own = {"user": "anna", "answer_s": 1.0}
         super().__init__(state=state, note=print, attention=None, requests=[], seen=[], **own)
 
     def captured_here(self, camera, captured):
@@ -362,9 +362,15 @@ def test_a_driver_is_warned_if_the_vehicle_has_another_operator_in_control(chrom
         controlling(page)
         viewing(page, "drive")
         page.evaluate(COUNT_TONES)
+        server.on_state(replace(station.state, operator="bob"))
+        until(lambda: page.inner_text("#attention") == "NOT IN CONTROL: operator bob is in control")
+        assert "CONTROL LOST" not in page.inner_text("#toasts"), "this station's operator did not have it"
+        server.on_state(replace(station.state, operator="anna"))
+        until(page.locator("#attention").is_hidden)
+        server.on_state(None)
         before = tones(page)
         server.on_state(replace(station.state, operator="bob"))
-        until(lambda: page.inner_text("#attention") == "NOT IN CONTROL: operator bob is")
+        until(lambda: page.inner_text("#attention") == "NOT IN CONTROL: operator bob is in control")
         assert "CONTROL LOST: operator bob is in control" in page.inner_text("#toasts")
         until(lambda: tones(page) >= before + 4)
         shot(page, "other-operator-drive")
@@ -402,8 +408,25 @@ def test_a_driver_is_alerted_to_a_picture_lost_in_a_monitor_only(chromium, pictu
         until(lambda: page.inner_text("#alarms") == "")
         withheld.add(2)
         until(lambda: page.inner_text("#alarms") == "✕ LOST mast (monitor)")
-        monitor.close()
-        until(lambda: page.inner_text("#alarms") == "")
+        viewing(page, "configure")
+        assert page.inner_text("#hidden-alarms") == "✕ LOST mast (monitor)"
+        monitor.close(run_before_unload=True)
+        until(page.locator("#hidden-alarms").is_hidden)
+        assert "no longer responds" not in page.inner_text("#toasts")
+
+
+def test_a_driver_is_alerted_to_a_monitor_that_crashed(chromium, picture):
+    with served(picture, None) as (server, _), opened(chromium, server.url) as page:
+        all_live(page)
+        controlling(page)
+        page.evaluate(COUNT_TONES)
+        monitor = page.context.new_page()
+        visit(monitor, f"{server.url}?show=front,mast")
+        all_live(monitor)
+        before = tones(page)
+        monitor.evaluate("BroadcastChannel.prototype.postMessage = () => {}")  # all that the page sees of a crash
+        until(lambda: "a monitor no longer responds: reload it" in page.inner_text("#toasts"))
+        until(lambda: tones(page) >= before + 4)
 
 
 def test_keys_act_on_the_cameras_after_a_button_was_clicked(chromium, picture):

@@ -31,7 +31,7 @@ test("a button pressed while the page was out of focus does not count", () => {
 
 test("the ends of an axis and the directions of a cross are buttons, too", () => {
   const wheel = (...axes) => [{ index: 0, buttons: [], axes }];
-  assert.deepEqual(polled(new Presses(), wheel(0, 1), wheel(-1, 1), wheel(-0.4, 0), wheel(0.1, -0.6)), [[], ["axis0-", "hat0-up"], [], ["axis1-"]]);
+  assert.deepEqual(polled(new Presses(), wheel(0, 1), wheel(-1, 1), wheel(-0.4, 0), wheel(0.1, -0.6), wheel(0, -0.4), wheel(0, -0.6), wheel(0, -0.2), wheel(0, -0.6)), [[], ["axis0-", "hat0-up"], [], ["axis1-"], [], [], [], ["axis1-"]]);
   const cross = [9 / 7, -1, -5 / 7, -3 / 7, 1 / 7, 5 / 7, 1]; // nothing, up, up and right, right, down, left, left and up
   const hats = polled(new Presses(), ...cross.map((value) => wheel(value))).map((names) => names.filter((name) => name.startsWith("hat")));
   assert.deepEqual(hats, [[], ["hat0-up"], [], ["hat0-right"], ["hat0-down"], ["hat0-left"], []]);

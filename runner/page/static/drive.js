@@ -78,27 +78,28 @@ function linkWords() {
   return reason ? `limited: ${reason.slice(reason.indexOf(": ") + 2)}` : "connected";
 }
 
-/** The pictures that are not live, in monitors as well; in the Configure view, those that the enlarged one hides. */
+/** The pictures that are not live, in monitors as well; of the page's own, in the Configure view, those that the enlarged one hides. */
 function refreshAlarms() {
-  showAlarms(byId("alarms"), names(), monitored());
-  const hidden = store.view === "configure" && store.enlarged ? names().filter((name) => name !== store.enlarged) : [];
-  byId("hidden-alarms").hidden = !showAlarms(byId("hidden-alarms"), hidden);
+  showAlarms(byId("alarms"), names());
+  const hidden = store.enlarged ? names().filter((name) => name !== store.enlarged) : [];
+  byId("hidden-alarms").hidden = !showAlarms(byId("hidden-alarms"), hidden) || store.view !== "configure";
 }
 
 /** Show pictures by status: FROZEN front left, rear (monitor). Returns whether there are any. */
-function showAlarms(element, cameras, others = /** @type {ReturnType<typeof monitored>} */ ([])) {
-  const found = ALARMS.map((status) => ({ status, pictures: picturesOf(status, cameras, others) })).filter(({ pictures }) => pictures.length);
+function showAlarms(element, cameras) {
+  const found = ALARMS.map((status) => ({ status, pictures: picturesOf(status, cameras) })).filter(({ pictures }) => pictures.length);
   const texts = found.map(({ status, pictures }) => `${SHAPES[status]} ${WORDS[status] ?? status.toUpperCase()} ${pictures.join(", ")}`);
   setText(element, texts.join("  "));
   setAttribute(element, "data-level", found.some(({ status }) => STALLED.includes(status)) ? "late" : "near");
   return found.length > 0;
 }
 
-/** What to call the pictures of a status. One in a monitor counts if the page's own picture of that camera is in another status. */
-function picturesOf(status, cameras, others) {
+/** The pictures of a status: the page's of these cameras, and those in monitors of cameras whose picture on the page has another one. */
+function picturesOf(status, cameras) {
   const own = cameras.filter((name) => store.status[name] === status);
-  const elsewhere = others.filter((other) => other.status === status && !own.includes(other.camera)).map(({ camera }) => camera);
-  return [...own.map(displayName), ...[...new Set(elsewhere)].map((name) => `${displayName(name)} (monitor)`)];
+  const others = monitored().filter((other) => other.status === status && store.status[other.camera] !== status);
+  const inMonitors = new Set(others.map(({ camera }) => displayName(camera)));
+  return [...own.map(displayName), ...[...inMonitors].map((name) => `${name} (monitor)`)];
 }
 
 /** Make the words smaller where they would be cut off. */
@@ -155,7 +156,7 @@ function updateAttention() {
 function warningText() {
   if (!inControl()) return holding.isLost ? withKey("CONTROL LOST: this page only watches; take control", "control") : null;
   const other = otherOperator();
-  return [other && `NOT IN CONTROL: operator ${other} is`, attention.warning].filter(Boolean).join(" · ") || null;
+  return [other && `NOT IN CONTROL: operator ${other} is in control`, attention.warning].filter(Boolean).join(" · ") || null;
 }
 
 export function startDrive() {

@@ -2,6 +2,7 @@
 
 import { listen, publish, store } from "./store.js";
 import { ACTIONS } from "./actions.js";
+import { withKey } from "./hints.js";
 import { actionOf, Presses } from "./presses.js";
 import { reportProblem } from "./requests.js";
 
@@ -30,7 +31,7 @@ function poll() {
 
 function onConnected({ gamepad }) {
   const isStandard = gamepad.mapping === "standard";
-  const text = isStandard ? "connected" : "connected: it numbers its buttons in its own order; press ? to see what each is called, and check inputs.buttons";
+  const text = isStandard ? "connected" : withKey("connected: it numbers its buttons in its own order; check inputs.buttons; the list of keys shows what is pressed", "help");
   publish("toast", { text: `${nameOf(gamepad)} ${text}`, level: isStandard ? "hint" : "problem" });
   pollTimer ??= setInterval(poll, POLL_MS);
 }

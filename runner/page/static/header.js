@@ -15,8 +15,7 @@ const HOLDERS = { you: "You are in control", another: "Another page is in contro
 
 let clockKnownAt = performance.now(); // when the clock offset was last known, or could not be measured
 
-/** @type {string|null} */
-let other = null; // the operator of another station, if the vehicle has that one in control
+let wasOperator = false; // whether the vehicle had this page's operator in control
 
 export const holding = new Holding();
 const buttons = [...byId("modes").querySelectorAll("button")];
@@ -35,11 +34,12 @@ function onControl() {
   if (isLost) reportLoss(HOLDERS[store.holder].toLowerCase());
 }
 
-/** The vehicle may have passed control to the operator of another station while this page is in control of this one. */
-function onState() {
-  const before = other;
-  other = otherOperator();
-  if (other && other !== before && inControl() && store.view !== "monitor") reportLoss(`operator ${other} is in control`);
+/** While this page is in control of its station, the vehicle may have passed control to another operator. */
+function watchOperator() {
+  if (!inControl() || store.view === "monitor" || !store.state?.online || !store.state.operator) return;
+  const other = otherOperator();
+  if (other && wasOperator) reportLoss(`operator ${other} is in control`);
+  wasOperator = other === null;
 }
 
 function reportLoss(why) {
@@ -82,9 +82,9 @@ function refreshModes() {
 
 function refreshControl() {
   const button = byId("take-control", HTMLButtonElement);
-  const rival = otherOperator();
-  setText(byId("holder"), !store.connected ? "" : rival ? `Operator ${rival} is in control` : HOLDERS[store.holder]);
-  setAttribute(byId("holder"), "data-holder", rival ? "another" : store.holder);
+  const other = otherOperator();
+  setText(byId("holder"), !store.connected ? "" : other ? `Operator ${other} is in control` : HOLDERS[store.holder]);
+  setAttribute(byId("holder"), "data-holder", other ? "another" : store.holder);
   setText(button, store.holder === "you" ? "Release" : "Take control");
   button.classList.toggle("strong", store.connected && store.holder !== "you");
   button.disabled = !store.connected;
@@ -146,7 +146,7 @@ export function startHeader() {
   });
   byId("help-open").addEventListener("click", () => publish("help"));
   listen("control", onControl);
-  listen("state", onState);
+  listen("control state", watchOperator);
   listen("hello state control requests socket", refresh);
   listen("sample socket state", refreshTotals);
   listen("ages", refreshSkew);

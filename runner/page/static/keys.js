@@ -90,7 +90,7 @@ export function startKeys() {
   const help = byId("help", HTMLDialogElement);
   const close = make("form", { method: "dialog" }, make("button", { autofocus: true }, "Close"));
   const pressed = make("p", { id: "pressed", role: "status" });
-  listen("pressed", (names) => setText(pressed, `Pressed: ${names.join(" or ")}`));
+  listen("pressed", (names) => setText(pressed, `Pressed: ${names.join(", ")}`));
   listen("help", () => {
     if (help.open) return;
     setText(pressed, "");

@@ -1,39 +1,54 @@
-/** The statuses of the pictures in monitors, reported to the pages of the same browser: the page in control alerts its driver. */
+/**
+ * The statuses of the pictures in monitors: each monitor reports its own to the pages in the same browser, of which the one in
+ * control alerts its driver.
+ */
 
 import { listen, publish, store } from "./store.js";
+import { reportProblem } from "./requests.js";
 
-const REPORT_MS = 500;
-const FORGET_MS = 3000; // a closed monitor no longer reports; browsers run the timers of a hidden one once a second
+const REPORT_MS = 500; // at most; usually its worker makes a monitor report more often, also while it is hidden
+const SILENT_MS = 3000; // a monitor that has not reported for this long has crashed
 const channel = new BroadcastChannel("tod-status");
 const ownId = String(Math.random());
 
 /**
  * @typedef {object} Report of a monitor
  * @property {string} id of the monitor's window
- * @property {Record<string, string>} status by camera
+ * @property {Record<string, string>|null} status by camera; null: the monitor is being closed
  */
 
-/** The last report of each monitor, and when it arrived. @type {Map<string, {status: Record<string, string>, at: number}>} */
+/** The last report of each open monitor, and when it arrived. @type {Map<string, {status: Record<string, string>, at: number}>} */
 const reports = new Map();
+let checkedAt = performance.now();
 
 /** Each picture in a monitor. @returns {{camera: string, status: string}[]} */
 export const monitored = () => [...reports.values()].flatMap(({ status }) => Object.keys(status).map((camera) => ({ camera, status: status[camera] })));
 
-const report = () => channel.postMessage({ id: ownId, status: store.status });
+/** @param {Record<string, string>|null} status */
+const report = (status) => channel.postMessage({ id: ownId, status });
 
 /** @param {Report} report */
 function onReport({ id, status }) {
   const before = reports.get(id)?.status ?? {};
-  reports.set(id, { status, at: performance.now() });
-  for (const camera of Object.keys(status)) if (status[camera] !== before[camera]) publishStatus(id, camera, status[camera]);
+  if (status) reports.set(id, { status, at: performance.now() });
+  else reports.delete(id);
+  const now = status ?? Object.fromEntries(Object.keys(before).map((camera) => [camera, "off"]));
+  for (const camera of Object.keys(now)) if (now[camera] !== before[camera]) publishStatus(id, camera, now[camera]);
 }
 
-function forgetClosed() {
-  for (const [id, { status, at }] of reports) {
-    if (performance.now() - at < FORGET_MS) continue;
-    reports.delete(id);
-    for (const camera of Object.keys(status)) publishStatus(id, camera, "off");
-  }
+function checkMonitors() {
+  const time = performance.now();
+  const hasStalled = time - checkedAt > 2 * REPORT_MS; // this page itself: reports are still queued
+  checkedAt = time;
+  if (hasStalled) return;
+  for (const [id, { status, at }] of reports) if (time - at >= SILENT_MS) onSilent(id, Object.keys(status));
+}
+
+/** A monitor has crashed: the driver is alerted once, and its pictures no longer count. */
+function onSilent(id, cameras) {
+  reportProblem("a monitor no longer responds: reload it");
+  for (const camera of cameras) publishStatus(id, camera, "lost");
+  reports.delete(id);
 }
 
 /** `picture` tells apart pictures of the same camera. */
@@ -41,10 +56,12 @@ const publishStatus = (id, camera, status) => publish("monitored", { picture: `$
 
 export function startMonitored() {
   if (globalThis.boot.shown) {
-    listen("status", report);
-    setInterval(report, REPORT_MS);
+    const reportOwn = () => report(store.status);
+    listen("status ages", reportOwn);
+    setInterval(reportOwn, REPORT_MS);
+    addEventListener("pagehide", () => report(null));
     return;
   }
   channel.onmessage = ({ data }) => onReport(data);
-  setInterval(forgetClosed, REPORT_MS);
+  setInterval(checkMonitors, REPORT_MS);
 }

@@ -1,16 +1,23 @@
 /** Detects button presses of gamepads and wheels. Pure. */
 
-const END = 0.5; // an axis that is further from its middle counts as pressed
+const END = 0.5; // an axis that is further from its middle counts as pressed,
+const RELEASED = 0.3; // and as released at this distance
 const DIRECTIONS = ["up", null, "right", null, "down", null, "left", null]; // of a cross reported as one axis, from -1 to 1; null: between two
 const TOLERANCE = 0.1; // of a step between directions
 
 /** @typedef {{index: number, buttons: readonly {pressed: boolean}[], axes?: readonly number[]}} Pad as the Gamepad API reports it */
 
-/** What is held: numbers of buttons, and names of axes: axis6-, axis6+, hat9-left. @param {Pad} pad  @returns {(number|string)[]} */
-function heldOf({ buttons, axes = [] }) {
+/**
+ * What is held: numbers of buttons, and names of axes: axis6-, axis6+, hat9-left.
+ * @param {Pad} pad
+ * @param {Set<number|string>} [before] what was held at the last poll
+ * @returns {(number|string)[]}
+ */
+function heldOf({ buttons, axes = [] }, before) {
   const numbers = buttons.flatMap(({ pressed }, i) => (pressed ? [i] : []));
-  const ends = axes.flatMap((value, i) => (Math.abs(value) > END && Math.abs(value) <= 1 ? [`axis${i}${value < 0 ? "-" : "+"}`] : []));
-  return [...numbers, ...ends, ...axes.flatMap((value, i) => directionOf(value).map((direction) => `hat${i}-${direction}`))];
+  const ends = axes.map((value, i) => ({ name: `axis${i}${value < 0 ? "-" : "+"}`, far: Math.abs(value) }));
+  const pressed = ends.filter(({ name, far }) => far <= 1 && far > (before?.has(name) ? RELEASED : END)).map(({ name }) => name);
+  return [...numbers, ...pressed, ...axes.flatMap((value, i) => directionOf(value).map((direction) => `hat${i}-${direction}`))];
 }
 
 /** The direction if an axis reports that of a cross, which is beyond 1 while nothing is pressed. @param {number} value  @returns {string[]} */
@@ -32,7 +39,7 @@ export class Presses {
    */
   poll(pads) {
     const before = this.held;
-    this.held = new Map(pads.map((pad) => [pad.index, new Set(heldOf(pad))]));
+    this.held = new Map(pads.map((pad) => [pad.index, new Set(heldOf(pad, before.get(pad.index)))]));
     const pressed = [...this.held].flatMap(([index, held]) => [...held].filter((button) => before.has(index) && !before.get(index)?.has(button)));
     return [...new Set(pressed)];
   }

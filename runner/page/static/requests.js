@@ -64,12 +64,8 @@ function onReply({ id, result, reason }) {
   requests.pending.delete(id);
   const { timer, ...kept } = entry;
   requests.answered = [...requests.answered, { ...kept, result, reason, answered: Date.now() }].slice(-200);
-  if (result !== "applied") reportFailure(`${entry.description}: ${result}${reason ? `: ${reason}` : ""}`);
+  if (result !== "applied") reportProblem(`${entry.description}: ${result}${reason ? `: ${reason}` : ""}`);
   publish("requests");
-}
-
-function reportFailure(text) {
-  reportProblem(text);
 }
 
 listen("reply", onReply);

@@ -25,7 +25,7 @@ const listeners = new Map();
  * @property {number} weight
  * @property {number[]} scaling factors, rising
  * @property {number} b_full_kbps
- * @typedef {{vehicle: string, cameras: Camera[], layout: Layout, selected: string|null, dimensions: import("./guides.js").Dimensions|null, inputs: Inputs, operator: string, answer_s: number, late_ms: number}} Hello selected: in another window of this page; operator: id of this station's; answer_s: the station
+ * @typedef {{vehicle: string, cameras: Camera[], layout: Layout, selected: string|null, dimensions: import("./guides.js").Dimensions|null, inputs: Inputs, operator: string|null, answer_s: number, late_ms: number}} Hello selected: in another window of this page; operator: this station's by its keys; answer_s: the station
  *   answers a request within this time; late_ms: a picture older than this is late
  * @typedef {{keys: Record<string, string|null>, buttons: Record<string, number|string|null>}} Inputs by action
  * @typedef {{places: Places, own: Places, problem: string|null}} Layout of the Configure view: places in force, the vehicle's own,
@@ -168,10 +168,11 @@ export const decisionOf = (name) => (store.state?.online && name ? store.state.c
 export const mode = () => (store.state?.online ? store.state.mode : null);
 export const inControl = () => store.connected && store.holder === "you";
 
-/** Another station's operator whom the vehicle has in control; null: there is none. */
+/** The operator in control, if it is not this station's; null: it is, nobody is, or any operator's requests are carried out, as without keys. */
 export function otherOperator() {
+  const own = store.hello?.operator;
   const operator = store.connected && store.state?.online ? store.state.operator : undefined;
-  return operator && operator !== store.hello?.operator ? operator : null;
+  return own && operator && operator !== own ? operator : null;
 }
 
 /** Select a camera in all windows of this page. */
