@@ -56,7 +56,7 @@ def test_a_view_survives_a_machine_that_is_overloaded_for_a_while(monkeypatch: p
 
 def test_a_view_that_hangs_for_long_ends_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live, "SAMPLE_S", 0.01)
-    monkeypatch.setattr(live, "HUNG_S", 0.3)
+    monkeypatch.setattr(live, "GIVE_UP_S", 0.3)
     running = operator(1_000_000, [], [])
     running.start()
     try:

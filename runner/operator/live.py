@@ -41,7 +41,7 @@ SAMPLE_S = 0.25
 START_S = 20.0  # how long a given duration waits for the vehicle
 CONTROL_FIRST_S, POLL_S = 1.0, 0.01  # how long the streams wait for the vehicle, and how often they check
 STUCK_S = 2.0  # a side that samples nothing for this long hangs
-HUNG_S = 60.0  # after this long it ends; an overloaded machine may recover before
+GIVE_UP_S = 60.0  # after this long it ends; an overloaded machine may recover before
 END_S = 1.0  # how long the last sample may take
 
 
@@ -135,7 +135,7 @@ class LiveOperator:
         assert side
         try:
             self._repeat("sample", SAMPLE_S, lambda: self._sample(side))
-        except RunError as error:  # GStreamer has hung for HUNG_S; the main thread raises it
+        except RunError as error:  # GStreamer has hung for GIVE_UP_S; the main thread raises it
             self._failure = error
 
     def _report(self) -> None:
@@ -151,14 +151,14 @@ class LiveOperator:
     def _repeat(self, what: str, every_s: float, work: Callable[[], None]) -> None:
         """Repeat a piece of work until stopped; an exception must not end the operator's view of a moving vehicle.
 
-        raises  RunError if nothing was sampled for HUNG_S
+        raises  RunError if nothing was sampled for GIVE_UP_S
         """
         last_fault = ""
         while not self._stopped.wait(every_s) and self._elapsed_s() < self._duration_s:
             try:
                 work()
             except Exception as error:
-                if isinstance(error, RunError) and time.monotonic() - self._sampled > HUNG_S:
+                if isinstance(error, RunError) and time.monotonic() - self._sampled > GIVE_UP_S:
                     raise
                 why = error if isinstance(error, RunError) else f"{type(error).__name__}: {error}"
                 if last_fault != (last_fault := f"a {what} failed: {why}"):
