@@ -42,6 +42,7 @@ _TYPES = {
 _PATTERNS = {
     "^[A-Za-z0-9_-]+$": "must be letters, digits, _ and - only",
     "^(axis[0-9]{1,2}[+-]|hat[0-9]{1,2}-(up|down|left|right))$": "must be a number, or like axis6- or hat9-left",
+    "^[0-9a-fA-F.:]+/[0-9]{1,3}$": "must be true, false, or a network such as 10.9.0.0/24",
     "^[A-Za-z0-9_]+$": "must be letters, digits and _ only",
     r"^\$\{[^{}]+\}$": "must be a mapping",  # or an interpolation instead
 }

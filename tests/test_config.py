@@ -515,6 +515,8 @@ def test_a_base_that_does_not_exist(conf: UserConf, tod: Command) -> None:
         ),
         (["inputs.keys.view=d"], "inputs.keys.drawer: 'd': is already assigned to view"),
         (["inputs.buttons.theme=0"], "inputs.buttons.theme: 0: is already assigned to enlarge"),
+        (["insecure=10.9.0.1"], "insecure: '10.9.0.1': must be true, false, or a network such as 10.9.0.0/24"),
+        (["insecure=10.9.0.0/40"], "insecure: 10.9.0.0/40: must be true, false, or a network such as 10.9.0.0/24"),
         (["inputs.buttons.view=3.5"], "inputs.buttons.view: 3.5: must be a whole number or text or null"),
         (
             ["inputs.buttons.view=axis6"],

@@ -15,10 +15,12 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import ec, ed25519
+from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.x509.oid import NameOID
 from helpers import out_of_reach
 
 from runner.__main__ import main
+from runner.configuration.config import configuration
 from runner.core.events import EVENTS
 from runner.core.roles import MAY_REQUEST, PEOPLE, Role, denial
 from runner.errors import RunError, UserError
@@ -27,6 +29,7 @@ from runner.mqtt.messages import MAX_MESSAGE_BYTES
 from runner.security import keyring
 from runner.security.authority import Authority, Issued
 from runner.security.broker_files import broker_settings
+from runner.security.exposure import keyring_of
 from runner.security.keyring import Keyring
 
 NOW = datetime(2026, 5, 1, tzinfo=UTC)
@@ -63,7 +66,7 @@ def test_a_certificate_states_name_role_hosts_and_term(authority):
     hosts = car.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     assert [str(each) for each in hosts.get_values_for_type(x509.IPAddress)] == ["10.0.0.2"]
     assert hosts.get_values_for_type(x509.DNSName) == ["car.example", "car"]
-    assert car.not_valid_after == (NOW + timedelta(days=365)).replace(tzinfo=None)
+    assert car.not_valid_after_utc == NOW + timedelta(days=365)
     assert "own.crt: OK" in verified(authority, "car", "-attime", str(int(NOW.timestamp())), "-purpose", "sslserver")
     assert "own.crt: OK" in verified(authority, "a-watcher", "-attime", str(int(NOW.timestamp())))
     late = str(int((NOW + timedelta(days=366)).timestamp()))
@@ -159,6 +162,39 @@ def test_the_broker_is_reached_with_the_last_keys_while_new_ones_cannot_be_read(
         (directory / name).unlink()
     assert (login.has_changed(), login.refresh()) == (False, password)
     assert login.context.cert_store_stats()["crl"] == 1
+
+
+def test_each_revocation_list_is_later_than_the_one_before(authority):
+    """Even within a second: OpenSSL would use the old one, which a server keeps beside the new one."""
+
+    def list_of(name):
+        return x509.load_pem_x509_crl((authority.directory / name / keyring.REVOKED).read_bytes())
+
+    times = [list_of("broker").last_update_utc]
+    for name in ("a-watcher", "a-predictor", "car"):
+        authority.rotate(name)
+        times.append(list_of("broker").last_update_utc)
+    assert times == sorted(set(times))
+    assert times[-1] < NOW
+    assert list_of("a-watcher").fingerprint(SHA256()) == list_of("broker").fingerprint(SHA256())
+
+
+def test_a_network_that_needs_no_keys():
+    def needs(*words):
+        """Whether keys are needed."""
+        try:
+            return keyring_of(configuration([*words]).vehicle()) is not None
+        except UserError:
+            return True
+
+    hosts = ("media.host=10.9.0.2", "control.host=10.9.0.1")
+    assert needs(*hosts)
+    assert not needs(*hosts, "insecure=10.9.0.0/24")
+    assert not needs(*hosts, "insecure=true")
+    assert needs("media.host=10.9.1.2", "insecure=10.9.0.0/24")
+    assert needs("media.host=car.example", "insecure=10.9.0.0/24")
+    assert needs("media.host=fd00::1", "insecure=10.9.0.0/24")
+    assert not configuration(["insecure=10.9.0.0/24"]).vehicle().insecure, "which would open ROS, too"
 
 
 @pytest.mark.parametrize("action", ["rotate", "revoke", "issue"])

@@ -8,6 +8,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
+from ipaddress import IPv4Network, IPv6Network, ip_network
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -118,7 +119,8 @@ class Builder:
         media = self.part(("media",), _media)
         if media is None:
             return None
-        keys = document.get("keys")  # older drives lack it
+        keys, insecure = document.get("keys"), document.get("insecure", False)  # older drives lack them
+        private = None if isinstance(insecure, bool) else self.part(("insecure",), _network)
         media = replace(media, secure=keys is not None)
         control = Endpoint(document["control"]["host"], document["control"]["port"])
         built = {name: camera for name, camera in cameras.items() if camera}
@@ -160,7 +162,8 @@ class Builder:
             log_video=document["log"]["video"],
             expires_s=float(document["control"]["expires_s"]),
             keys=keys,
-            insecure=document.get("insecure", False),
+            insecure=insecure is True,
+            private=private,
             metrics=MetricsPorts(**document.get("metrics", {})),
             ros=ros,
             dimensions=dimensions,
@@ -410,6 +413,13 @@ def _given(data: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
 def _media(data: Mapping[str, Any]) -> Media:
     first, last = data["rtp_ports"]
     return Media(**{**data, "rtp_ports": (first, last)})
+
+
+def _network(text: str) -> IPv4Network | IPv6Network:
+    try:
+        return ip_network(text, strict=False)
+    except ValueError:
+        raise ModelError("", text, "must be true, false, or a network such as 10.9.0.0/24") from None
 
 
 def _ros(data: Mapping[str, Any]) -> RosSettings:

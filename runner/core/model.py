@@ -14,7 +14,10 @@ from enum import StrEnum
 from fractions import Fraction
 from functools import lru_cache
 from itertools import islice, pairwise
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
+
+if TYPE_CHECKING:
+    from ipaddress import IPv4Network, IPv6Network
 
 Kbps = Fraction
 Value = bool | int | float | str  # type of an element's property in YAML
@@ -610,6 +613,7 @@ class Vehicle:
     latency    limit of the speed by latency
     keys       directory made for this side by `tod-runner keys`; None: nothing is encrypted or authenticated
     insecure   whether that is intended although video or control leave this machine
+    private    network on whose addresses it is intended; None: none
     metrics    ports at which both sides serve metrics for Prometheus
     ros        the ROS node, for cameras whose source subscribes to topics
     dimensions None: unknown
@@ -630,6 +634,7 @@ class Vehicle:
     latency: LatencyLimit = LatencyLimit()
     keys: str | None = None
     insecure: bool = False
+    private: IPv4Network | IPv6Network | None = None
     metrics: MetricsPorts = MetricsPorts()
     ros: RosSettings = RosSettings()
     dimensions: Dimensions | None = None

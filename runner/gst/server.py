@@ -7,6 +7,7 @@ callbacks run in any of these threads, and one lock guards all shared state.
 from __future__ import annotations
 
 import resource
+import secrets
 import threading
 import time
 import weakref
@@ -173,6 +174,7 @@ class CameraServer:
         if self._viewers:
             self._server.set_auth(self._viewers.auth)
         self._server.connect("client-connected", self._on_connected)
+        self._server.set_session_pool(SessionPool())
         self._server.get_session_pool().connect("session-removed", _on_session_removed)
         self._addresses = _address_pool(media)
         self._cameras = {plan.camera.name: self._camera(plan) for plan in plans}
@@ -688,6 +690,17 @@ def _end(session: GstRtspServer.RTSPSession, media: GstRtspServer.RTSPSessionMed
     """End what a session has set up, as TEARDOWN does."""
     media.set_state(Gst.State.NULL)
     session.release_media(media)
+
+
+class SessionPool(GstRtspServer.RTSPSessionPool):  # type: ignore[misc]  # PyGObject has no types
+    """Sessions with identifiers from the system's generator.
+
+    Whoever knows an identifier can end or pause that session, from any connection. The library's identifiers come from
+    GLib's generator, of which the digest nonces reveal the state.
+    """
+
+    def do_create_session_id(self) -> str:
+        return secrets.token_hex(16)
 
 
 def _on_session_removed(_pool: object, session: GstRtspServer.RTSPSession) -> None:

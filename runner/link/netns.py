@@ -3,7 +3,8 @@
     vehicle's namespace link0 ---- runner.link.tunnel ---- tod-N this machine's namespace
 
 Both devices are TUN devices of one process, which limits, delays and drops packets of any protocol in both directions.
-Sizes are those of IP packets. The operator, its page and the broker stay in this machine's namespace.
+Sizes are those of IP packets. The operator, its page and the broker stay in this machine's namespace, where Linux would
+answer at the link's address to whoever is on any network of this machine: rules of routing limit that to the vehicle.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from runner.system.signals import urgent
 NETWORK = ipaddress.IPv4Network("10.77.0.0/16")  # split into a pair of addresses per link
 LINK = "link0"  # the vehicle's device
 RUN = Path("/run/netns")  # where ip keeps namespaces by name
+TO_VEHICLE, TO_OTHERS = 7700, 7701  # priorities of the rules for packets from this machine's address of the link
 CAP_NET_ADMIN, CAP_SYS_ADMIN = 12, 21  # linux/capability.h
 COMMAND_S = 10.0  # how long a command of iproute2 may take
 ALTERNATIVE = "or choose link=relay"
@@ -49,7 +51,7 @@ def namespaced(limit: Limit, media: Endpoint, control: Endpoint, dials: bool = F
     raises          RunError with the remedy
     """
     ip = check_possible()
-    with _claimed_network(ip) as (name, network), urgent(lambda: _remove(ip, name)):
+    with _claimed_network(ip) as (name, network), urgent(lambda: _remove(ip, name, network)):
         machine, vehicle = map(str, network.hosts())
         devices = (name, f"{name}-far")
         inside = (ip, "netns", "exec", name)
@@ -59,12 +61,13 @@ def namespaced(limit: Limit, media: Endpoint, control: Endpoint, dials: bool = F
                 port = tunnel.answer()["port"]
                 _connect(ip, devices, (machine, vehicle))
                 broker = Endpoint(machine, control.port)
-                # A private namespace is as safe as loopback.
-                both = (*overrides(Endpoint(machine if dials else vehicle, media.port), broker), "insecure=true")
+                # As safe as loopback: only the two ends reach these addresses.
+                ends = overrides(Endpoint(machine if dials else vehicle, media.port), broker)
+                both = (*ends, f"insecure={network}")
                 with _competing_flows(limit.tcp, (machine, port), inside) as (tcp, notes):
                     yield Ends(inside, both, both, broker, ChildShaper(tunnel, tcp), notes)
         finally:
-            _remove(ip, name)
+            _remove(ip, name, network)
 
 
 @contextmanager
@@ -105,15 +108,21 @@ def _connect(ip: str, devices: tuple[str, str], addresses: tuple[str, str]) -> N
         with suppress(RunError):  # a kernel without IPv6 lacks this setting, and sends nothing unprompted
             _run(*command, "link", "set", "dev", device, "addrgenmode", "none")
         _run(*command, "addr", "add", own, "peer", peer, "dev", device)
+        if command == (ip,):
+            _run(ip, "rule", "add", "priority", str(TO_VEHICLE), "from", own, "to", peer, "lookup", "main")
+            _run(ip, "rule", "add", "priority", str(TO_OTHERS), "from", own, "unreachable")
         _run(*command, "link", "set", "dev", device, "up")
 
 
-def _remove(ip: str, name: str) -> None:
-    """Remove a namespace, if it exists, and kill the processes still running in it."""
+def _remove(ip: str, name: str, network: ipaddress.IPv4Network) -> None:
+    """Remove a namespace, if it exists, with the rules of its addresses, and kill the processes still running in it."""
     try:
         identity = (RUN / name).stat().st_ino
     except FileNotFoundError:
         return
+    machine, _ = map(str, network.hosts())
+    for priority in (TO_VEHICLE, TO_OTHERS):
+        _output_of(ip, "rule", "delete", "priority", str(priority), "from", machine)
     _output_of(ip, "netns", "delete", name)  # first, so that no more processes can enter
     for pid in _inside(identity):
         with suppress(ProcessLookupError):
@@ -154,7 +163,7 @@ def _remove_left_behind(ip: str, networks: Mapping[str, ipaddress.IPv4Network]) 
     for name in networks.keys() & {path.name for path in RUN.glob("tod-*")}:
         with _claim(networks[name]) as is_free:
             if is_free:
-                _remove(ip, name)
+                _remove(ip, name, networks[name])
 
 
 @contextmanager

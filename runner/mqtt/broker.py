@@ -57,7 +57,8 @@ class Broker:
     def __init__(
         self, endpoint: Endpoint, keys: Path | None = None, on_report: Callable[[str], None] = lambda line: None
     ) -> None:
-        self._endpoint = endpoint
+        self._endpoint, self._keys = endpoint, keys
+        self._version = self._version_of_keys()
         self._stderr_lines: deque[str] = deque(maxlen=KEPT_LINES)
         listener = (
             broker_settings(str(keys.absolute()), endpoint.host, endpoint.port).splitlines()
@@ -86,11 +87,19 @@ class Broker:
         self._reader.start()
 
     def check(self) -> None:
-        """raises RunError if the broker has ended"""
+        """Reload new keys. To be called a few times a second; raises RunError if the broker has ended."""
         status = self._process.poll()
         if status is not None:
             message = "; ".join(filter(None, (children.ending(status), self._last_line())))
             raise RunError(f"the MQTT broker on {self._endpoint} ended: {message}")
+        if (version := self._version_of_keys()) != self._version:
+            self._version = version
+            self.reload()
+
+    def _version_of_keys(self) -> list[tuple[int, int]]:
+        """When each file of the broker's keys was written, and its inode."""
+        files = [path.stat() for path in sorted(self._keys.glob("*")) if path.is_file()] if self._keys else []
+        return [(file.st_mtime_ns, file.st_ino) for file in files]
 
     def wait_until_it_answers(self) -> None:
         """raises RunError if it does not answer within `START_S`"""

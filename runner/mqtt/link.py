@@ -104,14 +104,23 @@ class ControlLink:
         behind   send it although earlier ones wait
         returns  False if it was not sent because earlier ones wait
         """
-        if not self._listening.is_set():
-            return True
-        if self._has_moved() or (self._login and self._login.has_changed()):
-            self._drop_connection()
+        if self.check() or not self._listening.is_set():
             return True
         if not behind and _is_one_of(SUPERSEDED, topic) and self.is_behind():
             return False
         self._send(topic, message)
+        return True
+
+    def check(self) -> bool:
+        """Connect again if this side's address or keys have changed, or the broker's keys are revoked.
+
+        `publish` does so, too: for a side that sends nothing, to be called a few times a second.
+
+        returns  whether the connection was dropped
+        """
+        if not self._listening.is_set() or not (self._has_moved() or (self._login and self._login.has_changed())):
+            return False
+        self._drop_connection()
         return True
 
     def close(self, *goodbye: tuple[str, JsonObject]) -> None:

@@ -53,6 +53,8 @@ class Login:
         if subject.get("organizationalUnitName") != Role.BROKER:
             raise RunError("the peer is not the broker: its certificate has a different role")
         self._broker = int(certificate["serialNumber"], 16)
+        if self._broker in self._revoked.get():
+            raise RunError("the certificate of the broker is revoked")
 
     def has_changed(self) -> bool:
         """Whether to reconnect: the broker's certificate is revoked, or there are new keys."""

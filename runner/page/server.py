@@ -102,7 +102,7 @@ class PageServer(Listener):
         self._vehicle, self._station, self._on_counter = vehicle, station, on_counter
         self._layouts, self._is_saving = layouts or Layouts(), False
         self._report = LimitedReports(station.note)  # of what browsers and others on the network can cause
-        self._tls = PageTls(keyring, self._report) if keyring else None
+        self._tls = PageTls(keyring, station.note) if keyring else None
         self._holder = keyring.watched_holder(station.note) if keyring else None
         self._login = PageLogin(keyring.watched_token(station.note).get) if keyring else None
         check_port_free(vehicle.page.endpoint)

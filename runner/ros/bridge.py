@@ -116,6 +116,7 @@ class Bridge:
 
         To be called a few times a second.
         """
+        self._link.check()
         now = time.monotonic()
         with self._lock:
             is_silent = now - max(self._state_time, self._vehicle_time[1]) > SILENT_S

@@ -134,7 +134,7 @@ class Authority:
             self._renew_media_secret(self._known(name, "revoke").role)
             self._write_issued(self._revoked(name))
         self._distribute()
-        shutil.rmtree(self.directory / name, ignore_errors=True)
+        _remove(self.directory / name)
 
     # --- files --------------------------------------------------------------------------------------------------------
 
@@ -219,11 +219,7 @@ class Authority:
 
     def _files_of(self, role: Role) -> dict[str, bytes]:
         """Files that holders of a role have in addition to those that all have and those that `_distribute` writes."""
-        if role in VIEWERS:
-            return {keyring.TOKEN: _secret()}
-        if role is Role.BROKER:
-            return {SETTINGS: broker_settings(self.installed).encode()}
-        return {}
+        return {keyring.TOKEN: _secret()} if role in VIEWERS else {}
 
     def _replace(self, name: str, files: Mapping[str, bytes]) -> None:
         """Replace a holder's directory as a whole."""
@@ -231,14 +227,14 @@ class Authority:
             self.directory / f"{dot}{name}{end}" for dot, end in ((".", ".new"), (".", ".old"), ("", ""))
         )
         for leftover in (new, old):  # of a killed run
-            shutil.rmtree(leftover, ignore_errors=True)
+            _remove(leftover)
         new.mkdir(mode=0o700)
         for file, content in files.items():
             _write(new / file, content)
         if final.exists():
             final.rename(old)
         new.rename(final)
-        shutil.rmtree(old, ignore_errors=True)
+        _remove(old)
 
     def _distribute(self) -> None:
         """Write the accepted holders, revocations and secrets of SRT to all directories that need them."""
@@ -246,7 +242,10 @@ class Authority:
         issued, holders = self._issued(), list(filter(self._in_use, self.holders()))
         revoked = [each for each in issued if each.revoked and each.until > self.now()]
         serials = [(int(each.serial, 16), each.revoked) for each in revoked if each.revoked]
-        crl = revocation_list(self._pair, serials, self.now())
+        known = self._own / keyring.REVOKED
+        with _damage_reported(known):
+            crl = revocation_list(self._pair, serials, self.now(), _read(known) if known.exists() else None)
+        _write(known, crl)
         passwords = {each.name: _read(self.directory / each.name / keyring.SECRET) for each in holders}
         for holder in holders:
             directory = self.directory / holder.name
@@ -260,6 +259,7 @@ class Authority:
                 lines = (_password_line(name, keyring.mqtt_password(own)) for name, own in passwords.items())
                 _write(directory / PASSWORDS, "".join(lines).encode())
                 _write(directory / ACCESS, access_list((each.name, each.role) for each in holders).encode())
+                _write(directory / SETTINGS, broker_settings(self.installed).encode())
 
     def _people(self, vehicle: str, holders: Sequence[Issued], secret: Mapping[str, bytes]) -> bytes:
         people = {
@@ -288,6 +288,12 @@ def _read(path: Path) -> bytes:
         return read_file(path, keyring.MOST_BYTES)
     except ValueError as error:
         raise RunError(f"{path}: {error}") from None
+
+
+def _remove(directory: Path) -> None:
+    """Remove a directory of keys, if it exists."""
+    if directory.exists():
+        shutil.rmtree(directory)
 
 
 def _write(path: Path, content: bytes) -> None:

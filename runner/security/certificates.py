@@ -72,16 +72,26 @@ def new_certificate(
     return Pair(_pem(builder.sign(signer, hashes.SHA256())), _key_pem(key))
 
 
-def revocation_list(authority: Pair, revoked: Iterable[tuple[int, datetime]], now: datetime) -> bytes:
+def revocation_list(
+    authority: Pair, revoked: Iterable[tuple[int, datetime]], now: datetime, before: bytes | None = None
+) -> bytes:
     """A CRL, PEM, of serial numbers and times of revocation. It does not expire before the authority does.
 
-    An expired list would lock everyone out: OpenSSL would refuse every certificate.
+    An expired list would lock everyone out: OpenSSL would refuse every certificate. Servers that read a new list keep
+    the old one, and OpenSSL uses the later of the two: the time of the new one, in whole seconds, must be later.
+
+    before  the previous list, PEM; None: there is none
+    raises  ValueError if that is not a list
     """
     issuer, signer = _loaded(authority)
+    updated = now - BACKDATED
+    if before:
+        after = x509.load_pem_x509_crl(before).last_update_utc + timedelta(seconds=1)
+        updated = max(updated, min(after, now))
     builder = (
         x509.CertificateRevocationListBuilder()
         .issuer_name(issuer.subject)
-        .last_update(now - BACKDATED)
+        .last_update(updated)
         .next_update(now + AUTHORITY_YEARS * YEAR)
     )
     for serial, since in revoked:

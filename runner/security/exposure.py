@@ -23,7 +23,9 @@ def keyring_of(vehicle: Vehicle, *needed: str) -> Keyring | None:
         _check_server_name(vehicle)
         return Keyring.of(Path(vehicle.keys), *needed)
     reached = {"media.host": vehicle.media.host, "control.host": vehicle.control.host}
-    exposed = [f"{key} {host}" for key, host in reached.items() if not is_loopback(host)]
+    exposed = [
+        f"{key} {host}" for key, host in reached.items() if not is_loopback(host) and not _is_private(host, vehicle)
+    ]
     if exposed and not vehicle.insecure:
         found = "is not a loopback address" if len(exposed) == 1 else "are not loopback addresses"
         rule = f"{found}: give keys=DIR, created by `tod-runner keys`, or insecure=true"
@@ -114,6 +116,14 @@ def page_keyring(vehicle: Vehicle) -> Keyring | None:
 def _wrong_holder(keyring: Keyring, expected: str) -> UserError:
     found = f"{keyring.holder.role} {keyring.holder.name}"
     return UserError("keys", "", str(keyring.directory), f"must be those of {expected}, not of {found}")
+
+
+def _is_private(host: str, vehicle: Vehicle) -> bool:
+    """Whether an address is on the network that needs no keys by the configuration; a name never is."""
+    try:
+        return vehicle.private is not None and ip_address(host) in vehicle.private
+    except ValueError:
+        return False
 
 
 def is_loopback(host: str) -> bool:

@@ -13,6 +13,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
+from machines import machines
 
 from rig import CHECKOUT, NOISE, free_port, needs_root, over_tcp, process, streaming, until, watching
 from runner.configuration.config import configuration
@@ -290,6 +291,39 @@ def test_a_namespace_is_removed_completely():
         names.append(link.vehicle_command[-1])
         1 / 0  # noqa: B018
     assert not [found for found in _names() if found.startswith(tuple(names))], "nor their devices"
+
+
+CONNECTING = "import socket, sys; socket.create_connection((sys.argv[1], int(sys.argv[2])), 1)"
+
+
+@needs_root
+def test_only_the_vehicle_gets_an_answer_at_the_links_address():
+    """A neighbour that routes to it through another network of this machine gets none."""
+    own, device = "203.0.113.1", f"near-{os.getpid()}"
+    with machines("neighbour") as [neighbour], limited_link("netns", WIDE, *_ends(), print) as link:
+        peer = f"peer name eth0 netns {neighbour.namespace}"
+        for words in (
+            f"link add {device} type veth {peer}",
+            f"addr add {own}/24 dev {device}",
+            f"link set {device} up",
+        ):
+            subprocess.run(["ip", *words.split()], check=True, timeout=10)
+        for words in ("addr add 203.0.113.2/24 dev eth0", "link set eth0 up", f"route add default via {own}"):
+            neighbour.run(f"ip {words}")
+
+        def connects(before, server):
+            host, port = server.getsockname()
+            command = [*before, sys.executable, "-c", CONNECTING, host, str(port)]
+            return subprocess.run(command, check=False, capture_output=True, timeout=30).returncode == 0
+
+        reached = until(lambda: neighbour.run("ip -br link show eth0").split()[1] == "UP")
+        with socket.create_server((own, 0)) as outside, socket.create_server((link.broker.host, 0)) as inside:
+            assert reached
+            assert connects(neighbour.command, outside)
+            assert not connects(neighbour.command, inside)
+            assert connects(link.vehicle_command, inside)
+            assert connects([], inside)
+    assert link.broker.host not in subprocess.check_output(["ip", "rule"], text=True)
 
 
 @needs_root

@@ -276,18 +276,21 @@ def _intrude(keys, broker, tmp_path):
 
 
 def test_the_broker_refuses_a_revoked_certificate_although_the_password_is_right(keys, tmp_path):
+    """Revoked while the broker runs; it reads its new files."""
     old, mixed, broker, reports = tmp_path / "old", tmp_path / "mixed", Endpoint("127.0.0.1", free_port()), []
     shutil.copytree(keys / "alice", old)
-    changed(keys, "rotate", "alice")
-    shutil.copytree(keys / "alice", mixed)
-    for name in (keyring.CERTIFICATE, keyring.KEY):
-        shutil.copy(old / name, mixed)
     topic = f"tod/{NAME}/request/alice"
-    with private_broker(broker, keys / "broker", reports.append):
-        assert published(broker, keys / "alice", topic) == (0, "")
+    with private_broker(broker, keys / "broker", reports.append) as running:
+        assert published(broker, old, topic) == (0, "")
+        changed(keys, "rotate", "alice")
+        shutil.copytree(keys / "alice", mixed)
+        for name in (keyring.CERTIFICATE, keyring.KEY):
+            shutil.copy(old / name, mixed)
+        running.check()
+        until(lambda: published(broker, keys / "alice", topic) == (0, ""))
         assert published(broker, mixed, topic)[0] != 0
         until(lambda: reports)
-    assert "verify failed" in reports[0], reports
+    assert "verify failed" in reports[-1], reports
 
 
 def test_revoked_holders_are_disconnected_and_stay_out(keys):
@@ -665,10 +668,19 @@ def _unencrypted(plan):
     return (replace(client, properties={**client.properties, "location": location}), *rest)
 
 
-def test_a_demo_with_keys_streams_and_shows_no_secret(keys, tmp_path):
-    """Neither in its output nor its drive, nor the MCAP of that, nor what a list of processes shows."""
+@pytest.mark.parametrize("graph", ["h264_rtsp", "h264_srt"])
+def test_a_demo_with_keys_streams_and_shows_no_secret(keys, tmp_path, graph):
+    """Neither in its output nor its drive, nor the MCAP of that, nor what a list of processes shows.
+
+    Its page is served to other machines, so that all kinds of secrets are in use.
+    """
+    authority = Authority(keys)
+    with authority.opened():
+        authority.issue("alice", Role.CONTROLLER, ["127.0.0.2"])
     drive, mark = tmp_path / "drive", uuid.uuid4().hex
-    words = (*WORDS, f"media.port={free_port()}", f"control.port={free_port()}", f"keys={keys}", f"log={drive}")
+    page = ("page.serve=true", "page.host=0.0.0.0", f"page.port={free_port()}")
+    ports = (f"media.port={free_port()}", f"control.port={free_port()}", f"graph.first_port={free_port()}")
+    words = (*WORDS, *page, *ports, f"graph={graph}", f"keys={keys}", f"log={drive}")
     with process("demo", *words, "duration_s=6", env={MARK: mark}) as demo:
         until(lambda: (drive / "operator.jsonl").exists() and len(marked_processes(mark)) == 4)
         shown = [

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import itertools
 import os
+import re
 import socket
 import struct
 import subprocess
@@ -464,12 +465,13 @@ def test_a_play_request_that_fails_leaves_no_second_copy():
 
 
 def test_a_viewer_counts_until_its_own_session_ends():
-    """The library ends any session whose id it is given."""
+    """The library ends any session whose id it is given; it must be impossible to guess."""
     with ExitStack() as stack:
         vehicle = stack.enter_context(serving())
         viewer, other = (stack.enter_context(RtspClient(vehicle.url())) for _ in range(2))
         for client in (viewer, other):
             assert client.open(udp=True) == [200, 200, 200]
+            assert re.fullmatch("[0-9a-f]{32}", client.session)
         own, viewer.session = viewer.session, other.session
         assert viewer.ask("TEARDOWN") == 200
         viewer.session = own
