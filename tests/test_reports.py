@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from runner.system.reports import LONGEST, MOST, PERIOD_S, LimitedReports
+from runner.system.reports import LONGEST, MOST, MOST_OF_PEER, PERIOD_S, LimitedReports
 
 
 def test_each_text_is_reported_once_and_only_so_many_in_a_period() -> None:
@@ -10,11 +10,14 @@ def test_each_text_is_reported_once_and_only_so_many_in_a_period() -> None:
     now = [0.0]
     report = LimitedReports(lines.append, lambda: now[0])
     for _ in range(1000):
-        report("from 10.0.0.9: wrong token")
+        report("from 10.0.0.9: wrong token", "10.0.0.9")
     assert lines == ["from 10.0.0.9: wrong token"]
     for port in range(1000):
-        report(f"from port {port}")
-    assert lines[1:] == [f"from port {port}" for port in range(MOST - 1)]
+        report(f"from port {port}", "10.0.0.9")
+    assert lines[1:] == [f"from port {port}" for port in range(MOST_OF_PEER - 1)]
+    for peer in range(1000):
+        report(f"from {peer}", str(peer))
+    assert lines[MOST_OF_PEER:] == [f"from {peer}" for peer in range(MOST - MOST_OF_PEER)]
 
 
 def test_what_goes_on_stays_visible_with_the_number_of_those_left_out() -> None:
@@ -22,18 +25,18 @@ def test_what_goes_on_stays_visible_with_the_number_of_those_left_out() -> None:
     now = [0.0]
     report = LimitedReports(lines.append, lambda: now[0])
     for _ in range(5):
-        report("again")
+        report("again", "peer")
     now[0] = PERIOD_S - 1
-    report("again")
+    report("again", "peer")
     now[0] = PERIOD_S
-    report("again")
+    report("again", "peer")
     assert lines == ["again", "5 more such reports were left out before this one", "again"]
     now[0] = 2 * PERIOD_S
-    report("another")
+    report("another", "peer")
     assert lines[3:] == ["another"]
 
 
 def test_a_long_text_is_cut() -> None:
     lines: list[str] = []
-    LimitedReports(lines.append)("x" * 100_000)
+    LimitedReports(lines.append)("x" * 100_000, "peer")
     assert [len(line) for line in lines] == [LONGEST]

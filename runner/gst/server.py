@@ -376,7 +376,8 @@ class CameraServer:
                 connection.release()
                 self._changed.notify_all()
         if connection and connection.refusal:
-            self._report_refusal(f"refused an RTSP client at {connection.viewer.address}: {connection.refusal}")
+            address = connection.viewer.address
+            self._report_refusal(f"refused an RTSP client at {address}: {connection.refusal}", address)
 
     def _on_refused(self, peer: tuple[str, int], why: str) -> None:
         """A client's certificate is not accepted: its connection ends."""

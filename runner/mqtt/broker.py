@@ -141,7 +141,8 @@ class Broker:
             self._newest = connected["address"]
         elif (refused := REFUSED.match(line)) and LEFT not in line:
             why = refused["failed"] or refused["tls"] or refused["why"]
-            self._report(f"the MQTT broker refused a client at {refused['address'] or self._newest}: {why}")
+            address = refused["address"] or self._newest
+            self._report(f"the MQTT broker refused a client at {address}: {why}", address)
 
 
 @contextmanager

@@ -220,7 +220,7 @@ class ControlLink:
 
     def _drop(self, message: MQTTMessage, why: str) -> None:
         self.dropped += 1
-        self._report_fault(f"a message on {message.topic} was dropped: {why}")
+        self._report_fault(f"a message on {message.topic} was dropped: {why}", message.topic)
 
     def _send(self, topic: str, message: JsonObject) -> MQTTMessageInfo:
         qos = 0 if _is_one_of(PERIODIC, topic) else 1

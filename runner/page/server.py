@@ -197,7 +197,7 @@ class PageServer(Listener):
     def _logger(self) -> logging.Logger:
         """Reports the server library's warnings, without its tracebacks."""
         logger = logging.Logger("page")
-        logger.addHandler(_FaultHandler(self._report))
+        logger.addHandler(_FaultHandler(lambda text: self._report(text, "")))
         return logger
 
     def _new_connection(self) -> asyncio.Protocol:
@@ -298,7 +298,7 @@ class PageServer(Listener):
 
     def _report_refusal(self, request: web.Request, why: str) -> None:
         path = shortened(repr(request.raw_path.partition("?")[0]))  # what follows may be anything, such as a password
-        self._report(f"page: refused {request.method} {path} from {request.remote}: {why}")
+        self._report(f"page: refused {request.method} {path} from {request.remote}: {why}", str(request.remote))
 
     async def _on_challenge(self, _request: web.Request) -> web.Response:
         assert self._login

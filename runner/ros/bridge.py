@@ -150,7 +150,8 @@ class Bridge:
         if self._pending.pop(reply.id, None) is not None:
             self._answer(reply.id, reply.result, reply.reason, reply.t)
         elif reply.result != "applied":
-            self._report_refusal(f"{reply.id.partition(' ')[0]}: {reply.result}: {reply.reason}")
+            topic = reply.id.partition(" ")[0]
+            self._report_refusal(f"{topic}: {reply.result}: {reply.reason}", topic)
 
     # --- from ROS, in the node's thread -------------------------------------------------------------------------------
 
@@ -186,7 +187,7 @@ class Bridge:
         assert prediction
         if others := [name for name in nodes if name != prediction.node]:
             published = f"is published by {', '.join(others)}, must be by {prediction.node} alone"
-            self._report_publisher(f"{prediction.topic} {published}: predictions are left out")
+            self._report_publisher(f"{prediction.topic} {published}: predictions are left out", prediction.topic)
         return nodes == [prediction.node]
 
     def _on_request(self, text: str) -> None:

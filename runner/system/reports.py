@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 
 PERIOD_S = 3600.0
-MOST = 20  # texts in a period; further ones, and repeated ones, are only counted
+MOST = 100  # texts in a period; further ones, and repeated ones, are only counted
+MOST_OF_PEER = 10  # of these
 LONGEST = 1000  # characters of a text
 
 
 class LimitedReports:
     """Passes on each text once in a period, and MOST of them. May be called from any thread.
 
-    An ongoing problem stays visible: the first text of a later period comes with the number left out before it.
+    A peer chooses part of its texts, such as a path: it has only MOST_OF_PEER, so that others are reported, too. An
+    ongoing problem stays visible: the first text of a later period comes with the number left out before it.
 
     on_report  called with a text
     clock      returns the time, s
@@ -25,19 +28,23 @@ class LimitedReports:
         self._lock = threading.Lock()
         self._ends = float("-inf")  # of this period
         self._passed_on: set[str] = set()  # in this period
+        self._of_peer: Counter[str] = Counter()  # number of these by peer
         self._left_out = 0  # since the last text that was passed on in a new period
 
-    def __call__(self, text: str) -> None:
+    def __call__(self, text: str, peer: str) -> None:
         text, left_out = text[:LONGEST], 0
         with self._lock:
             if self._clock() >= self._ends:
                 self._ends = self._clock() + PERIOD_S
                 self._passed_on.clear()
+                self._of_peer.clear()
                 left_out, self._left_out = self._left_out, 0
-            if text in self._passed_on or len(self._passed_on) >= MOST:
+            most = len(self._passed_on) >= MOST or self._of_peer[peer] >= MOST_OF_PEER
+            if most or text in self._passed_on:
                 self._left_out += 1
                 return
             self._passed_on.add(text)
+            self._of_peer[peer] += 1
         if left_out:
             self._on_report(f"{left_out} more such reports were left out before this one")
         self._on_report(text)

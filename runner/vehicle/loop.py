@@ -279,7 +279,7 @@ class ControlLoop:
         t = self._now()
         name = str(request.document.get("event"))
         if request.sender and (denied := self.access.denial(request.sender, name, self._operators.in_control)):
-            self._report_denial(f"refused {shortened(name)} of {request.sender}: {denied}")
+            self._report_denial(f"refused {shortened(name)} of {request.sender}: {denied}", request.sender)
             self.refuse(request, denied)
             return
         stamped = {**request.document, "t": t}
