@@ -17,7 +17,7 @@ from runner.security.keyring import derived
 CHALLENGE_S = 60.0  # until an unanswered challenge expires
 SESSION_S = 43_200.0  # twelve hours after its last use; an open page uses it
 MAX_SESSIONS = 100
-COOKIE = "tod_session"
+COOKIE = "__Host-tod_session"  # browsers accept such a name only from this very host, over HTTPS
 
 
 class PageLogin:
