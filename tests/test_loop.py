@@ -425,6 +425,28 @@ def test_the_frames_that_an_operator_without_control_reports_are_not_logged() ->
     assert (watcher.units, watcher.damaged, watcher.packets) == ((), UNSET, 1)
 
 
+def test_no_speed_is_advised_while_nobody_sees_the_pictures() -> None:
+    watched = Watched("latency.fixed_ms=0")
+
+    def advised(**attention: str) -> set[float]:
+        """The advice while latency is reported and the page states its attention."""
+        watched.loop.take(Request("driver", {"event": "operator_connected", **attention}))
+        until(
+            lambda: [state.attention for state in watched.of(VehicleState)][-1:] == [attention.get("attention", UNSET)]
+        )
+        before = len(watched.of(SpeedAdvice))
+        for _ in range(20):
+            numbers = {"at": time.monotonic(), "as_of": watched.loop._now(), "packets": 0, "lost": 0, "run": 1}
+            watched.loop.take(QueuedReport("driver", ReceptionReport(units=(), latency_ms=400, **numbers)))
+            time.sleep(0.03)
+        return {advice.speed_factor for advice in watched.of(SpeedAdvice)[before + 2 :]}
+
+    with watched.running():
+        assert advised() == {0.5}
+        for attention, factor in (("watching", 0.5), ("hidden", 0), ("slow", 0.5), ("absent", 0), ("unfocused", 0.5)):
+            assert advised(attention=attention) == {factor}, attention
+
+
 def test_a_second_process_of_the_driver_neither_ends_control_nor_advises_a_speed() -> None:
     """It may be a program on another machine, with the same keys and a better link."""
     watched = Watched("latency.fixed_ms=0")

@@ -61,6 +61,7 @@ REASONS_S, UNSEEN_REASONS_S = 1.0, 10.0  # between two that differ in reasons on
 CLOCK_S = 0.1  # between two answers about the clock to an operator, which asks five times a second
 KEY_FRAME_S = 1.0  # between two key frames that repair a camera's pictures: each costs bits of the next pictures
 STEERING_S = 0.05  # between two published steering angles: each costs the video 0.2 kB of the link
+UNSEEN = (Attention.HIDDEN, Attention.ABSENT)  # the driver sees no picture
 ADVICE_S = 0.2  # how long a reported latency, and the advice based on it, is valid
 POSITION_S = 5.0  # an older position is stale
 SPEED_S = 2.0  # an older speed is stale; receivers of GNSS report once a second or more often
@@ -345,7 +346,7 @@ class ControlLoop:
             self.applier.send_key_frames(due)
 
     def _advise(self, t: float) -> None:
-        """Publish the speed that the latency of the operator's pictures allows; 0 without a recent report."""
+        """Publish the speed that the latency of the operator's pictures allows; 0 without a recent report or driver."""
         if (factor := self._speed_factor(t)) is not None:
             _, measured_ms = self._latency
             limit = self.vehicle.latency
@@ -354,7 +355,8 @@ class ControlLoop:
 
     def _speed_factor(self, t: float) -> float | None:
         at, measured_ms = self._latency
-        factor = self.vehicle.latency.speed_factor(measured_ms if t - at <= ADVICE_S else None)
+        is_seen = t - at <= ADVICE_S and self._run.state.attention not in UNSEEN
+        factor = self.vehicle.latency.speed_factor(measured_ms if is_seen else None)
         return None if factor is None else round(factor, 3)
 
     def _state_clock(self, item: QueuedReport, t: float) -> None:
