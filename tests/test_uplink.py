@@ -240,6 +240,26 @@ def test_a_large_drop_of_the_link_is_not_mistaken_for_competing_traffic(kbps: fl
     assert done.kbps(25, 60) >= 0.9 * kbps
 
 
+@pytest.mark.parametrize(
+    ("falls", "limit"),
+    [
+        (((0, 6000), (15, 3300), (25, 1815), (35, 998)), 6000),
+        (((0, 9000), (15, 5400), (22, 3240), (29, 1944), (36, 1166)), HIGH),
+        (((0, 6000), (15, 4200), (22, 2940), (29, 2058), (36, 1440)), 6000),
+    ],
+)
+def test_each_fall_of_a_link_that_falls_in_steps_is_followed(
+    falls: tuple[tuple[float, float], ...], limit: float
+) -> None:
+    """Also to a third of the highest recent rate, below which the cameras yield to no other traffic at first."""
+    done = drive(Link(steps(*falls), one_way_s=0.03), steps((0, limit)), 50, fps=15)
+    for since, until in pairwise((*(t for t, _ in falls[1:]), 50)):
+        waits = [wait for t, wait in done.waits if since <= t < until]
+        long_s = (until - since) * sum(wait > 0.1 for wait in waits) / len(waits)
+        assert long_s <= 3, since
+    assert done.kbps(40, 50) >= 0.9 * falls[-1][1]
+
+
 def test_after_a_stall_the_rate_is_restored_only_up_to_the_new_capacity() -> None:
     """As in another cell: half of the earlier rate would fill the queue again."""
     link = Link(steps((0, 8000), (20, 800)), delay_s=stalls((20, 22.4)), one_way_s=0.02, queue_s=0.5)

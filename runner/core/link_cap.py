@@ -41,6 +41,8 @@ LONGEST_RTT_S = 1.0  # a longer round trip does not delay the recovery further
 LEAST = Fraction(50)  # kbit/s; recovery in factors cannot start from 0
 # To competing traffic the cameras yield down to this share of the most that arrived recently ...
 YIELDED = Fraction(1, 3)
+# ... and, once the queue has been long for this many s, to this part of that share ...
+EASED_S, EASED = 2.0, Fraction(4, 5)
 # ... unless, while a cap was held and the queue was long for this many s, less than this share of the cap arrived, or
 # never more than TRIED of it: then the link itself is narrower. Otherwise the encoders may have used less than the cap.
 NARROW = ((0.0, Fraction(1, 2)), (1.0, Fraction(4, 5)))
@@ -379,6 +381,14 @@ def _is_contested(cap: LinkCap) -> bool:
     return cap.alone and len(cap.proofs.times) == OFTEN
 
 
+def _yielded(cap: LinkCap, t: float) -> Fraction:
+    """The share of the most that arrived, below which the cameras do not yield; less once a queue has long been long.
+
+    If the link fell to just that share, the cameras' own queue would never drain.
+    """
+    return YIELDED * EASED if t - cap.short >= EASED_S else YIELDED
+
+
 def _burst(cap: LinkCap, link: LinkMeasured, t: float) -> Fraction:
     """How far a long queue may still be a burst of competing traffic: from 1 to 0, in tenths."""
     if not _is_contested(cap):
@@ -427,7 +437,7 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps, kn
     most, burst = min(cap.most.kbps, limit), _burst(cap, link, t)
     if is_proof and not burst:
         most = min(most, PROVEN * carried)
-    target = max(target, YIELDED * most * (CONTESTED + (1 - CONTESTED) * burst if _is_contested(cap) else 1))
+    target = max(target, _yielded(cap, t) * most * (CONTESTED + (1 - CONTESTED) * burst if _is_contested(cap) else 1))
     if cap.provisional:  # not all cameras may have started, so a low rate proves little
         target = max(target, DEEPEST * _in_force(cap, limit))
     settled, seen = t - cap.changed >= SETTLE_S + _rtt_s(link), _limit_seen(cap, link, t, full)

@@ -162,7 +162,8 @@ class UplinkMemory:
     packets    (time of the report, received, lost) for the share of losses
     resumed    when units arrived again after the last gap
     onset      when the queue was last empty; None: it is empty
-    peak       kbit/s, highest rate since the onset
+    level      wait in the queue when it last grew clearly, s
+    peak       kbit/s, highest rate since then: a queue that grows because the link fell carried more before
     rates      (time of the report, kbit/s) since the onset, of the last STEADY_S
     """
 
@@ -174,6 +175,7 @@ class UplinkMemory:
     packets: tuple[tuple[float, int, int], ...] = ()
     resumed: float = -inf
     onset: float | None = None
+    level: float = 0.0
     peak: float = 0.0
     rates: tuple[tuple[float, float], ...] = ()
 
@@ -206,7 +208,9 @@ def estimate(uplink: UplinkMemory, report: LinkReport) -> tuple[UplinkMemory, Li
     fallen = onset is not None and queue + uplink.units[-1].playout > FALLEN_S
     own = min(frame, SLOW_S)
     kbps, since = _rate(uplink, last, max(FALLEN_RATE_S, own) if fallen else max(RATE_S, 3 * frame), queue, own)
-    uplink = replace(uplink, peak=max(0.0 if onset is None or stalled else uplink.peak, kbps or 0.0))
+    if onset is None or stalled or queue > STUCK_GROWTH * uplink.level + GROWN_S:
+        uplink = replace(uplink, level=queue, peak=0.0)
+    uplink = replace(uplink, peak=max(uplink.peak, kbps or 0.0))
     if _is_stuck(uplink, kbps):
         return _lengthen_path(uplink), LinkEstimate(kbps, 0.0, _loss(packets), LinkState.CLEAR)
     state = LinkState.STALLED if stalled else _state(queues, queue, onset)
@@ -294,7 +298,7 @@ def _state(queues: Sequence[tuple[float, float, int, int]], queue: float, onset:
 
 
 def _is_stuck(uplink: UplinkMemory, kbps: float | None) -> bool:
-    """Whether a queue lasts although less arrives than at its start, so that it cannot be a queue."""
+    """Whether a queue lasts although less arrives than when it was that long, so that it cannot be a queue."""
     queues = [was for _, was, _, _ in uplink.queues]
     received, lost = sum(some for _, _, some, _ in uplink.queues), sum(some for _, _, _, some in uplink.queues)
     return (
