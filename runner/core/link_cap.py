@@ -382,7 +382,7 @@ def _is_contested(cap: LinkCap) -> bool:
 
 
 def _yielded(cap: LinkCap, t: float) -> Fraction:
-    """The share of the most that arrived, below which the cameras do not yield; less once a queue has long been long.
+    """The share of the most that arrived, below which the cameras do not yield; less after EASED_S of a long queue.
 
     If the link fell to just that share, the cameras' own queue would never drain.
     """

@@ -17,7 +17,8 @@ from pathlib import Path
 
 from runner.core.model import Endpoint
 from runner.errors import RunError
-from runner.security.broker_files import broker_settings
+from runner.security.broker_files import ACCESS, PASSWORDS, broker_settings
+from runner.security.keyring import CERTIFICATE, REVOKED
 from runner.system import children, signals
 from runner.system.ports import check_port_free
 from runner.system.reports import LimitedReports
@@ -37,6 +38,7 @@ CONNECTIONS = {
 }  # with keys?
 
 # What it logs about connections. Only some lines on refused clients name their address.
+RELOADED = (PASSWORDS, ACCESS, REVOKED, CERTIFICATE)
 CONNECTED = re.compile(r"New connection from (?P<address>\S+):\d+ on port ")
 REFUSED = re.compile(
     r"Client connection from (?P<address>\S+) failed: (?:error:\w*:)?(?P<failed>.*)"
@@ -92,14 +94,17 @@ class Broker:
         if status is not None:
             message = "; ".join(filter(None, (children.ending(status), self._last_line())))
             raise RunError(f"the MQTT broker on {self._endpoint} ended: {message}")
-        if (version := self._version_of_keys()) != self._version:
+        if (version := self._version_of_keys()) not in (None, self._version):
             self._version = version
             self.reload()
 
-    def _version_of_keys(self) -> list[tuple[int, int]]:
-        """When each file of the broker's keys was written, and its inode."""
-        files = [path.stat() for path in sorted(self._keys.glob("*")) if path.is_file()] if self._keys else []
-        return [(file.st_mtime_ns, file.st_ino) for file in files]
+    def _version_of_keys(self) -> list[tuple[int, int]] | None:
+        """When each file that mosquitto reads again was written, and its inode; None: one is missing, or no keys."""
+        try:
+            files = [(self._keys / name).stat() for name in RELOADED] if self._keys else []
+        except OSError:  # they are just being replaced
+            return None
+        return [(file.st_mtime_ns, file.st_ino) for file in files] or None
 
     def wait_until_it_answers(self) -> None:
         """raises RunError if it does not answer within `START_S`"""

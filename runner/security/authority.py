@@ -27,7 +27,7 @@ import msgspec
 from runner.core.roles import VIEWERS, Role
 from runner.errors import RunError, UserError
 from runner.security import keyring
-from runner.security.broker_files import access_list, broker_settings
+from runner.security.broker_files import ACCESS, PASSWORDS, access_list, broker_settings
 from runner.security.certificates import (
     Pair,
     is_host,
@@ -42,7 +42,7 @@ from runner.system.files import read_file, unfinished
 NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")  # as in MQTT topics; 64 is the longest common name of a certificate
 RESERVED = ("authority", "broker")
 ISSUED, AUTHORITY_KEY, LOCK = "issued.json", "authority.key", ".lock"
-PASSWORDS, ACCESS, SETTINGS = "passwords", "access", "mosquitto.conf"
+SETTINGS = "mosquitto.conf"
 VALID = timedelta(days=365)
 ROUNDS = 101  # of PBKDF2; the passwords have 256 random bits
 

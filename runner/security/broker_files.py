@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 from runner.core.roles import VIEWERS, Role
 
+PASSWORDS, ACCESS = "passwords", "access"  # files
 PORT = 8883  # IANA: secure-mqtt
 
 # Below tod/VEHICLE/; + stands for any name.
@@ -48,8 +49,8 @@ def broker_settings(directory: str, host: str = "", port: int = PORT) -> str:
         (
             "per_listener_settings false",
             "allow_anonymous false",
-            f"password_file {directory}/passwords",
-            f"acl_file {directory}/access",
+            f"password_file {directory}/{PASSWORDS}",
+            f"acl_file {directory}/{ACCESS}",
             "persistence false",
             "persistent_client_expiration 1d",  # of a session that a client leaves behind; neither side leaves one
             "set_tcp_nodelay true",
