@@ -39,10 +39,11 @@ _TYPES = {
     "array": "a list",
     "null": "null",
 }
+NETWORK_RULE = "must be true, false, or a network such as 10.9.0.0/24"
 _PATTERNS = {
     "^[A-Za-z0-9_-]+$": "must be letters, digits, _ and - only",
     "^(axis[0-9]{1,2}[+-]|hat[0-9]{1,2}-(up|down|left|right))$": "must be a number, or like axis6- or hat9-left",
-    "^[0-9a-fA-F.:]+/[0-9]{1,3}$": "must be true, false, or a network such as 10.9.0.0/24",
+    "^[0-9a-fA-F.:]+/[0-9]{1,3}$": NETWORK_RULE,
     "^[A-Za-z0-9_]+$": "must be letters, digits and _ only",
     r"^\$\{[^{}]+\}$": "must be a mapping",  # or an interpolation instead
 }

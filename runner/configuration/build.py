@@ -419,7 +419,7 @@ def _network(text: str) -> IPv4Network | IPv6Network:
     try:
         return ip_network(text, strict=False)
     except ValueError:
-        raise ModelError("", text, "must be true, false, or a network such as 10.9.0.0/24") from None
+        raise ModelError("", text, schema.NETWORK_RULE) from None
 
 
 def _ros(data: Mapping[str, Any]) -> RosSettings:

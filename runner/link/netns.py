@@ -108,10 +108,9 @@ def _connect(ip: str, devices: tuple[str, str], addresses: tuple[str, str]) -> N
         with suppress(RunError):  # a kernel without IPv6 lacks this setting, and sends nothing unprompted
             _run(*command, "link", "set", "dev", device, "addrgenmode", "none")
         _run(*command, "addr", "add", own, "peer", peer, "dev", device)
-        if command == (ip,):
-            _run(ip, "rule", "add", "priority", str(TO_VEHICLE), "from", own, "to", peer, "lookup", "main")
-            _run(ip, "rule", "add", "priority", str(TO_OTHERS), "from", own, "unreachable")
         _run(*command, "link", "set", "dev", device, "up")
+    _run(ip, "rule", "add", "priority", str(TO_VEHICLE), "from", machine, "to", vehicle, "lookup", "main")
+    _run(ip, "rule", "add", "priority", str(TO_OTHERS), "from", machine, "unreachable")
 
 
 def _remove(ip: str, name: str, network: ipaddress.IPv4Network) -> None:

@@ -82,7 +82,7 @@ function linkWords() {
 function refreshAlarms() {
   showAlarms(byId("alarms"), names());
   const hidden = store.enlarged ? names().filter((name) => name !== store.enlarged) : [];
-  byId("hidden-alarms").hidden = !showAlarms(byId("hidden-alarms"), hidden) || store.view !== "configure";
+  byId("hidden-alarms").hidden = store.view !== "configure" || !showAlarms(byId("hidden-alarms"), hidden);
 }
 
 /** Show pictures by status: FROZEN front left, rear (monitor). Returns whether there are any. */
