@@ -18,7 +18,7 @@ from pathlib import Path
 from runner.core.model import Endpoint
 from runner.errors import RunError
 from runner.security.broker_files import ACCESS, PASSWORDS, broker_settings
-from runner.security.keyring import CERTIFICATE, REVOKED
+from runner.security.keyring import CERTIFICATE, REVOKED, version_of
 from runner.system import children, signals
 from runner.system.ports import check_port_free
 from runner.system.reports import LimitedReports
@@ -60,7 +60,7 @@ class Broker:
         self, endpoint: Endpoint, keys: Path | None = None, on_report: Callable[[str], None] = lambda line: None
     ) -> None:
         self._endpoint, self._keys = endpoint, keys
-        self._version = self._version_of_keys()
+        self._loaded = self._versions()
         self._stderr_lines: deque[str] = deque(maxlen=KEPT_LINES)
         listener = (
             broker_settings(str(keys.absolute()), endpoint.host, endpoint.port).splitlines()
@@ -94,17 +94,13 @@ class Broker:
         if status is not None:
             message = "; ".join(filter(None, (children.ending(status), self._last_line())))
             raise RunError(f"the MQTT broker on {self._endpoint} ended: {message}")
-        if (version := self._version_of_keys()) not in (None, self._version):
-            self._version = version
+        if None not in (versions := self._versions()) and versions != self._loaded:
+            self._loaded = versions
             self.reload()
 
-    def _version_of_keys(self) -> list[tuple[int, int]] | None:
-        """When each file that mosquitto reads again was written, and its inode; None: one is missing, or no keys."""
-        try:
-            files = [(self._keys / name).stat() for name in RELOADED] if self._keys else []
-        except OSError:  # they are just being replaced
-            return None
-        return [(file.st_mtime_ns, file.st_ino) for file in files] or None
+    def _versions(self) -> list[tuple[int, int, int] | None]:
+        """Of the files that mosquitto reads again; None while one is just being replaced."""
+        return [version_of(self._keys / name) for name in RELOADED] if self._keys else []
 
     def wait_until_it_answers(self) -> None:
         """raises RunError if it does not answer within `START_S`"""

@@ -85,7 +85,7 @@ class Watched(Generic[T]):
     """A value read from a file, and again when the file has changed. May be used from any thread.
 
     A file that cannot be used leaves the last value in force, and is reported once; it is read again until it can be
-    used: a change of its owner leaves no trace in `_stat`.
+    used: a change of its owner leaves no trace in `version_of`.
 
     read       reads the value; may raise UserError
     on_report  called with what is wrong with a new file
@@ -95,7 +95,7 @@ class Watched(Generic[T]):
     def __init__(self, path: Path, read: Callable[[], T], on_report: Callable[[str], None]) -> None:
         self._path, self._read, self._on_report = path, read, on_report
         self._lock = threading.Lock()
-        self._version, self._checked = self._stat(), time.monotonic()
+        self._version, self._checked = version_of(self._path), time.monotonic()
         self._problem = ""  # of the file as it is now, as reported
         self._value = read()
 
@@ -108,7 +108,7 @@ class Watched(Generic[T]):
             return self._value
 
     def _reload(self) -> None:
-        version = self._stat()
+        version = version_of(self._path)
         if version == self._version:
             return
         try:
@@ -119,12 +119,14 @@ class Watched(Generic[T]):
                 self._problem = str(error)
                 self._on_report(f"{error}; the previous content stays in force")
 
-    def _stat(self) -> tuple[int, int, int] | None:
-        try:
-            found = self._path.stat()
-        except OSError:
-            return None
-        return found.st_mtime_ns, found.st_ino, found.st_size
+
+def version_of(path: Path) -> tuple[int, int, int] | None:
+    """Differs once a file has been written or replaced; None: it is missing."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_mtime_ns, found.st_ino, found.st_size
 
 
 @dataclass(frozen=True, slots=True)
