@@ -4,6 +4,7 @@ Compares output that must not change, byte for byte, with copies beside this scr
 
   plans      `print` of every vehicle with every graph and source, as text and as JSON
   events     decisions on 2400 generated events, over every vehicle and five modes files
+  links      decisions on 720 generated events on a measured link, with floors, for every vehicle
   drives     replays of three recorded drives
   validate   output of `validate` for a hundred broken files
   keys       keys of events, of lines of drive logs and of messages of the control link
@@ -30,7 +31,7 @@ from concurrent.futures import ProcessPoolExecutor
 from functools import lru_cache
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import broken
 import mutations as mutated
@@ -40,9 +41,14 @@ HERE = Path(__file__).resolve().parent
 CHECKOUT = HERE.parents[1]
 CONF, SCHEMAS = CHECKOUT / "conf", CHECKOUT / "schemas"
 EVENTS, SEED = 2400, 20261122
+LINK_EVENTS = 720
 MODES = ("equal", "fixed", "paper", "safe", "steady")  # a new file must not change the events of these
+LINK_MODES = ("open_loop", "safe")
 SHOWN = 60  # lines of a difference
 Texts = dict[str, str]
+Generators = dict[
+    str, Callable[[random.Random, str, list[str], float], dict[str, Any]]
+]  # of an event's values, by name
 
 
 def main(words: list[str]) -> int:
@@ -115,15 +121,37 @@ def plans(pool: ProcessPoolExecutor) -> Texts:
 
 
 def events(pool: ProcessPoolExecutor) -> Texts:
-    runs = list(product(_files("vehicle"), MODES))
+    return _decisions(pool, Story(MODES, EVENTS, (0, 0.1, 0.1, 0.1, 0.5, 1.3, 7), _GENERATED, lambda _: []))
+
+
+def links(pool: ProcessPoolExecutor) -> Texts:
+    return _decisions(pool, Story(LINK_MODES, LINK_EVENTS, (0, 0.04, 0.04, 0.04, 0.1, 0.7), _ON_A_LINK, _floors))
+
+
+class Story(NamedTuple):
+    """Generated events, shared evenly by the vehicles and modes files.
+
+    steps      s between two events
+    overrides  by vehicle
+    """
+
+    modes: tuple[str, ...]
+    count: int
+    steps: tuple[float, ...]
+    generated: Generators
+    overrides: Callable[[str], list[str]]
+
+
+def _decisions(pool: ProcessPoolExecutor, story: Story) -> Texts:
+    runs = list(product(_files("vehicle"), story.modes))
     chance = random.Random(SEED)
-    inputs = {f"{vehicle} {modes}": _events(chance, vehicle, EVENTS // len(runs)) for vehicle, modes in runs}
+    inputs = {run: _events(chance, run[0], story.count // len(runs), story) for run in runs}
     with tempfile.TemporaryDirectory() as directory:
         words = []
         for vehicle, modes in runs:
             path = Path(directory, f"{vehicle}_{modes}.jsonl")
-            path.write_text("\n".join(map(json.dumps, inputs[f"{vehicle} {modes}"])))
-            words.append(["replay", f"vehicle={vehicle}", f"modes={modes}", f"input={path}"])
+            path.write_text("\n".join(map(json.dumps, inputs[vehicle, modes])))
+            words.append(["replay", f"vehicle={vehicle}", f"modes={modes}", *story.overrides(vehicle), f"input={path}"])
         outputs = _outputs(pool, words)
     return {" ".join(word for word in name.split() if "input=" not in word): text for name, text in outputs.items()}
 
@@ -164,6 +192,7 @@ def keys(pool: ProcessPoolExecutor) -> Texts:
 SECTIONS: dict[str, Callable[[ProcessPoolExecutor], Texts]] = {
     "plans": plans,
     "events": events,
+    "links": links,
     "drives": drives,
     "validate": validate,
     "keys": keys,
@@ -240,12 +269,12 @@ def _shown(status: int, out: str, err: str) -> str:
 # --- generated events -------------------------------------------------------------------------------------------------
 
 
-def _events(chance: random.Random, vehicle: str, count: int) -> list[dict[str, Any]]:
+def _events(chance: random.Random, vehicle: str, count: int, story: Story) -> list[dict[str, Any]]:
     cameras = _cameras(vehicle)
     t, made = 0.0, []
     for _ in range(count):
-        t = round(t + chance.choice((0, 0.1, 0.1, 0.1, 0.5, 1.3, 7)), 6)
-        made.append({"t": t, **_event(chance, chance.choice(cameras), cameras)})
+        t = round(t + chance.choice(story.steps), 6)
+        made.append({"t": t, **_event(chance, chance.choice(cameras), cameras, story.generated)})
     return made
 
 
@@ -254,14 +283,22 @@ def _cameras(vehicle: str) -> list[str]:
     return [line.partition("@cameras.")[2].partition(":")[0] for line in text.splitlines() if "/cameras@" in line]
 
 
-def _event(chance: random.Random, camera: str, cameras: list[str]) -> dict[str, Any]:
+def _floors(vehicle: str) -> list[str]:
+    """Floors that together exceed a low total, with an order in which cameras are given up."""
+    mounts = {"floor_kbps": lambda _: 150, "shed": lambda number: number}
+    cameras = enumerate((name for name in _cameras(vehicle) if name.islower()), 1)  # not NAME, of a comment
+    return [f"cameras.{name}.{key}={value(number)}" for number, name in cameras for key, value in mounts.items()]
+
+
+def _event(chance: random.Random, camera: str, cameras: list[str], generated: Generators) -> dict[str, Any]:
     """One event; some are refused, since the mode is wrong or a value is out of range."""
     kbps = chance.choice((0, 0.5, 1, 99.9, chance.randrange(20_000), round(chance.uniform(0, 8000), 2)))
-    name = chance.choice(list(_GENERATED))
-    return {"event": name, **_GENERATED[name](chance, camera, cameras, kbps)}
+    name = chance.choice(list(generated))
+    values = generated[name](chance, camera, cameras, kbps)
+    return {"event": name.rstrip("+"), **values}
 
 
-_GENERATED: dict[str, Callable[[random.Random, str, list[str], float], dict[str, Any]]] = {
+_GENERATED: Generators = {
     "mode_selected": lambda chance, *_: {"mode": chance.choice(("single", "automatic", "collective"))},
     "bitrate_predicted": lambda chance, _camera, _cameras, kbps: {
         "kbps": kbps,
@@ -286,10 +323,30 @@ _GENERATED: dict[str, Callable[[random.Random, str, list[str], float], dict[str,
     "weights_set": lambda chance, _camera, cameras, _kbps: {
         "weights": {name: chance.choice((0, 0.5, 1, 3)) for name in chance.sample(cameras, 2)}
     },
-    "link_measured": lambda _chance, camera, _cameras, kbps: {"camera": camera, "kbps": kbps},
+    "link_measured": lambda _chance, camera, _cameras, kbps: {"camera": camera, "kbps": kbps},  # of older drives
     "operator_connected": lambda *_: {},
     "operator_disconnected": lambda *_: {},
     "clock_advanced": lambda *_: {},
+}
+
+
+def _measured(chance: random.Random, _camera: str, _cameras: list[str], kbps: float) -> dict[str, Any]:
+    return {
+        "kbps": kbps,
+        "queue_ms": chance.choice((0, 12, 70, 400)),
+        "loss": chance.choice((0, 0, 0.02, 0.2)),
+        "rtt_ms": chance.choice((10, 60, 900)),
+        "state": chance.choice(("clear", "clear", "clear", "filling", "filling", "draining", "stalled")),
+    }
+
+
+_ON_A_LINK: Generators = {
+    **_GENERATED,
+    **{f"link_measured{'+' * n}": _measured for n in range(45)},  # three quarters of the events
+    "copies_counted": lambda chance, camera, *_: {"copies": {camera: chance.randrange(1, 4)}},
+    "control_passed": lambda chance, *_: {"operator": chance.choice(("a", "b", ""))},
+    "attention_changed": lambda chance, *_: {"attention": chance.choice(("watching", "hidden", "absent"))},
+    "steering_reported": lambda chance, *_: {"rad": round(chance.uniform(-0.5, 0.5), 3)},
 }
 
 
