@@ -14,8 +14,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from runner.configuration.rule_lists import call_rule, check_order
+from runner.core import events as core_events
 from runner.core import rules
-from runner.core.events import BitratePredicted, parse
+from runner.core.events import Attention, BitratePredicted, parse
 from runner.core.model import Mode, ModelError, Roi, Vehicle
 from runner.core.rules import decide
 from runner.core.state import State
@@ -358,7 +359,7 @@ KBPS = {"kbps": st.sampled_from([0, 0.5, 300, 1320, 2970, 5225.5, 12_000])}
 EVENTS: dict[str, dict[str, st.SearchStrategy[Any]]] = {
     "mode_selected": {"mode": st.sampled_from(list(map(str, Mode)))},
     "bitrate_predicted": {**KBPS, "lower_kbps": st.sampled_from([0, 900, 4000]), "valid_s": st.sampled_from([0.5, 4])},
-    "position_reported": {"lat": st.just(48.1), "lon": st.just(11.6)},
+    "position_reported": {"lat": st.sampled_from([48.1, 48.2]), "lon": st.just(11.6)},
     "steering_reported": {"rad": st.just(0.2)},
     "total_set": KBPS,
     "camera_switched": {**FRONT_LEFT, "on": st.booleans()},
@@ -372,16 +373,27 @@ EVENTS: dict[str, dict[str, st.SearchStrategy[Any]]] = {
     "link_measured": {
         **KBPS,
         "queue_ms": st.sampled_from([0, 30, 300]),
+        "loss": st.sampled_from([0, 0.2]),
         "state": st.sampled_from(["clear", "filling", "draining", "stalled"]),
     },
+    "copies_counted": {"copies": st.dictionaries(st.sampled_from(list(TUM.cameras)), st.sampled_from([1, 2, 3]))},
+    "control_passed": {"operator": st.sampled_from(["a", "b", ""])},
+    "attention_changed": {"attention": st.sampled_from(list(map(str, Attention)))},
     "operator_connected": {},
     "operator_disconnected": {},
     "clock_advanced": {},
 }
+assert set(EVENTS) == set(core_events.EVENTS)
 EVENT = st.sampled_from(list(EVENTS)).flatmap(
     lambda name: st.fixed_dictionaries({"event": st.just(name), **EVENTS[name]})
 )
 PASSING = st.tuples(EVENT, st.sampled_from([0, 0.1, 0.6, 1.5, 4]))  # and the s that pass before the event
+
+FLOORS = tuple(
+    f"cameras.{name}.{key}={value}"
+    for number, name in enumerate(TUM.cameras, 1)
+    for key, value in (("floor_kbps", 300), ("shed", number))
+)
 
 # The first measurement that the cap sees is 0.6 s old, and an event follows that it does not read.
 OLD_MEASUREMENT = [
@@ -416,7 +428,7 @@ def reading_everything(vehicle: Vehicle) -> Vehicle:
 @example(events=OLD_MEASUREMENT)
 @example(events=NEW_OPERATOR)
 def test_declaring_reads_changes_no_decision(modes: str, events: list[tuple[dict[str, Any], float]]) -> None:
-    stated = vehicle(f"modes={modes}")
+    stated = vehicle(f"modes={modes}", *FLOORS)
     everything = reading_everything(stated)
     run, other, t = start(stated), start(everything), 0.0
     for event, passing in events:
@@ -486,10 +498,10 @@ def test_a_list_in_the_wrong_order_is_refused(names: tuple[str, ...], problems: 
         ("share_by_demand", {"x": 1}, "share_by_demand.x: 1: unknown parameter; share_by_demand takes none"),
         ("hold_upscaling", {"fo_s": 1}, "hold_upscaling.fo_s: 1: unknown parameter, did you mean for_s?"),
         ("hold_upscaling", {}, "hold_upscaling.for_s: missing: required by this rule"),
-        ("hold_upscaling", {"for_s": -1}, "hold_upscaling.for_s: -1: must be a number from 0"),
-        ("hold_upscaling", {"for_s": "3"}, "hold_upscaling.for_s: '3': must be a number from 0"),
-        ("hold_upscaling", {"for_s": True}, "hold_upscaling.for_s: True: must be a number from 0"),
-        ("hold_upscaling", {"for_s": float("nan")}, "hold_upscaling.for_s: nan: must be a number from 0"),
+        ("hold_upscaling", {"for_s": -1}, "hold_upscaling.for_s: -1: must be a number of 0 or more"),
+        ("hold_upscaling", {"for_s": "3"}, "hold_upscaling.for_s: '3': must be a number of 0 or more"),
+        ("hold_upscaling", {"for_s": True}, "hold_upscaling.for_s: True: must be a number of 0 or more"),
+        ("hold_upscaling", {"for_s": float("nan")}, "hold_upscaling.for_s: nan: must be a number of 0 or more"),
         ("fade_when_stale", {"halve_every_s": 0}, "fade_when_stale.halve_every_s: 0: must be above 0"),
     ],
 )
