@@ -26,6 +26,7 @@ from runner.drive.read import read_drive
 from runner.drive.series import series
 from runner.drive.statistics import statistics
 from runner.schema import findings
+from runner.system import extras
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("plotly")
@@ -438,13 +439,11 @@ def test_a_verb_without_positional_arguments_refuses_them(tod: Command) -> None:
 
 @pytest.mark.usefixtures("unprinted")
 def test_without_its_libraries(tmp_path: Path, drive: Path, monkeypatch: pytest.MonkeyPatch, tod: Command) -> None:
-    import importlib.util
-
-    real = importlib.util.find_spec
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "matplotlib" else real(name))
+    real = extras.find_spec
+    monkeypatch.setattr(extras, "find_spec", lambda name: None if name == "matplotlib" else real(name))
     status, out, err = tod("report", str(drive), f"output={tmp_path / 'out'}")
     assert (status, out) == (1, "")
-    assert err == "the Python modules matplotlib are not installed: extra report, see docs/install.md\n"
+    assert err == "the Python module matplotlib is not installed: install the extra report, see docs/install.md\n"
 
 
 def test_charts_of_many_drives_have_letters_of_their_own(drive: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,6 +12,7 @@ from multiprocessing import active_children
 from typing import ParamSpec, TypeVar
 
 from runner.errors import RunError
+from runner.system.extras import how_to_install
 from runner.system.spawned import WorkerContext
 
 P = ParamSpec("P")
@@ -54,7 +55,7 @@ def _dask(scheduler: str | None, parallel: int) -> Iterator[Executor]:
     try:
         from distributed import Client, LocalCluster
     except ImportError:
-        raise RunError("workers=dask needs Dask: install the extra cluster, see docs/install.md") from None
+        raise RunError(f"workers=dask needs Dask: {how_to_install('cluster')}") from None
     with ExitStack() as stack:
         try:
             own = {"n_workers": parallel, "threads_per_worker": 1, "dashboard_address": None}

@@ -21,6 +21,7 @@ from pathlib import Path
 from runner.clips import View, clip_path
 from runner.core.model import Progress
 from runner.system import signals
+from runner.system.extras import how_to_install
 from runner.system.files import put_in_place
 from runner.system.spawned import WorkerContext
 
@@ -87,7 +88,7 @@ def _remove_unfinished(cache: Path) -> None:
 
 def _need_numba() -> None:
     if find_spec("numba") is None:
-        raise RuntimeError("the synthetic drive needs numba: install the extra synthetic, see docs/install.md")
+        raise RuntimeError(f"the synthetic drive needs numba: {how_to_install('synthetic')}")
 
 
 def _pixels(view: View, seconds: float) -> int:

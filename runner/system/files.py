@@ -174,5 +174,7 @@ def plotly_script(extra: str) -> Path:
     """
     spec = find_spec("plotly")
     if spec is None or spec.origin is None:
-        raise RunError(f"the Python module plotly is not installed: install the extra {extra}, see docs/install.md")
+        from runner.system.extras import how_to_install
+
+        raise RunError(f"the Python module plotly is not installed: {how_to_install(extra)}")
     return Path(spec.origin).parent / "package_data" / "plotly.min.js"

@@ -139,32 +139,18 @@ HYDRA_FLAGS = {
 }
 
 
-# By extra of this package, the Python modules that it provides.
-EXTRAS = {
-    "live": ("paho", "rich"),
-    "page": ("aiohttp", "plotly"),
-    "synthetic": ("numba",),
-    "model": ("numba", "cv2", "scipy", "matplotlib"),
-    "report": ("matplotlib", "plotly"),
-    "vmaf": ("imageio_ffmpeg",),
-    "cluster": ("distributed",),
-    "mcap": ("foxglove",),
-    "bag": ("rosbags",),
-    "security": ("cryptography",),
-    "metrics": ("prometheus_client",),
-}
-
-
 def import_problem(error: ImportError) -> str | None:
     """What to tell the user about a library that cannot be imported; None for a mistake in this package."""
+    from runner.system.extras import EXTRAS, how_to_install
+
     module = (error.name or "").partition(".")[0]
     extra = next((extra for extra, modules in EXTRAS.items() if module in modules), None)
     if isinstance(error, ModuleNotFoundError):
         missing = f"the Python module {error.name} is not installed"
-        return f"{missing}: install the extra {extra}, see docs/install.md" if extra else None
+        return f"{missing}: {how_to_install(extra)}" if extra else None
     if module == "runner":
         return None
-    remedy = f"; reinstall the extra {extra}, see docs/install.md" if extra else ""
+    remedy = f"; re{how_to_install(extra)}" if extra else ""
     return f"{f'the Python module {module}' if module else 'a Python module'} does not load: {error}{remedy}"
 
 
@@ -257,7 +243,7 @@ class Arguments:
         except ValueError:
             number = -1.0
         if not 0 <= number < float("inf"):
-            raise UserError("command line", key, repr(text), "must be a number from 0")
+            raise UserError("command line", key, repr(text), "must be a number of 0 or more")
         return number
 
     def path(self, key: str) -> Path | None:

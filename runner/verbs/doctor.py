@@ -23,9 +23,10 @@ from runner.core.model import Endpoint, RosSettings, Vehicle, suggest
 from runner.errors import MissingBindings, RunError, UserError
 from runner.mqtt.broker import find_mosquitto
 from runner.plans import compile_plans
+from runner.system.extras import EXTRAS, how_to_install
 from runner.system.ports import check_port_free
 from runner.system.usb import UsbCamera, buses
-from runner.verbs import EXTRAS, VERBS, Arguments, study_word
+from runner.verbs import VERBS, Arguments, study_word
 
 IMPORT_S = 30  # rclpy or rospy loads within a second
 CORE_MPX_S = 180  # cropped, scaled and encoded per core and second at factor 0.5, measured with h264_rtsp
@@ -74,11 +75,14 @@ def _verb(arguments: Arguments) -> str:
 
 def examine(verb: str, vehicle: Vehicle, document: Mapping[str, Any]) -> Iterator[Diagnosis]:
     """Everything that a verb needs with this configuration."""
+    needed: dict[str, str] = {}
     for extra in _extras(verb, vehicle, document):
         for module in EXTRAS[extra]:
-            found = find_spec(module) is not None
-            hint = "" if found else f": install the extra {extra}, see docs/install.md"
-            yield Diagnosis(found, f"Python module {module}{hint}")
+            needed.setdefault(module, extra)
+    for module, extra in needed.items():
+        found = find_spec(module) is not None
+        hint = "" if found else f": {how_to_install(extra)}"
+        yield Diagnosis(found, f"Python module {module}{hint}")
     if verb in STREAMING:
         bindings = list(_bindings())
         yield from bindings

@@ -33,8 +33,9 @@ from runner.bag import PICTURES, Bag, is_bag
 from runner.configuration.config import configuration
 from runner.configuration.files import conf_directories, options
 from runner.core.model import BagTopic, ModelError, Vehicle, suggest
-from runner.errors import ConfigError, Problem, RunError, UserError
+from runner.errors import ConfigError, Problem, UserError
 from runner.system import signals
+from runner.system.extras import require
 from runner.verbs import Arguments, study_word
 from runner.verbs.screen import progress_bar, say, streaming
 
@@ -47,7 +48,7 @@ NO_CLIPS = (".json", ".yaml", ".png", ".pdf")  # suffixes of other files named a
 
 def run(arguments: Arguments) -> int:
     streaming()
-    _need_libraries()
+    require("model")
     output = arguments.path("output")
     if output is None:
         raise UserError("command line", "output", None, "must be given: the directory to write models to")
@@ -73,14 +74,6 @@ def compare(words: Sequence[str]) -> int:
     before, after = (read_model(Path(word)) for word in words)
     print("\n".join(differences(before, after)))
     return 0
-
-
-def _need_libraries() -> None:
-    from importlib.util import find_spec
-
-    missing = [name for name in ("numba", "cv2", "scipy", "matplotlib") if find_spec(name) is None]
-    if missing:
-        raise RunError(f"the Python modules {', '.join(missing)} are not installed: extra model, see docs/install.md")
 
 
 def _targets(arguments: Arguments) -> tuple[Vehicle, Study, list[str]]:

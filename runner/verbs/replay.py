@@ -66,7 +66,7 @@ if TYPE_CHECKING:
 InputEvent = tuple[dict[str, Any], Event]  # an event, as JSON and parsed
 NOTHING_PREDICTED = (
     "the source of predictions on the command line has predicted nothing from this input (a map needs positions in it);"
-    " the input's own predictions are left out"
+    " the input's own predictions are ignored"
 )
 
 _encode = json.JSONEncoder(ensure_ascii=False, check_circular=False).encode

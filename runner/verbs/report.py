@@ -24,7 +24,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from runner.configuration.files import conf_directories
-from runner.errors import RunError, UserError
+from runner.errors import UserError
+from runner.system.extras import require
 from runner.verbs import Arguments
 from runner.verbs.screen import progress_bar
 
@@ -95,7 +96,7 @@ def check_report(output: Path, models: Path | None) -> None:
         raise UserError("command line", "output", repr(str(output / PAGE)), rule)
     if models and not models.is_dir():
         raise UserError("command line", "models", repr(str(models)), "no such directory")
-    _need_libraries()
+    require("report")
 
 
 def _is_report(page: Path) -> bool:
@@ -122,14 +123,6 @@ def _own() -> tuple[str, ...]:
     from runner.verbs import VERBS
 
     return VERBS["report"].arguments
-
-
-def _need_libraries() -> None:
-    from importlib.util import find_spec
-
-    missing = [name for name in ("matplotlib", "plotly", "rich") if find_spec(name) is None]
-    if missing:
-        raise RunError(f"the Python modules {', '.join(missing)} are not installed: extra report, see docs/install.md")
 
 
 def _measured(
