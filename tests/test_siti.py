@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 pytest.importorskip("cv2")
 
-from runner.rate_quality.siti import SiTi, measure, spatial, temporal
+from runner.rate_quality.siti import SiTi, spatial, temporal
 
 
 def noise(seed: int, height: int = 36, width: int = 50) -> np.ndarray:
@@ -40,7 +40,9 @@ def test_exact_values() -> None:
 
 def test_clip() -> None:
     frames = [noise(i) for i in range(4)]
-    found = measure(iter(frames))
+    found = SiTi()
+    for frame in frames:
+        found.add(frame)
     assert found.si == [spatial(frame) for frame in frames]
     assert found.ti == [temporal(*pair) for pair in pairwise(frames)]
     assert (found.si_max, found.ti_max) == (max(found.si), max(found.ti))
@@ -48,6 +50,7 @@ def test_clip() -> None:
 
 
 def test_too_few_frames() -> None:
-    assert measure([]) == SiTi([], [])
-    one = measure([noise(0)])
+    none, one = SiTi(), SiTi()
+    assert (none.si_max, none.si_mean, none.ti_max, none.ti_mean) == (0, 0, 0, 0)
+    one.add(noise(0))
     assert (one.si_max, one.ti_max, one.ti_mean) == (spatial(noise(0)), 0, 0)

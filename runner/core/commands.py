@@ -12,8 +12,6 @@ from runner.core.model import Roi
 Size = tuple[int, int]
 KnobValue = bool | int | Roi | Size
 
-KNOBS = ("sending", "roi", "size", "bitrate")
-
 
 @dataclass(frozen=True, slots=True)
 class Command:

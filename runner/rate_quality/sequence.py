@@ -7,17 +7,13 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from fractions import Fraction
 from pathlib import Path
-from statistics import fmean
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from runner.core.model import BagTopic, Camera, ModelError
 from runner.errors import RunError, UserError
 from runner.lanes import BAG, FRAMES, LaneSet
 from runner.rate_quality.cache import Cache, digest, file_digest
 from runner.rate_quality.recordings import INDEX
-
-if TYPE_CHECKING:
-    from runner.rate_quality.metrics import Luma
 
 SURVEY_VERSION = 1
 FEWEST_FRAMES = 25
@@ -126,27 +122,17 @@ def _is_recording(path: Path) -> bool:
 
 def _analyse(footage: Footage, fps: Fraction) -> dict[str, Any]:
     from runner.apply import run_lanes
-    from runner.rate_quality.siti import spatial, temporal
+    from runner.rate_quality.siti import SiTi
 
-    si: list[float] = []
-    ti: list[float] = []
-    before: Luma | None = None
-
-    def on_frame(_number: int, luma: Luma) -> None:
-        nonlocal before
-        si.append(spatial(luma))
-        if before is not None:
-            ti.append(temporal(before, luma))
-        before = luma
-
+    found = SiTi()
     line = f"{decoding(footage, fps)} ! identity name={FRAMES} ! fakesink sync=false"
     bag = footage if isinstance(footage, BagTopic) else None
     try:
-        run_lanes(LaneSet(line, fps, (), bag), on_frame, lambda *_: None, lambda _: None)
+        run_lanes(LaneSet(line, fps, (), bag), lambda _, luma: found.add(luma), lambda *_: None, lambda _: None)
     except RunError as error:
         raise UserError("command line", "sequence", _named(footage), f"cannot be decoded to its end: {error}") from None
-    means = {"si_mean": fmean(si or [0.0]), "ti_mean": fmean(ti or [0.0])}
-    return {"frames": len(si), "si": max(si, default=0.0), "ti": max(ti, default=0.0), **means}
+    means = {"si_mean": found.si_mean, "ti_mean": found.ti_mean}
+    return {"frames": len(found.si), "si": found.si_max, "ti": found.ti_max, **means}
 
 
 def _named(footage: Footage) -> str:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from statistics import fmean
 
 import cv2
@@ -11,15 +10,23 @@ import cv2
 from runner.rate_quality.metrics.interface import Luma
 
 
-@dataclass(frozen=True)
+@dataclass
 class SiTi:
-    """SI of each frame, and TI of each but the first.
+    """SI of each frame of a clip, and TI of each but the first; only the last frame is kept.
 
-    P.910 uses the maximum over time; the mean says more about a scene with a cut or a flash.
+    P.910 uses the maximum over time; the mean says more about a scene with a cut or a flash. Without values, each is 0.
     """
 
-    si: Sequence[float]
-    ti: Sequence[float]
+    si: list[float] = field(default_factory=list)
+    ti: list[float] = field(default_factory=list)
+    _before: Luma | None = None
+
+    def add(self, frame: Luma) -> None:
+        """The next frame of the clip."""
+        self.si.append(spatial(frame))
+        if self._before is not None:
+            self.ti.append(temporal(self._before, frame))
+        self._before = frame
 
     @property
     def si_max(self) -> float:
@@ -36,19 +43,6 @@ class SiTi:
     @property
     def ti_mean(self) -> float:
         return fmean(self.ti or [0.0])
-
-
-def measure(frames: Iterable[Luma]) -> SiTi:
-    """SI and TI of a clip, keeping two frames in memory; 0 if it has too few frames."""
-    si: list[float] = []
-    ti: list[float] = []
-    before: Luma | None = None
-    for frame in frames:
-        si.append(spatial(frame))
-        if before is not None:
-            ti.append(temporal(before, frame))
-        before = frame
-    return SiTi(si, ti)
 
 
 def spatial(luma: Luma) -> float:

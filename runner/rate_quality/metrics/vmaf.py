@@ -22,6 +22,7 @@ import numpy as np
 
 from runner.errors import RunError, UserError
 from runner.rate_quality.metrics.interface import Luma, Mask, Metric, PictureSize, check
+from runner.system.extras import how_to_install
 
 TIMEOUT_S = 120.0  # even a busy machine scores a picture faster
 PIPE_BYTES = 1 << 20  # the most that a user may request; fewer, larger writes
@@ -101,7 +102,7 @@ def find_tool() -> Tool:
         if version := _version(exe):
             return Tool(exe, version)
     what = f"TOD_FFMPEG={named} is not an ffmpeg with libvmaf" if named else "VMAF needs an ffmpeg with libvmaf"
-    raise RunError(f"{what}: install the extra vmaf, see docs/install.md")
+    raise RunError(f"{what}: {how_to_install('vmaf')}")
 
 
 def _candidates() -> Iterator[str]:
@@ -185,21 +186,6 @@ def ffmpeg_error(directory: Path, status: int) -> RunError:
     lines = (directory / STDERR_FILE).read_text(errors="replace").strip().splitlines()
     why = re.sub(r"^\[[^]]*\] ", "", lines[0]) if lines else f"status {status}"
     return RunError(f"ffmpeg failed to score VMAF: {why}")
-
-
-def score_files(reference: Path, picture: Path, size: PictureSize, pixel_format: str, model: str) -> list[float]:
-    """Score of each picture of a raw video.
-
-    pixel_format  of both files, as ffmpeg names it
-    raises        RunError
-    """
-    tool = find_tool()
-    layout = picture_format(size, pixel_format, Fraction(25))
-    inputs = [[*layout, "-i", str(path.resolve())] for path in (picture, reference)]
-    with TemporaryDirectory(prefix="tod-vmaf-") as name, (Path(name) / STDERR_FILE).open("w") as stderr:
-        words = command(tool.exe, inputs, model, 1)
-        status = subprocess.run(words, check=False, cwd=name, stdout=subprocess.DEVNULL, stderr=stderr).returncode
-        return list(read_log(Path(name), status).by_picture.values())
 
 
 # --- a lane ---------------------------------------------------------------------------------------------------------
