@@ -1,6 +1,6 @@
 """usage: python tests/faults [PACKAGE ...]
 
-Injects one fault at a time, two in each package, into a copy of the checkout and runs the tests that must fail.
+Injects one fault at a time, one or two in each package, into a copy of the checkout and runs the tests that must fail.
 """
 
 from __future__ import annotations
@@ -108,6 +108,15 @@ FAULTS = [
         "test_page_parts",
     ),
     Fault("verbs/replay.py", 'if document["t"] < last:', "if False:", "test_replay"),
+    Fault("verbs/validate.py", 'not name.startswith(".") and name.lower()', "name.lower()", "test_validate"),
+    Fault("security/authority.py", "in keyring.PUBLIC else 0o600", "in keyring.PUBLIC else 0o640", "test_keys"),
+    Fault("security/authority.py", "if role is Role.VEHICLE or role in VIEWERS:", "if role in VIEWERS:", "test_keys"),
+    Fault("system/clocks.py", "if exchange.answered < exchange.received:", "if False:", "test_clocks"),
+    Fault("system/reports.py", "if most or text in self._passed_on:", "if text in self._passed_on:", "test_reports"),
+    Fault("bag/pictures.py", "if size < step * height:", "if size < step * height - step:", "test_bag"),
+    Fault("bag/__init__.py", "abs(measured - whole) <= ROUND * whole", "measured == whole", "test_bag"),
+    Fault("ros/inputs.py", "if other != camera:", "if False:", "test_ros_inputs"),
+    Fault("metrics/prometheus.py", "if not is_own:", "if False:", "test_prometheus"),
     Fault(
         "graph.py",
         "right, bottom = native_width - left - value.width",
