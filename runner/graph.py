@@ -244,14 +244,14 @@ def assignments(camera: Camera, knob: str, value: KnobValue) -> list[Assignment]
     """
     quantities = _quantities(camera, value)
     turned: list[Assignment] = []
-    for turn in camera.graph.knobs[knob]:
-        if PLACEHOLDER.search(turn.value) and "width" in quantities:
-            filled: Value = PLACEHOLDER.sub(lambda match: str(quantities[match[1]]), turn.value)
-        elif turn.value in quantities:
-            filled = quantities[turn.value]
+    for target in camera.graph.knobs[knob]:
+        if PLACEHOLDER.search(target.value) and "width" in quantities:
+            filled: Value = PLACEHOLDER.sub(lambda match: str(quantities[match[1]]), target.value)
+        elif target.value in quantities:
+            filled = quantities[target.value]
         else:
-            raise ModelError(f"graph.knobs.{knob}", repr(turn.value), f"{knob} offers {', '.join(quantities)}")
-        turned.append((turn.element, turn.property, filled))
+            raise ModelError(f"graph.knobs.{knob}", repr(target.value), f"{knob} offers {', '.join(quantities)}")
+        turned.append((target.element, target.property, filled))
     return turned
 
 
@@ -285,7 +285,7 @@ def video_codec(graph: Graph) -> str:
 
 
 def _quantities(camera: Camera, value: KnobValue) -> dict[str, Value]:
-    """The quantities that a knob's value offers to its turns, by their names in the YAML."""
+    """The quantities that a knob's value offers to its targets, by their names in the YAML."""
     if isinstance(value, bool):
         return {"on": value, "off": not value}
     if isinstance(value, int):

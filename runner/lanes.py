@@ -93,7 +93,7 @@ def cut(plan: Plan) -> tuple[tuple[Element, ...], tuple[Element, ...]]:
 
 def encoder(plan: Plan) -> str:
     """Name of the element whose bitrate is set."""
-    names = [turn.element for turn in plan.camera.graph.knobs.get("bitrate", ())]
+    names = [target.element for target in plan.camera.graph.knobs.get("bitrate", ())]
     for element in plan.vehicle:
         if element.name in names:
             return element.name

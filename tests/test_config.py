@@ -327,7 +327,7 @@ REAR, GRAPH, PAPER, ROBOT = (
         ),
         (PAPER, {"start_kbps: 3000": "start_kbp: 1"}, "start_kbp: 1: unknown parameter, did you mean start_kbps?"),
         (PAPER, {"start_kbps: 3000": ""}, "start_kbps: missing: required by this rule"),
-        (PAPER, {"start_kbps: 3000": "start_kbps: -1"}, "start_kbps: -1: must be a number from 0"),
+        (PAPER, {"start_kbps: 3000": "start_kbps: -1"}, "start_kbps: -1: must be a number of 0 or more"),
         (PAPER, {"collective:": "colective:"}, "colective: unknown key, did you mean collective?"),
         (
             PAPER,

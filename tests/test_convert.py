@@ -108,7 +108,7 @@ NEEDED = "sizes and frame rates must be given: bag=BAG with pictures of each cam
         (("width_px=640", "fps=5"), f"without height_px=: {NEEDED}"),
         (("bag=/none.bag",), "bag: /none.bag: no such file"),
         (("width_px=640.5", *SIZE[1:]), "width_px: '640.5': must be a whole number"),
-        ((*SIZE[:2], "fps=x"), "fps: 'x': must be a number from 0"),
+        ((*SIZE[:2], "fps=x"), "fps: 'x': must be a number of 0 or more"),
         (
             (*SIZE, "vehicle=a b"),
             "vehicle: 'a b': must be letters, digits, _ and -, and no number, true, false or null",

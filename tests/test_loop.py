@@ -18,7 +18,7 @@ from test_keys import ALLOWED, PRESENCE
 
 from runner.configuration.config import configuration
 from runner.core.events import EVENTS, to_json
-from runner.core.roles import SETTINGS, Role, denial
+from runner.core.roles import DRIVER_EVENTS, Role, denial
 from runner.core.step import step
 from runner.drive.log import Log
 from runner.plans import compile_plans
@@ -274,7 +274,7 @@ def test_the_vehicle_enforces_each_roles_rights_for_every_event(
         assert requests.ask("driver", {"event": "operator_connected"})[0].result == "applied"
         for document in EXAMPLES:
             outcome, decided = requests.ask("other", document)
-            if document["event"] in SETTINGS:
+            if document["event"] in DRIVER_EVENTS:
                 assert (outcome.result, outcome.reason, decided) == ("refused", "driver is in control", False)
     reported = [report for report in watched.reports if report.startswith("refused ")]
     assert reported[0] == f"refused mode_selected of a-vehicle: {denial(Role.VEHICLE, 'mode_selected')}"
@@ -308,7 +308,7 @@ def test_attention_of_the_operator_in_control_is_published_until_control_passes(
         states("other", attention="watching")
         until(lambda: attention() == "watching")
     reported = [report for report in watched.reports if report.startswith("operator driver is ")]
-    expected = ["present", "watching", "slow", "no longer stating its attention", "hidden"]
+    expected = ["present", "watching", "slow", "no longer reporting its attention", "hidden"]
     assert reported == [f"operator driver is {what}" for what in expected]
 
 

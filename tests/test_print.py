@@ -159,10 +159,10 @@ def test_a_transport_without_a_server(tod: Command) -> None:
 @pytest.mark.parametrize(
     "word, expected",
     [
-        ("total_kbps=many", "command line: total_kbps: 'many': must be a number from 0"),
-        ("total_kbps=-1", "command line: total_kbps: '-1': must be a number from 0"),
-        ("total_kbps=nan", "command line: total_kbps: 'nan': must be a number from 0"),
-        ("total_kbps=inf", "command line: total_kbps: 'inf': must be a number from 0"),
+        ("total_kbps=many", "command line: total_kbps: 'many': must be a number of 0 or more"),
+        ("total_kbps=-1", "command line: total_kbps: '-1': must be a number of 0 or more"),
+        ("total_kbps=nan", "command line: total_kbps: 'nan': must be a number of 0 or more"),
+        ("total_kbps=inf", "command line: total_kbps: 'inf': must be a number of 0 or more"),
         ("total_kbps=", "command line: total_kbps: '': must not be empty"),
         ("format=xml", "command line: format: 'xml': must be one of text, json, yaml"),
         ("conf=/nowhere", "command line: conf: /nowhere: no such directory"),

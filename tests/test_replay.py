@@ -383,7 +383,7 @@ def test_a_truncated_drive_is_replayed_to_its_last_complete_line(tod: Command, d
     result = tod("replay", f"input={drive}")
     assert result.status == 0
     assert whole.startswith(result.out) and result.out.count("\n") == 4
-    assert result.err == f"{path}: line {at + 1} is cut off and was left out\n"
+    assert result.err == f"{path}: line {at + 1} is truncated and was skipped\n"
 
 
 def test_files_that_are_not_a_drive_are_reported(tod: Command, drive: Path, tmp_path: Path) -> None:

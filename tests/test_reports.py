@@ -30,7 +30,7 @@ def test_what_goes_on_stays_visible_with_the_number_of_those_left_out() -> None:
     report("again", "peer")
     now[0] = PERIOD_S
     report("again", "peer")
-    assert lines == ["again", "5 more such reports were left out before this one", "again"]
+    assert lines == ["again", "5 similar reports were suppressed before this one", "again"]
     now[0] = 2 * PERIOD_S
     report("another", "peer")
     assert lines[3:] == ["another"]

@@ -488,7 +488,7 @@ def _graph(data: Mapping[str, Any]) -> Graph:
         operator=_elements(data["operator"]),
         wire_vehicle=_elements(wire.get("vehicle")),
         wire_operator=_elements(wire.get("operator")),
-        knobs={knob: tuple(KnobTarget(**turn) for turn in turns) for knob, turns in data["knobs"].items()},
+        knobs={knob: tuple(KnobTarget(**target) for target in targets) for knob, targets in data["knobs"].items()},
         settings=settings | _effort(data),
         mutable=tuple((entry["element"], entry["property"]) for entry in data.get("mutable") or ()),
         **_given(data, ("verified", "key_frame")),

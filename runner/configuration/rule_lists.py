@@ -46,7 +46,7 @@ def call_rule(name: str, parameters: Mapping[str, Any]) -> RuleCall:
             hint = suggest(key, known) if known else f"; {name} takes none"
             raise ModelError(f"{name}.{key}", repr(value), f"unknown parameter{hint}")
         if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < float("inf"):
-            raise ModelError(f"{name}.{key}", repr(value), "must be a number from 0")
+            raise ModelError(f"{name}.{key}", repr(value), "must be a number of 0 or more")
         if "_every_" in key and value == 0:
             raise ModelError(f"{name}.{key}", value, "must be above 0")
     for key, parameter in known.items():

@@ -196,14 +196,14 @@ class Graph:
         if self.transport == "rtsp" and self.vehicle[-1].name != "pay0":
             rule = "the last element must be named pay0, as the RTSP server requires"
             raise ModelError("vehicle", repr(self.vehicle[-1].name), rule)
-        for knob, turns in self.knobs.items():
-            for index, turn in enumerate(turns):
-                if turn.element not in names:
-                    rule = f"no such element{suggest(turn.element, names)}"
-                    raise ModelError(f"knobs.{knob}[{index}].element", repr(turn.element), rule)
-        if self.key_frame == "caps" and [turn.property for turn in self.knobs["size"]] != ["caps"]:
+        for knob, targets in self.knobs.items():
+            for index, target in enumerate(targets):
+                if target.element not in names:
+                    rule = f"no such element{suggest(target.element, names)}"
+                    raise ModelError(f"knobs.{knob}[{index}].element", repr(target.element), rule)
+        if self.key_frame == "caps" and [target.property for target in self.knobs["size"]] != ["caps"]:
             raise ModelError("key_frame", "'caps'", "needs a knob `size` that sets the caps of one element")
-        turned = {(turn.element, turn.property) for turns in self.knobs.values() for turn in turns}
+        turned = {(target.element, target.property) for targets in self.knobs.values() for target in targets}
         for index, pair in enumerate(self.mutable):
             if pair not in turned:
                 raise ModelError(f"mutable[{index}]", repr(".".join(pair)), "no knob sets this property")

@@ -17,9 +17,11 @@ class Role(StrEnum):
 
 
 PRESENCE = frozenset({"operator_connected", "operator_disconnected"})
-SETTINGS = frozenset({"mode_selected", "total_set", "camera_switched", "roi_set", "camera_configured", "weights_set"})
+DRIVER_EVENTS = frozenset(
+    {"mode_selected", "total_set", "camera_switched", "roi_set", "camera_configured", "weights_set"}
+)
 MAY_REQUEST: dict[Role, frozenset[str]] = {
-    Role.CONTROLLER: PRESENCE | SETTINGS,
+    Role.CONTROLLER: PRESENCE | DRIVER_EVENTS,
     Role.WATCHER: PRESENCE,
     Role.PREDICTOR: frozenset({"bitrate_predicted"}),
     Role.POSITIONER: frozenset({"position_reported", "steering_reported"}),

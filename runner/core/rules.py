@@ -537,7 +537,7 @@ def _draft_problem(state: State, before: Draft, draft: Any) -> str | None:
         return None
     if draft.total is not before.total and not _is_bitrate(draft.total):
         return f"total {draft.total!r}: {BITRATE_RULE}"
-    for part, fits, rule in PARTS:
+    for part, fits, expected in PARTS:
         values = getattr(draft, part)
         if values is getattr(before, part):
             continue
@@ -547,7 +547,7 @@ def _draft_problem(state: State, before: Draft, draft: Any) -> str | None:
             continue
         for name, on in state.on.items():
             if on and not fits(values.get(name)):
-                return f"{part} of {name} {values.get(name)!r}: {rule}"
+                return f"{part} of {name} {values.get(name)!r}: {expected}"
     return None
 
 

@@ -163,7 +163,7 @@ def read_lines(
                 continue
             problem = problem or log_problem(line)
         if problem and drive and not text.endswith("\n"):
-            warnings.append(f"{name}: line {number} is cut off and was left out")
+            warnings.append(f"{name}: line {number} is truncated and was skipped")
             return
         if problem:
             raise UserError(f"{name}: line {number}", "", None, problem)

@@ -128,7 +128,7 @@ class VideoFile:
         parts.get_by_name(f"{_MARK}gate").set_property("drop", True)
         if not self._failed:
             self._failed = True
-            self._on_report(self._camera, f"no video is kept: {why}")
+            self._on_report(self._camera, f"video is not recorded: {why}")
 
     def _on_overrun(self, queue: Gst.Element) -> None:
         """From the stream's thread, when the queue is full for the first time."""

@@ -392,7 +392,7 @@ class Station:
         if not is_own:
             return
         if state and (missing := self._vehicle.cameras.keys() - state.cameras.keys()):
-            raise ValueError(f"cameras: {', '.join(sorted(missing))}: missing: the vehicle has another configuration")
+            raise ValueError(f"cameras: {', '.join(sorted(missing))}: missing: the vehicle's configuration differs")
         self._published = state
         self._signed_off = state is None
         if state:
@@ -460,7 +460,7 @@ class Station:
         """Report where the vehicle's configuration differs from this side's."""
         differences = agreement.differences(self._settings, read_settings(message.payload).settings)
         if differences and differences != self._differences:
-            self.note(f"the vehicle has another configuration: {differences}")
+            self.note(f"the vehicle's configuration differs: {differences}")
         self._differences = differences
 
     def _check_vehicle_name(self, now: float) -> None:
@@ -471,7 +471,7 @@ class Station:
         if self._vehicle.name not in self._vehicles:
             online = sorted(name for name, is_online in self._vehicles.items() if is_online)
             known = f"online: {', '.join(online)}" if online else "no vehicle is online"
-            self.note(f"the broker knows no vehicle named {self._vehicle.name}; {known}")
+            self.note(f"the broker has no vehicle named {self._vehicle.name}; {known}")
 
     def _on_reply(self, message: MqttMessage) -> None:
         reply = read_reply(message.payload)

@@ -23,6 +23,7 @@ from aiohttp.web_protocol import RequestHandler
 from runner.configuration.layout import NOWHERE, Layouts, Places, own_places
 from runner.core.events import Attention
 from runner.core.model import Camera, Vehicle, plain
+from runner.core.roles import DRIVER_EVENTS
 from runner.errors import ConfigError, RunError, UserError
 from runner.graph import video_codec
 from runner.h264.access_unit import AccessUnit, RecentUnits
@@ -44,7 +45,6 @@ from runner.system.reports import LimitedReports
 STATIC = Path(__file__).with_name("static")
 FROZEN_MS = 120  # a picture that is frozen for this long is marked within 150 ms
 NOTES = 50  # kept for pages that open later
-EVENTS = ("mode_selected", "total_set", "camera_switched", "roi_set", "camera_configured", "weights_set")
 REPORTED = tuple(attention.value for attention in Attention if attention is not Attention.ABSENT)  # by pages
 SEND_BUFFER_BYTES = 131_072  # small: a viewer that does not read is noticed here, not megabytes later
 START_S = 10.0  # the port is known to be free: only a stalled machine takes longer
@@ -508,10 +508,10 @@ class PageServer(Listener):
             self._call_soon(answer, outcome.result, outcome.reason)
 
         event = document.get("event")
-        if event in EVENTS:
+        if event in DRIVER_EVENTS:
             self._station.ask(document, on_reply)
         else:
-            answer("refused", f"event: {event!r}: must be one of {', '.join(EVENTS)}")
+            answer("refused", f"event: {event!r}: must be one of {', '.join(sorted(DRIVER_EVENTS))}")
 
     def _save_layout(self, document: dict[str, Any], answer: Callable[[str, str], None]) -> None:
         """Save a layout in its own thread: a hung disk must not stop the video."""

@@ -187,7 +187,7 @@ class Bridge:
         assert prediction
         if others := [name for name in nodes if name != prediction.node]:
             published = f"is published by {', '.join(others)}, must be by {prediction.node} alone"
-            self._report_publisher(f"{prediction.topic} {published}: predictions are left out", prediction.topic)
+            self._report_publisher(f"{prediction.topic} {published}: predictions are ignored", prediction.topic)
         return nodes == [prediction.node]
 
     def _on_request(self, text: str) -> None:

@@ -42,7 +42,7 @@ from runner.system.files import read_file, unfinished
 NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")  # as in MQTT topics; 64 is the longest common name of a certificate
 RESERVED = ("authority", "broker")
 ISSUED, AUTHORITY_KEY, LOCK = "issued.json", "authority.key", ".lock"
-SETTINGS = "mosquitto.conf"
+BROKER_SETTINGS = "mosquitto.conf"
 VALID = timedelta(days=365)
 ROUNDS = 101  # of PBKDF2; the passwords have 256 random bits
 
@@ -259,7 +259,7 @@ class Authority:
                 lines = (_password_line(name, keyring.mqtt_password(own)) for name, own in passwords.items())
                 _write(directory / PASSWORDS, "".join(lines).encode())
                 _write(directory / ACCESS, access_list((each.name, each.role) for each in holders).encode())
-                _write(directory / SETTINGS, broker_settings(self.installed).encode())
+                _write(directory / BROKER_SETTINGS, broker_settings(self.installed).encode())
 
     def _people(self, vehicle: str, holders: Sequence[Issued], secret: Mapping[str, bytes]) -> bytes:
         people = {

@@ -29,22 +29,22 @@ class LimitedReports:
         self._ends = float("-inf")  # of this period
         self._passed_on: set[str] = set()  # in this period
         self._of_peer: Counter[str] = Counter()  # number of these by peer
-        self._left_out = 0  # since the last text that was passed on in a new period
+        self._suppressed = 0  # since the last text that was passed on in a new period
 
     def __call__(self, text: str, peer: str) -> None:
-        text, left_out = text[:LONGEST], 0
+        text, suppressed = text[:LONGEST], 0
         with self._lock:
             if self._clock() >= self._ends:
                 self._ends = self._clock() + PERIOD_S
                 self._passed_on.clear()
                 self._of_peer.clear()
-                left_out, self._left_out = self._left_out, 0
+                suppressed, self._suppressed = self._suppressed, 0
             most = len(self._passed_on) >= MOST or self._of_peer[peer] >= MOST_OF_PEER
             if most or text in self._passed_on:
-                self._left_out += 1
+                self._suppressed += 1
                 return
             self._passed_on.add(text)
             self._of_peer[peer] += 1
-        if left_out:
-            self._on_report(f"{left_out} more such reports were left out before this one")
+        if suppressed:
+            self._on_report(f"{suppressed} similar reports were suppressed before this one")
         self._on_report(text)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from runner.core.roles import SETTINGS, Role, denial
+from runner.core.roles import DRIVER_EVENTS, Role, denial
 from runner.security.keyring import Keyring, Person, Watched
 
 
@@ -28,7 +28,7 @@ class Access:
             return None
         if why := denial(self._role(sender), event):
             return why
-        return f"{in_control} is in control" if event in SETTINGS and in_control not in ("", sender) else None
+        return f"{in_control} is in control" if event in DRIVER_EVENTS and in_control not in ("", sender) else None
 
     def may_control(self, operator: str) -> bool:
         return self._people is None or self._role(operator) is Role.CONTROLLER

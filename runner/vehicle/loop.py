@@ -392,7 +392,7 @@ class ControlLoop:
             self._attention_stated = (operator, t)
         if attention is not self._run.state.attention:
             self._take(AttentionChanged(t=t, attention=attention))
-            self.on_report(f"operator {operator} is {attention or 'no longer stating its attention'}")
+            self.on_report(f"operator {operator} is {attention or 'no longer reporting its attention'}")
 
     def _watch_operators(self, t: float) -> None:
         """Detect operators that have fallen silent, unless this loop itself has stalled."""

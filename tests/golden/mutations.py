@@ -1,7 +1,7 @@
 """Two hundred single mutations of packaged files, made from a seed, and what `validate` says of each.
 
-A mutation changes a key, the type of a value, a number, a name, an element, a property or the order of a list. Not each
-one is a mistake.
+Graphs and modes are mutated as they were before they inherited from each other. A mutation changes a key, the type of a
+value, a number, a name, an element, a property or the order of a list. Not each one is a mistake.
 """
 
 from __future__ import annotations

@@ -340,7 +340,7 @@ def test_an_unknown_vehicle_is_reported_with_the_known_ones(broker, vehicle):
     station.connect()
     try:
         until(lambda: station.take({}) is None and listener.notes, every_s=0.2)
-        assert listener.notes == ["the broker knows no vehicle named delivery_robott; online: delivery_robot"]
+        assert listener.notes == ["the broker has no vehicle named delivery_robott; online: delivery_robot"]
     finally:
         station.close()
 
@@ -348,7 +348,7 @@ def test_an_unknown_vehicle_is_reported_with_the_known_ones(broker, vehicle):
 def test_differences_between_both_sides_configurations_are_reported(broker, vehicle, ports):
     with process("operator", *ROBOT, *ports, "fps_max=10", "duration_s=4") as operator:
         output, _ = operator.communicate(timeout=60)
-    assert "the vehicle has another configuration: fps_max: 10 here, 15 on the vehicle" in " ".join(output.split())
+    assert "the vehicle's configuration differs: fps_max: 10 here, 15 on the vehicle" in " ".join(output.split())
 
 
 # --- rules of the user's own ------------------------------------------------------------------------------------------

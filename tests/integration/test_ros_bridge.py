@@ -214,7 +214,7 @@ def test_positions_and_predictions_of_one_named_node(ros, lines):
         # Its node is discovered a moment after its topic.
         until(lambda: [pqos.publish("/pqos/kbps", number=2345.0), predicted(reader) == 2345][-1], every_s=0.1)
         with ros.client("impostor") as other:
-            why = "is published by /impostor, must be by /pqos alone: predictions are left out"
+            why = "is published by /impostor, must be by /pqos alone: predictions are ignored"
             until(lambda: [other.publish("/pqos/kbps", number=9.0), matching(lines, why)][-1], every_s=0.1)
             asker = Operator(broker)
             assert asker.ask("x", event="mode_selected", mode="automatic")["result"] == "applied"

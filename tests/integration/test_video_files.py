@@ -221,7 +221,7 @@ def test_the_file_does_not_affect_the_stream(sides):
 def failed_files(sides):
     """Files that were reported as failed; the operator names cameras together if they fail alike."""
     reports = [line.partition(": ") for line in sides.reported]
-    return sum(len(cameras.split(", ")) for cameras, _, what in reports if what.startswith("no video is kept"))
+    return sum(len(cameras.split(", ")) for cameras, _, what in reports if what.startswith("video is not recorded"))
 
 
 def stream_continues(sides, camera="front"):
@@ -234,7 +234,7 @@ def stream_continues(sides, camera="front"):
         assert {c.rebuilt for c in received.values()} == {0}
         sides.resize(160, 90)
         until(lambda: operator.sample({})[camera].width == 160)
-    others = [line for line in sides.reported if "no video is kept" not in line and "pipeline stopped" not in line]
+    others = [line for line in sides.reported if "video is not recorded" not in line and "pipeline stopped" not in line]
     assert sorted(others) == [f"{name}: pipeline built" for name in CAMERAS]
 
 
@@ -284,7 +284,7 @@ def test_a_disk_that_stalls_does_not_delay_the_stream(tmp_path, monkeypatch):
             before = operator.sample({})["front"].frames
             until(lambda: operator.sample({})["front"].frames > before + 40)
             os.close(ends[0])  # the writers fail, and can be ended
-            until(lambda: any("no video is kept" in line for line in sides.reported))
+            until(lambda: any("video is not recorded" in line for line in sides.reported))
     finally:
         os.close(ends[1])
         sides.stop()

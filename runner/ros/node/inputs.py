@@ -54,7 +54,7 @@ class InputTopic:
             case _ if len(message.data) <= MAX_TEXT:
                 self._pass_on(text=message.data)
             case _:
-                self._port.report(f"a text is longer than {MAX_TEXT} characters and was left out", self.name)
+                self._port.report(f"dropped a text longer than {MAX_TEXT} characters", self.name)
 
     def _pass_on(self, **values: Any) -> None:
         self._port.send(self.kind, topic=self.name, **values)
