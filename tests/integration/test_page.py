@@ -36,7 +36,7 @@ from browser import (
     visit_again,
 )
 from rig import WAIT_S, answers, free_port, needs_browser, passes, process
-from runner.page.server import EVENTS
+from runner.core.roles import DRIVER_EVENTS
 
 pytestmark = [pytest.mark.gst, needs_browser]
 aiohttp = pytest.importorskip("aiohttp")
@@ -346,7 +346,7 @@ def test_invalid_requests_are_refused_with_a_reason(page):
         ({"event": "weights_set", "weights": {"rear_center": -1}}, "weights.rear_center: -1: must be at least 0"),
         (
             {"event": "operator_disconnected"},
-            f"event: 'operator_disconnected': must be one of {', '.join(EVENTS)}",
+            f"event: 'operator_disconnected': must be one of {', '.join(sorted(DRIVER_EVENTS))}",
         ),
     ]
     for event, reason in wrong:
