@@ -53,6 +53,13 @@ def test_pictures_come_as_they_were_written(bag, frames):
                 assert (rows(picture, 3) == frame).all()
 
 
+@pytest.mark.parametrize(("fps", "rate"), [(9.93, 10), (10.08, 10), (10.5, Fraction(21, 2)), (0.4, Fraction(2, 5))])
+def test_a_rate_close_to_a_whole_number_is_rounded(tmp_path, fps, rate):
+    made = camera_bag(tmp_path / "bag", "mcap", {"/image": [np.zeros((16, 16, 3), np.uint8)] * 11}, fps)
+    with Bag(made) as opened:
+        assert opened.form("/image").fps == rate
+
+
 def test_a_bag_without_ends_of_file_is_reported(bag, tmp_path):
     files = [bag] if bag.is_file() else [file for file in bag.iterdir() if file.suffix != ".yaml"]
     (file,) = files

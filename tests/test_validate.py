@@ -73,7 +73,9 @@ def test_all_files_of_a_user_are_checked_together(tod: Command, conf: UserConf) 
     conf.write("vehicel/x.yaml", "a: 1\n").write("foo.yaml", "a: 1\n").write("modes/y.yaml", "a: [\n")
     conf.write("cameras/front/x.yaml", "a: 1\n").write("camera/x.yaml", "a: 1\n").write("cameras.yaml", "a: 1\n")
     conf.write("cameras/foo.yml", "a: 1\n").write("graph/a,b.yaml", "a: 1\n").write("graph/true.yaml", "a: 1\n")
-    conf.write("source/empty.yaml", "").write(".github/x.yml", "a: 1\n").write("maps/opencv.yaml", "%YAML:1.0\n")
+    conf.write("source/empty.yaml", "").write(".github/x.yml", "a: 1\n").write("modes/.x.yaml", "a: [\n").write(
+        "maps/opencv.yaml", "%YAML:1.0\n"
+    )
     conf.change("cameras/top_view.yaml", {"fps: 30": "fsp: 30"})
     folder = f"would be ignored: must be in the folder of its group, one of {', '.join(GROUPS)}, or config.yaml"
     name = "could not be chosen: the name must be letters, digits, _ and -, and no number, true, false or null"

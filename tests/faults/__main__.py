@@ -115,7 +115,7 @@ FAULTS = [
     Fault("system/reports.py", "if most or text in self._passed_on:", "if text in self._passed_on:", "test_reports"),
     Fault("bag/pictures.py", "if size < step * height:", "if size < step * height - step:", "test_bag"),
     Fault("bag/__init__.py", "abs(measured - whole) <= ROUND * whole", "measured == whole", "test_bag"),
-    Fault("ros/inputs.py", "if other != camera:", "if False:", "test_ros_inputs"),
+    Fault("ros/inputs.py", "if other != camera:", "if False:", "test_ros_cameras"),
     Fault("metrics/prometheus.py", "if not is_own:", "if False:", "test_prometheus"),
     Fault(
         "graph.py",

@@ -372,7 +372,7 @@ def test_notice_a_late_picture(page, drive):
     by that is this picture certainly late.
     """
     sent, late_ms = drive.sent_kbps(), drive.vehicle.page.late_ms
-    held_ms = late_ms + 1000 / min(float(camera.kind.fps) for camera in drive.vehicle.cameras.values())
+    held_ms = late_ms + 1000 / min(float(camera.fps) for camera in drive.vehicle.cameras.values())
     assert sent > 0.5 * TOTAL_KBPS, "what is sent is less than what a full queue lasts for"
     drive.stall(2 * late_ms, 1.05 * sent)
     until(lambda: share(page, "front", AMBER) > 0.03)
