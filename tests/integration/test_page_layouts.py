@@ -380,6 +380,16 @@ def test_a_driver_is_warned_if_the_vehicle_has_another_operator_in_control(chrom
         server.on_state(replace(station.state, operator="anna"))
         until(page.locator("#attention").is_hidden)
         assert page.inner_text("#holder") == "You are in control"
+        before = tones(page)
+        server.on_state(station.state)  # names no operator: nothing from this station arrives any more
+        unheard = "the vehicle receives nothing from this station"
+        until(lambda: page.inner_text("#attention") == f"NOT IN CONTROL: {unheard}")
+        assert page.inner_text("#holder") == "You are not heard"
+        assert page.inner_text("#connection") == "✕ vehicle receives nothing"
+        assert f"CONTROL LOST: {unheard}" in page.inner_text("#toasts")
+        until(lambda: tones(page) >= before + 4)
+        viewing(page, "drive")
+        until(lambda: page.inner_text("#line").endswith("vehicle receives nothing"))
 
 
 def test_a_driver_is_alerted_to_a_picture_lost_in_a_monitor_only(chromium, picture, monkeypatch):

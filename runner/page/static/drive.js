@@ -1,10 +1,10 @@
 /** The Drive view's figures: what a driver must not miss. */
 
-import { inControl, listen, mode, ofVehicle, otherOperator, publish, store } from "./store.js";
+import { inControl, listen, mode, ofVehicle, publish, store } from "./store.js";
 import { worstOf } from "./ages.js";
 import { Attention } from "./attention.js";
 import { isGuided, nextChoice } from "./guides.js";
-import { holding, toggleControl } from "./header.js";
+import { holding, linkFault, toggleControl, whyNotHeeded } from "./header.js";
 import { withKey } from "./hints.js";
 import { reportAttention, showGuides } from "./link.js";
 import { monitored } from "./monitored.js";
@@ -71,9 +71,8 @@ function totalWords() {
 
 /** The state of the connection, or what limits the total. */
 function linkWords() {
-  if (!store.connected) return "no station";
-  if (!store.state) return "no state yet";
-  if (!store.state.online) return "vehicle offline";
+  const fault = linkFault();
+  if (fault) return fault;
   const reason = limitReasons().at(-1);
   return reason ? `limited: ${reason.slice(reason.indexOf(": ") + 2)}` : "connected";
 }
@@ -155,8 +154,8 @@ function updateAttention() {
 
 function warningText() {
   if (!inControl()) return holding.isLost ? withKey("CONTROL LOST: this page only watches; take control", "control") : null;
-  const other = otherOperator();
-  return [other && `NOT IN CONTROL: operator ${other} is in control`, attention.warning].filter(Boolean).join(" · ") || null;
+  const why = whyNotHeeded();
+  return [why && `NOT IN CONTROL: ${why}`, attention.warning].filter(Boolean).join(" · ") || null;
 }
 
 export function startDrive() {

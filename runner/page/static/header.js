@@ -4,7 +4,7 @@ import { inControl, listen, mode, otherOperator, publish, store } from "./store.
 import { pending, reportProblem, request, showProblem, whyNoControl } from "./requests.js";
 import { send } from "./link.js";
 import { withKey } from "./hints.js";
-import { Holding } from "./holding.js";
+import { Hearing, Holding } from "./holding.js";
 import { MOVING } from "./status.js";
 import { byId, displayName, setAttribute, setText, whole } from "./format.js";
 
@@ -12,12 +12,14 @@ const START_MS = 800; // no alarm while the page is opening
 const CLOCK_GRACE_MS = 2000;
 const UNKNOWN = "▲ Age of the pictures unknown: no capture times, or no answer from the vehicle's clock; LATE is not shown";
 const HOLDERS = { you: "You are in control", another: "Another page is in control", nobody: "Nobody is in control" };
+const UNHEARD = "the vehicle receives nothing from this station";
 
 let clockKnownAt = performance.now(); // when the clock offset was last known, or could not be measured
 
 let wasOperator = false; // whether the vehicle had this page's operator in control
 
 export const holding = new Holding();
+const hearing = new Hearing();
 const buttons = [...byId("modes").querySelectorAll("button")];
 
 /** Request another mode. The mode that the vehicle reports stays highlighted. */
@@ -40,6 +42,19 @@ function watchOperator() {
   const other = otherOperator();
   if (other && wasOperator) reportLoss(`operator ${other} is in control`);
   wasOperator = other === null;
+}
+
+function watchHearing() {
+  const isLost = hearing.update(store.connected ? store.state : null, performance.now());
+  if (isLost && inControl() && store.view !== "monitor") reportLoss(UNHEARD);
+  refreshControl();
+  refreshConnection();
+}
+
+/** Why this page does not control the vehicle, although it is in control of its station; null: it does. */
+export function whyNotHeeded() {
+  const other = otherOperator();
+  return other ? `operator ${other} is in control` : hearing.isLost ? UNHEARD : null;
 }
 
 function reportLoss(why) {
@@ -66,6 +81,7 @@ function refresh() {
   refreshModes();
   refreshControl();
   refreshBanner();
+  refreshConnection();
 }
 
 function refreshModes() {
@@ -83,8 +99,9 @@ function refreshModes() {
 function refreshControl() {
   const button = byId("take-control", HTMLButtonElement);
   const other = otherOperator();
-  setText(byId("holder"), !store.connected ? "" : other ? `Operator ${other} is in control` : HOLDERS[store.holder]);
-  setAttribute(byId("holder"), "data-holder", other ? "another" : store.holder);
+  const isUnheard = store.holder === "you" && hearing.isLost;
+  setText(byId("holder"), !store.connected ? "" : other ? `Operator ${other} is in control` : isUnheard ? "You are not heard" : HOLDERS[store.holder]);
+  setAttribute(byId("holder"), "data-holder", other || isUnheard ? "another" : store.holder);
   setText(button, store.holder === "you" ? "Release" : "Take control");
   button.classList.toggle("strong", store.connected && store.holder !== "you");
   button.disabled = !store.connected;
@@ -98,9 +115,19 @@ function refreshBanner() {
     : "NO CONNECTION TO THE STATION: video is not live; reconnecting";
   byId("banner").hidden = !isOffline;
   setText(byId("banner"), isOffline ? `✕ ${text}` : "");
-  const state = !store.connected ? "no station" : !store.state ? "no state yet" : isOffline ? "vehicle offline" : "connected";
-  setText(byId("connection"), `${state === "connected" ? "●" : "✕"} ${state}`);
-  setAttribute(byId("connection"), "data-state", state === "connected" ? "fine" : "bad");
+}
+
+/** What is wrong with the connection to the vehicle; null: nothing. */
+export function linkFault() {
+  if (!store.connected) return "no station";
+  if (!store.state) return "no state yet";
+  return !store.state.online ? "vehicle offline" : hearing.isLost ? "vehicle receives nothing" : null;
+}
+
+function refreshConnection() {
+  const fault = linkFault();
+  setText(byId("connection"), fault ? `✕ ${fault}` : "● connected");
+  setAttribute(byId("connection"), "data-state", fault ? "bad" : "fine");
 }
 
 /** Warn once the clock offset has been unknown for a while: measuring it takes time. */
@@ -147,6 +174,7 @@ export function startHeader() {
   byId("help-open").addEventListener("click", () => publish("help"));
   listen("control", onControl);
   listen("control state", watchOperator);
+  listen("state socket ages", watchHearing);
   listen("hello state control requests socket", refresh);
   listen("sample socket state", refreshTotals);
   listen("ages", refreshSkew);
