@@ -390,6 +390,13 @@ def test_a_driver_is_warned_if_the_vehicle_has_another_operator_in_control(chrom
         until(lambda: tones(page) >= before + 4)
         viewing(page, "drive")
         until(lambda: page.inner_text("#line").endswith("vehicle receives nothing"))
+        before = tones(page)
+        paused = {name: replace(camera, sending=False) for name, camera in station.state.cameras.items()}
+        server.on_state(replace(station.state, operator="anna", cameras=paused))
+        until(lambda: page.inner_text("#alarms") == "❚❚ PAUSED front, rear, mast")
+        assert page.inner_text("#worst-of") == "3 of 3 pictures not live"
+        until(lambda: tones(page) >= before + 4)
+        shot(page, "paused-drive")
 
 
 def test_a_driver_is_alerted_to_a_picture_lost_in_a_monitor_only(chromium, picture, monkeypatch):

@@ -14,7 +14,7 @@ function tones(...changes) {
 test("a stalled picture and a late one have different tones", () => {
   for (const status of ["lost", "frozen", "unsupported"]) assert.deepEqual(tones([0, status]), ["lost"]);
   for (const status of ["late", "damaged"]) assert.deepEqual(tones([0, status]), ["late"]);
-  for (const status of ["live", "synchronising", "off", "paused"]) assert.deepEqual(tones([0, status]), [null]);
+  for (const status of ["live", "synchronising", "off"]) assert.deepEqual(tones([0, status]), [null]);
 });
 
 test("a picture that fails again within two seconds triggers one tone", () => {
@@ -48,6 +48,16 @@ test("a picture that moves again damaged or late, and stalls again for good, sou
   }
 });
 
+test("a pause sounds like a stalled picture once it has lasted a second", () => {
+  const alarm = new Alarm();
+  assert.equal(alarm.due("front", "paused", 0), null);
+  assert.deepEqual([999, 1000, 5000].map((now) => alarm.overdue(now)), [null, "lost", null]);
+  assert.equal(alarm.due("front", "live", 6000), null);
+  assert.equal(alarm.due("front", "paused", 9000), null);
+  assert.equal(alarm.due("front", "live", 9900), null);
+  assert.equal(alarm.overdue(20_000), null);
+});
+
 test("a picture that recovers again, or never did, sounds no more", () => {
   for (const changes of [[[200, "live"], [420, "frozen"], [900, "live"]], [[900, "lost"]]]) {
     const alarm = new Alarm();
@@ -70,5 +80,5 @@ test("a late picture does not mask a stalled one, but is masked by it", () => {
 });
 
 test("a driver who takes control hears of the worst picture", () => {
-  assert.deepEqual([["live", "late"], ["late", "frozen"], ["unsupported"], ["live", "off"], []].map(worstKind), ["late", "lost", "lost", null, null]);
+  assert.deepEqual([["live", "late"], ["late", "frozen"], ["unsupported"], ["late", "paused"], ["live", "off"], []].map(worstKind), ["late", "lost", "lost", "lost", null, null]);
 });

@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { beforeEach, test } from "node:test";
 
-import { camera, decisionOf, enlarge, inControl, listen, mode, note, onStationMessage, select, store } from "../../runner/page/static/store.js";
+import { alertStatus, camera, decisionOf, enlarge, inControl, listen, mode, note, onStationMessage, select, store } from "../../runner/page/static/store.js";
 
 const HELLO = { kind: "hello", vehicle: "robot", cameras: [{ name: "front" }, { name: "rear" }] };
 const STATE = { kind: "state", online: true, mode: "single", cameras: { front: { kbps: 500 } } };
@@ -64,6 +64,19 @@ test("every message reaches the listeners of its kind", () => {
   onStationMessage(STATE);
   onStationMessage({ kind: "control", holder: "you" });
   assert.deepEqual(published.map(({ kind }) => kind), ["state", "control"]);
+});
+
+test("a pause alerts the driver unless nobody drives, or the camera has no weight", () => {
+  const paused = { on: true, sending: false, weight: 1 };
+  const state = (chosen) => ({ ...STATE, mode: chosen, cameras: { front: paused, rear: { ...paused, weight: 0 } } });
+  const alerts = () => ["front", "rear"].map((name) => alertStatus(name, "paused"));
+  onStationMessage(state("automatic"));
+  assert.deepEqual(alerts(), ["off", "off"]);
+  onStationMessage({ kind: "control", holder: "another" });
+  assert.deepEqual(alerts(), ["paused", "off"]);
+  onStationMessage(state("single"));
+  assert.deepEqual(alerts(), ["paused", "paused"]);
+  assert.equal(alertStatus("front", "lost"), "lost");
 });
 
 test("control requires a connection", () => {

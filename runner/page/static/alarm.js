@@ -2,7 +2,8 @@
 
 const TOGETHER_MS = 1000; // a link that fails takes eight pictures with it: one tone
 const REPEAT_MS = 2000; // a picture that flickers does not sound each time
-const KINDS = { lost: "lost", frozen: "lost", unsupported: "lost", late: "late", damaged: "late" };
+const PAUSED_MS = 1000; // a shorter pause, as until a vehicle hears of its operator, does not sound
+const KINDS = { lost: "lost", frozen: "lost", unsupported: "lost", paused: "lost", late: "late", damaged: "late" };
 const never = () => ({ lost: -Infinity, late: -Infinity });
 /**
  * @typedef {object} Sounded what was sounded of a camera
@@ -10,7 +11,8 @@ const never = () => ({ lost: -Infinity, late: -Infinity });
  * @property {number} late
  * @property {boolean} recovered whether there was no reason for a tone since
  * @property {boolean} moved whether it has moved since its last tone for standing still
- * @property {"lost"|"late"|null} waiting kind of its present status, if that came too soon after a tone to sound
+ * @property {"lost"|"late"|null} waiting kind of its present status, if that came too soon to sound
+ * @property {number} earliest when it may sound
  */
 
 /** The tone for the worst of these statuses; null: none is needed. @param {string[]} statuses @returns {"lost"|"late"|null} */
@@ -35,11 +37,15 @@ export class Alarm {
    */
   due(camera, status, now) {
     const kind = KINDS[status];
-    const own = (this.#ofCamera[camera] ??= { ...never(), recovered: false, moved: false, waiting: null });
-    own.waiting = null;
+    const own = (this.#ofCamera[camera] ??= { ...never(), recovered: false, moved: false, waiting: null, earliest: 0 });
+    Object.assign(own, { waiting: null, earliest: status === "paused" ? now + PAUSED_MS : now });
     own.recovered ||= !kind;
     own.moved ||= kind !== "lost";
     if (!kind) return null;
+    if (status === "paused") {
+      own.waiting = kind;
+      return null;
+    }
     if (now - latest(own, kind) < REPEAT_MS) {
       if (own.recovered || (kind === "lost" && own.moved)) own.waiting = kind;
       return null;
@@ -47,9 +53,9 @@ export class Alarm {
     return this.#sound(own, kind, now);
   }
 
-  /** The tone of a picture that failed again too soon to sound, and has not recovered since; to be called a few times a second. @param {number} now */
+  /** The tone of a picture that failed or was paused too soon to sound, and has not recovered since; to be called a few times a second. @param {number} now */
   overdue(now) {
-    const due = Object.values(this.#ofCamera).filter((own) => own.waiting && now - latest(own, own.waiting) >= REPEAT_MS);
+    const due = Object.values(this.#ofCamera).filter((own) => own.waiting && now >= own.earliest && now - latest(own, own.waiting) >= REPEAT_MS);
     const tones = due.map((own) => this.#sound(own, own.waiting ?? "late", now));
     return tones.includes("lost") ? "lost" : tones.includes("late") ? "late" : null;
   }

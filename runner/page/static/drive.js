@@ -1,6 +1,6 @@
 /** The Drive view's figures: what a driver must not miss. */
 
-import { inControl, listen, mode, ofVehicle, publish, store } from "./store.js";
+import { alertStatus, inControl, listen, mode, ofVehicle, publish, store } from "./store.js";
 import { worstOf } from "./ages.js";
 import { Attention } from "./attention.js";
 import { isGuided, nextChoice } from "./guides.js";
@@ -10,13 +10,13 @@ import { reportAttention, showGuides } from "./link.js";
 import { monitored } from "./monitored.js";
 import { showProblem } from "./requests.js";
 import { SHAPES } from "./tiles.js";
-import { limitReasons } from "./total.js";
+import { limitReasons, pauseReason } from "./total.js";
 import { byId, displayName, latency, setAttribute, setText, whole } from "./format.js";
 
 const MODES = { single: "Single", automatic: "Automatic", collective: "Collective" };
-const ALARMS = ["lost", "frozen", "unsupported", "damaged", "late"]; // the worst first
+const ALARMS = ["lost", "frozen", "unsupported", "paused", "damaged", "late"]; // the worst first
 const WORDS = { unsupported: "NO PICTURE" };
-const STALLED = ["lost", "frozen", "unsupported"];
+const STALLED = ["lost", "frozen", "unsupported", "paused"];
 const KMH = 3.6; // of 1 m/s
 const GUIDES = "tod-guides";
 const SETTLED_MS = 2500; // by then, pictures skipped while hidden no longer count
@@ -47,7 +47,7 @@ function refresh() {
 /** The worst latency of all pictures. A stalled picture has none, and is worse than any. */
 function refreshLatency() {
   const { camera, age_ms, bound_ms, level } = worstOf(store.ages, store.status, store.hello?.late_ms ?? 0);
-  const stalled = names().filter((name) => STALLED.includes(store.status[name]));
+  const stalled = names().filter((name) => STALLED.includes(alertStatus(name)));
   const from = camera === null ? "no moving picture" : `${level === "unknown" ? "unknown" : "worst"}: ${displayName(camera)}`;
   setAttribute(byId("latency"), "data-level", stalled.length ? "late" : level);
   setText(byId("worst"), latency(age_ms, bound_ms));
@@ -69,11 +69,12 @@ function totalWords() {
   return `${whole(total_kbps)}${isLimited ? ` of ${whole(asked_kbps)}` : ""} kbit/s`;
 }
 
-/** The state of the connection, or what limits the total. */
+/** The state of the connection, why nothing is sent, or what limits the total. */
 function linkWords() {
   const fault = linkFault();
   if (fault) return fault;
-  const reason = limitReasons().at(-1);
+  const [pause, reason] = [pauseReason(), limitReasons().at(-1)];
+  if (pause) return pause;
   return reason ? `limited: ${reason.slice(reason.indexOf(": ") + 2)}` : "connected";
 }
 
@@ -95,8 +96,8 @@ function showAlarms(element, cameras) {
 
 /** The pictures of a status: the page's of these cameras, and those in monitors of cameras whose picture on the page has another one. */
 function picturesOf(status, cameras) {
-  const own = cameras.filter((name) => store.status[name] === status);
-  const others = monitored().filter((other) => other.status === status && store.status[other.camera] !== status);
+  const own = cameras.filter((name) => alertStatus(name) === status);
+  const others = monitored().filter((other) => alertStatus(other.camera, other.status) === status && store.status[other.camera] !== status);
   const inMonitors = new Set(others.map(({ camera }) => displayName(camera)));
   return [...own.map(displayName), ...[...inMonitors].map((name) => `${name} (monitor)`)];
 }

@@ -52,7 +52,7 @@ function onSilent(id, cameras) {
 }
 
 /** `picture` tells apart pictures of the same camera. */
-const publishStatus = (id, camera, status) => publish("monitored", { picture: `${camera} ${id}`, status });
+const publishStatus = (id, camera, status) => publish("monitored", { picture: `${camera} ${id}`, camera, status });
 
 export function startMonitored() {
   if (globalThis.boot.shown) {

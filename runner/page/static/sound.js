@@ -3,7 +3,7 @@
  * the one that takes control; until then, and while muted, the page shows it.
  */
 
-import { listen, publish, store } from "./store.js";
+import { alertStatus, listen, publish, store } from "./store.js";
 import { Alarm, worstKind } from "./alarm.js";
 import { monitored } from "./monitored.js";
 import { withKey } from "./hints.js";
@@ -67,11 +67,11 @@ function sound(kind) {
 
 /** Sound for the worst picture, which may have gone wrong before this page had control. */
 const soundCurrent = () => isDriving && sound(currentKind());
-const currentKind = () => worstKind([...Object.values(store.status), ...monitored().map(({ status }) => status)]);
+const currentKind = () => worstKind([...Object.keys(store.status).map((name) => alertStatus(name)), ...monitored().map(({ camera, status }) => alertStatus(camera, status))]);
 
-/** @param {string} picture  @param {string} status */
-function onStatus(picture, status) {
-  const kind = alarm.due(picture, status, performance.now());
+/** @param {string} picture  @param {string} camera  @param {string} status */
+function onStatus(picture, camera, status) {
+  const kind = alarm.due(picture, alertStatus(camera, status), performance.now());
   if (isDriving) sound(kind);
 }
 
@@ -109,8 +109,8 @@ export function startSound() {
   for (const kind of ["pointerup", "keydown"]) addEventListener(kind, onPress, true);
   listen("control", onControl);
   listen("hello", refresh);
-  listen("status", ({ camera, status }) => onStatus(camera, status));
-  listen("monitored", ({ picture, status }) => onStatus(picture, status));
+  listen("status", ({ camera, status }) => onStatus(camera, camera, status));
+  listen("monitored", ({ picture, camera, status }) => onStatus(picture, camera, status));
   listen("deposed unseen", () => sound("lost"));
   addEventListener("storage", refresh); // muted in another window
   setInterval(() => {

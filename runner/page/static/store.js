@@ -175,6 +175,15 @@ export function otherOperator() {
   return own && operator && operator !== own ? operator : null;
 }
 
+/**
+ * A camera's status as far as the driver must be alerted to it: pauses while nobody drives, and those by a weight of 0, are intended.
+ * @param {string} name  @param {string|undefined} status of its picture
+ */
+export function alertStatus(name, status = store.status[name]) {
+  const isUnshared = mode() !== "single" && decisionOf(name)?.weight === 0;
+  return status === "paused" && (store.holder === "nobody" || isUnshared) ? "off" : status;
+}
+
 /** Select a camera in all windows of this page. */
 export function select(name) {
   if (!camera(name) || store.selected === name) return;

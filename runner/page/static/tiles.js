@@ -1,6 +1,6 @@
 /** The tiles: one per camera, with its status, its picture and the values of its stream. */
 
-import { camera, decisionOf, enlarge, inControl, listen, publish, select, store } from "./store.js";
+import { alertStatus, camera, decisionOf, enlarge, inControl, listen, publish, select, store } from "./store.js";
 import { drawFirst, reportSize, transferCanvas } from "./link.js";
 import { pending, request, whyNoControl } from "./requests.js";
 import { dragRegion, shownRegion } from "./roi.js";
@@ -18,7 +18,7 @@ import { announce, byId, displayName, factor, latency, make, setAttribute, setTe
 
 export const SHAPES = { live: "●", late: "▲", damaged: "◪", frozen: "■", lost: "✕", off: "○", paused: "❚❚", synchronising: "◌", unsupported: "⊘" };
 const SHORT = { synchronising: "SYNC", unsupported: "NO PICTURE" }; // the overlay has the full word
-const ALARMS = ["late", "damaged", "frozen", "lost", "unsupported"];
+const ALARMS = ["late", "damaged", "frozen", "lost", "paused", "unsupported"];
 const SILENT = ["lost", "off", "paused"]; // no frames arrive: the last values are out of date
 export const STALE = [...SILENT, "frozen"]; // the displayed picture is older than when it was drawn
 const THIN = "\u2009"; // space
@@ -315,7 +315,7 @@ function onStatus({ camera: name, status }) {
   if (!part) return;
   refreshStatus(name, part);
   refreshCaption(name, part);
-  if (ALARMS.includes(status)) announce(`${displayName(name)} ${SHORT[status] ?? status} ${store.refused[name] ?? ""}`);
+  if (ALARMS.includes(alertStatus(name, status))) announce(`${displayName(name)} ${SHORT[status] ?? status} ${store.refused[name] ?? ""}`);
 }
 
 export function startTiles() {

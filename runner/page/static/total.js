@@ -56,10 +56,15 @@ function refresh() {
   slider.update({ value: wanted, max: maxTotal(), why: reason });
 }
 
-/** Why the total is limited: the parts of the reason that concern all cameras. */
-export function limitReasons() {
+/** Why the total is limited. */
+export const limitReasons = () => commonReasons("total ");
+/** Why no camera is sent; undefined: no rule stops them. */
+export const pauseReason = () => commonReasons("not sending: ").at(-1);
+
+/** The parts of the reason that concern all cameras. @param {string} beginning */
+function commonReasons(beginning) {
   const [camera] = Object.values(store.state?.cameras ?? {}).filter(({ on }) => on);
-  return camera?.reason.split("; ").filter((part) => part.startsWith("total ")) ?? [];
+  return camera?.reason.split("; ").filter((part) => part.startsWith(beginning)) ?? [];
 }
 
 export function startTotal() {
