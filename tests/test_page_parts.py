@@ -452,7 +452,7 @@ def test_a_monitor_shares_selection_and_control_with_the_page_in_its_browser():
             ("front_left", 0),
             ("rear_center", 3),
         ]
-        await received(monitor, "control", holder="nobody")  # and it does not take control that is free
+        await received(monitor, "control", holder="nobody", abandoned=False)  # it does not take control that is free
         page = await windows.open("driver", "here")
         assert (await received(page, "hello"))["selected"] is None
         await received(page, "control", holder="you")
@@ -487,8 +487,12 @@ def test_a_monitor_shares_selection_and_control_with_the_page_in_its_browser():
         await received(monitor, "control", holder="another")
         await page.send_json({"take_control": True})
         await received(monitor, "control", holder="you")
+        await page.send_json({"release_control": True})
+        await received(monitor, "control", holder="nobody", abandoned=False)
+        await page.send_json({"take_control": True})
+        await received(monitor, "control", holder="you")
         await page.close()
-        await received(monitor, "control", holder="nobody")
+        await received(monitor, "control", holder="nobody", abandoned=True)
         await monitor.send_json(request)
         await received(monitor, "reply", reason="this page does not hold control; take it first")
 

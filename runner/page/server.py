@@ -425,13 +425,18 @@ class PageServer(Listener):
         return [other for other in self._viewers if other is not viewer and self._page_of(other) == page]
 
     def _broadcast_control(self) -> None:
-        """Send each viewer the holder of control, and whether another window of its page has the focus or is hidden."""
+        """Send each viewer the holder of control, and whether another window of its page has the focus or is hidden.
+
+        abandoned  nobody is in control because the page that was has closed
+        """
         for viewer in self._viewers:
             others = self._others(viewer)
             elsewhere = any(other.focused for other in others)
             covered = any(other.attention is Attention.HIDDEN for other in others)
             holder = self._control.holder_for(self._page_of(viewer))
-            viewer.post("control", {"holder": holder, "elsewhere": elsewhere, "covered": covered})
+            abandoned = holder == "nobody" and self._control.is_held
+            message = {"holder": holder, "abandoned": abandoned, "elsewhere": elsewhere, "covered": covered}
+            viewer.post("control", message)
         self._report_attention()
 
     def _report_attention(self) -> None:

@@ -444,6 +444,12 @@ def test_a_driver_is_alerted_to_a_monitor_that_crashed(chromium, picture):
         monitor.evaluate("BroadcastChannel.prototype.postMessage = () => {}")  # all that the page sees of a crash
         until(lambda: "a monitor no longer responds: reload it" in page.inner_text("#toasts"))
         until(lambda: tones(page) >= before + 4)
+        for holder in ("nobody", "you"):
+            page.keyboard.press("t")
+            until(lambda holder=holder: monitor.evaluate("tod.control") == holder)
+            assert "CONTROL LOST" not in monitor.inner_text("#attention"), "the driver has released it"
+        page.close()
+        until(lambda: monitor.inner_text("#attention") == "CONTROL LOST: the page of this monitor is closed")
 
 
 def test_keys_act_on_the_cameras_after_a_button_was_clicked(chromium, picture):
@@ -678,7 +684,7 @@ def test_monitors_share_selection_control_and_attention_with_their_page(chromium
         until(lambda: page.inner_text("#attention") == "HIDDEN: another window of this page cannot be seen")
         with opened(chromium, server.url) as other:
             take_control(other)
-            until(lambda: monitor.evaluate("tod.control") == "another")
+            until(lambda: monitor.inner_text("#attention") == "CONTROL LOST: take control on the page of this monitor")
             until(lambda: page.evaluate("tod.control") == "another")
             until(lambda: station.attention in ("watching", "unfocused"))
         take_control(page)

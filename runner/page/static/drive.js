@@ -154,9 +154,14 @@ function updateAttention() {
 }
 
 function warningText() {
-  if (!inControl()) return holding.isLost ? withKey("CONTROL LOST: this page only watches; take control", "control") : null;
+  if (!inControl()) return holding.isLost ? `CONTROL LOST: ${lossWords()}` : null;
   const why = whyNotHeeded();
   return [why && `NOT IN CONTROL: ${why}`, attention.warning].filter(Boolean).join(" · ") || null;
+}
+
+function lossWords() {
+  if (store.view !== "monitor") return withKey("this page only watches; take control", "control");
+  return store.abandoned ? "the page of this monitor is closed" : "take control on the page of this monitor";
 }
 
 export function startDrive() {

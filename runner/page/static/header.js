@@ -28,9 +28,9 @@ export function selectMode(selected) {
   request("mode", { event: "mode_selected", mode: selected }, `mode ${selected}`);
 }
 
-/** This page has lost control without releasing it: the driver must know, and other pages may drive. */
+/** This page has lost control without releasing it: the driver must know, and other pages may drive. A monitor shares its page's control. */
 function onControl() {
-  if (store.view === "monitor") return;
+  if (store.view === "monitor" && store.holder === "nobody" && !store.abandoned) holding.onRelease(); // its page has released it
   const isLost = holding.update(store.holder);
   if (holding.isReleasing) send({ release_control: true }); // the first one may have been lost with its connection
   if (isLost) reportLoss(HOLDERS[store.holder].toLowerCase());

@@ -75,6 +75,7 @@ const listeners = new Map();
  * @property {State|null} state
  * @property {Sample|null} sample
  * @property {string} holder
+ * @property {boolean} abandoned
  * @property {boolean} elsewhere
  * @property {boolean} covered
  * @property {boolean} connected
@@ -96,6 +97,7 @@ export const store = {
   state: null,
   sample: null,
   holder: "nobody",
+  abandoned: false, // whether nobody is in control because the page that was has closed
   elsewhere: false, // whether another window of this page has the keyboard focus
   covered: false, // whether another window of this page is hidden
   connected: false,
@@ -128,13 +130,17 @@ export function onStationMessage(message) {
   const { kind } = message;
   if (kind === "hello") onHello(message);
   else if (kind === "state" || kind === "sample") store[kind] = message;
-  else if (kind === "control") Object.assign(store, { holder: message.holder, elsewhere: message.elsewhere, covered: message.covered });
+  else if (kind === "control") onControl(message);
   else if (kind === "layout" && store.hello) store.hello.layout = message;
   else if (kind === "selection") return setSelected(message.camera);
   else if (kind === "history") onHistory(message);
   else if (kind === "note") return note({ ...message, own: false });
   if (kind === "sample") appendSample(message);
   publish(kind, message);
+}
+
+function onControl({ holder, abandoned, elsewhere, covered }) {
+  Object.assign(store, { holder, abandoned, elsewhere, covered });
 }
 
 function onHello(message) {
