@@ -25,6 +25,7 @@ export class GroundView {
   /** @type {{picture: string, frames: string, lines: string}} */
   drawn = { picture: "", frames: "", lines: "" }; // what the canvases show
   count = 0; // of the pictures drawn
+  session = 0; // counts how often it was hidden or got other cameras: what was ordered before is not on the screen
   /** @type {string[]} */
   drawn_labels = []; // labels of the cameras when the displayed picture was drawn
   why = ""; // why it cannot be drawn any more, for the operator
@@ -63,6 +64,7 @@ export class GroundView {
    * @param {Stream[]} streams  @param {Dimensions|null} dimensions
    */
   setCameras(streams, dimensions) {
+    this.session++;
     for (const layer of this.layers) layer.dispose();
     Object.assign(this, { streams: dimensions ? streams : [], dimensions, layers: [], sights: [], shared_regions: "", drawn_labels: [], drawn: { picture: "", frames: "", lines: "" } });
     this.updateStreams();
@@ -73,11 +75,12 @@ export class GroundView {
     Object.assign(this, { shown, display, drawn_labels: [], drawn: { picture: "", frames: "", lines: "" } });
     this.updateStreams();
     if (this.isOn()) this.draw();
-    else this.clear();
+    else this.hide();
   }
 
   /** Otherwise a stale picture would appear when it is shown again. */
-  clear() {
+  hide() {
+    this.session++;
     if (this.warp && !this.why) this.order({ width: 1, height: 1 }, { x: 0, y: 0, width: 1, height: 1 }, []);
     this.context?.reset();
   }
@@ -128,14 +131,14 @@ export class GroundView {
     this.order(size, extents, seen.map((each, i) => ({ ...each, layer: layers[i] })));
   }
 
-  /** Have a picture drawn, and tell its cameras once it is on the screen. */
+  /** Have a picture drawn, and tell its cameras once it is on the screen, perhaps in a box that has changed meanwhile. */
   async order(size, extents, parts) {
-    const { drawn, warp, streams } = this;
+    const { drawn, session, warp, streams } = this;
     try {
       await warp?.draw(size, extents, parts);
       this.count++;
-      if (drawn !== this.drawn) return; // another box or other cameras since
-      this.drawn_labels = parts.map(({ label }) => label);
+      if (session !== this.session) return;
+      if (drawn === this.drawn) this.drawn_labels = parts.map(({ label }) => label);
       for (const [i, { newest, picture }] of parts.entries()) streams[i].onComposed(newest, picture !== null, warp?.fps ?? Infinity);
     } catch (error) {
       const why = error instanceof Error ? error.message : String(error);

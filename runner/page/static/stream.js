@@ -41,6 +41,7 @@ const BT709 = { primaries: "bt709", transfer: "bt709", matrix: "bt709", fullRang
 export class Stream {
   arrived = now(); // page times of the newest unit and of the newest picture to draw, or of the start of the stream
   decoded = this.arrived;
+  ready_at = this.arrived; // page time when the newest picture was decoded
   drawn = false;
   waits_since = this.arrived; // since when pictures arrive and none is drawn
   /** @type {number|null} */
@@ -301,7 +302,8 @@ export class Stream {
     if (decoder !== this.decoder || meta.timestamp < (this.waiting?.meta.timestamp ?? 0)) return picture.close();
     this.waiting?.picture.close();
     this.waiting = { picture, meta };
-    if (!this.straight && !this.isOnlyInBirdseye) this.decoded = now(); // a picture that cannot be drawn does not count: the display stays frozen
+    this.ready_at = now();
+    if (this.countsDecoded) this.decoded = this.ready_at;
     this.station.wake();
   }
 
@@ -401,7 +403,7 @@ export class Stream {
   async straighten(on) {
     if (on === Boolean(this.straight)) return;
     this.straight?.dispose();
-    this.straight = on ? new StraightView(this.camera) : null;
+    this.changeView(() => (this.straight = on ? new StraightView(this.camera) : null));
     this.guides?.setOptics(on ? straightOptics(this.camera) : this.camera);
     if (on && this.shown) await this.straightenPicture(this.shown); // a stalled picture has no successor
     this.painted_text = null; // repaint at the next tick
@@ -422,10 +424,28 @@ export class Stream {
     return this.isInBirdseye && !this.display.width;
   }
 
+  /** Whether a picture counts once it is decoded; otherwise only once it is straightened or composed: one that cannot be drawn leaves the display frozen. */
+  get countsDecoded() {
+    return !this.straight && !this.isOnlyInBirdseye;
+  }
+
+  /** Change what shows the pictures. Those that count once they are decoded again do so from the newest one on: the last drawing may be older. @param {() => void} change */
+  changeView(change) {
+    const before = this.countsDecoded;
+    change();
+    if (this.countsDecoded && !before) this.decoded = Math.max(this.decoded, this.ready_at);
+  }
+
   /** Start or end being a part of the bird's-eye view. @param {boolean} shown */
   setInBirdseye(shown) {
     if (shown && !this.isInBirdseye) this.composed_at = -Infinity;
-    this.isInBirdseye = shown;
+    this.changeView(() => (this.isInBirdseye = shown));
+  }
+
+  /** Show the picture in a box of another size; 0: it is hidden. */
+  setDisplay(display) {
+    this.changeView(() => (this.display = display));
+    this.painted_text = null;
   }
 
   /**

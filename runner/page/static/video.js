@@ -292,11 +292,7 @@ const orders = {
   },
   ground: ({ picture, lines }) => ground.attach(picture, lines),
   above: ({ shown, width, height, ratio }) => ground.show({ shown, width, height, ratio }),
-  size({ name, ...display }) {
-    const stream = find(name);
-    if (!stream) return;
-    Object.assign(stream, { display, painted_text: null });
-  },
+  size: ({ name, ...display }) => find(name)?.setDisplay(display),
   send: ({ message }) => toPage({ kind: "sent", id: message.id, sent: send(message) }),
   async ask({ id, what, name }) {
     const questions = { measure, guides: () => find(name)?.guideLines(), ground: () => ground.measure(), stages: allStages, picture: () => find(name)?.picture(), first: () => find(name)?.first };

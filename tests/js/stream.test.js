@@ -1,0 +1,87 @@
+/** When the picture of a camera of 40 Hz counts as frozen, as the bird's-eye view and straightening begin and end without a GPU. */
+
+import assert from "node:assert/strict";
+import { test } from "node:test";
+
+import { Clock, now } from "../../runner/page/static/clock.js";
+import { GroundView } from "../../runner/page/static/ground_view.js";
+import { judge } from "../../runner/page/static/status.js";
+import { Stream } from "../../runner/page/static/stream.js";
+import { WHOLE } from "../../runner/page/static/framing.js";
+
+const FPS = 40;
+const SLOW = 5; // pictures a second, of WebGL without a GPU
+const CAMERA = { name: "top", index: 0, width: 640, height: 360, fps: FPS, codec: "h264", pose: null, wave_s: 1.5 };
+const LIMITS = { late_ms: 200, frozen_ms: 120 };
+const BOX = { width: 640, height: 360, ratio: 1, view: WHOLE };
+const HIDDEN = { ...BOX, width: 0, height: 0 };
+const straight = () => /** @type {any} */ ({ dispose() {}, warp: { fps: SLOW, isDue: false } });
+
+/** A stream whose picture was last drawn, by the bird's-eye view or straightened, 230 ms ago. */
+function slowStream(more = {}, decoded_ms = 20) {
+  const stream = new Stream(CAMERA, { clock: new Clock(), limits: LIMITS, connected: true, online: true, bound: NaN, video: true, dimensions: null, onMark() {}, wake() {} });
+  const composed_at = now() - 250;
+  Object.assign(stream, { on: true, sending: true, drawn: true, composed_at, composed_fps: SLOW, ...more });
+  Object.assign(stream, { arrived: now() - decoded_ms, decoded: now() - 230, ready_at: now() - decoded_ms });
+  return stream;
+}
+const statusOf = (stream) => judge(stream.times(), LIMITS, now());
+
+test("a picture that moves is live before and after its camera leaves the bird's-eye view", () => {
+  const stream = slowStream({ isInBirdseye: true, display: HIDDEN });
+  assert.equal(statusOf(stream), "live");
+  stream.setInBirdseye(false);
+  assert.equal(statusOf(stream), "live");
+});
+
+test("or its tile is shown beside it", () => {
+  const stream = slowStream({ isInBirdseye: true, display: HIDDEN });
+  stream.setDisplay(BOX);
+  assert.equal(statusOf(stream), "live");
+});
+
+test("or it is no longer straightened", () => {
+  const stream = slowStream({ straight: straight(), display: BOX });
+  assert.equal(statusOf(stream), "live");
+  stream.straighten(false);
+  assert.equal(statusOf(stream), "live");
+});
+
+test("a picture that stands still is frozen at once", () => {
+  const stream = slowStream({ isInBirdseye: true, display: HIDDEN }, 200);
+  stream.setInBirdseye(false);
+  assert.equal(statusOf(stream), "frozen");
+});
+
+/** A bird's-eye view of one camera whose drawing ends later: it, the pictures that were composed, and the drawing's end. */
+function composing() {
+  const view = new GroundView(/** @type {any} */ ({ angleAt: () => null }), assert.fail);
+  const composed = [];
+  let resolve = () => {};
+  const drawing = new Promise((done) => (resolve = () => done(null)));
+  view.warp = /** @type {any} */ ({ fps: SLOW, draw: () => drawing });
+  view.streams = /** @type {any} */ ([{ setInBirdseye() {}, onComposed: (one) => composed.push(one) }]);
+  view.show({ shown: true, width: 400, height: 300, ratio: 1 });
+  const ordered = view.order({ width: 400, height: 300 }, {}, [{ newest: "picture", picture: null, label: "" }]);
+  return { view, composed, end: () => (resolve(), ordered) };
+}
+
+test("a composition under way counts although the box changes, but not once the view was hidden or has other cameras", async () => {
+  const changes = {
+    box: (view) => view.show({ shown: true, width: 800, height: 600, ratio: 1 }),
+    hidden: (view) => {
+      view.warp.draw = () => new Promise(() => {});
+      view.show({ shown: false, width: 0, height: 0, ratio: 1 });
+      view.show({ shown: true, width: 400, height: 300, ratio: 1 });
+    },
+    cameras: (view) => view.setCameras([], null),
+  };
+  const counted = {};
+  for (const [name, change] of Object.entries(changes)) {
+    const { view, composed, end } = composing();
+    change(view);
+    await end();
+    counted[name] = composed.length;
+  }
+  assert.deepEqual(counted, { box: 1, hidden: 0, cameras: 0 });
+});
