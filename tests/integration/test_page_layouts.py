@@ -418,6 +418,7 @@ def test_a_driver_is_alerted_to_a_picture_lost_in_a_monitor_only(chromium, pictu
         before = tones(page)
         withheld.add(2)
         until(lambda: page.inner_text("#alarms") == "✕ LOST mast (monitor)")
+        assert page.inner_text("#worst-of") == "1 of 3 pictures not live"
         until(lambda: tones(page) >= before + 4)
         page.bring_to_front()
         shot(page, "lost-in-a-monitor")

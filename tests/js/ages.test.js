@@ -48,28 +48,34 @@ test("the skew is between moving pictures only", () => {
 });
 
 const age = (age_ms, bound_ms = 5) => ({ age_ms, bound_ms });
+const worst = (ages, statuses, late_ms) => worstOf(Object.entries(ages).map(([camera, of]) => ({ camera, status: statuses[camera], ...of })), late_ms);
 const live = (...names) => Object.fromEntries(names.map((name) => [name, "live"]));
 
 test("the worst latency includes the error bound of the clocks", () => {
   const ages = { front: age(90, 5), rear: age(80, 30) };
-  assert.deepEqual(worstOf(ages, live("front", "rear"), 200), { camera: "rear", age_ms: 80, bound_ms: 30, level: "fine" });
+  assert.deepEqual(worst(ages, live("front", "rear"), 200), { camera: "rear", age_ms: 80, bound_ms: 30, level: "fine" });
 });
 
 test("its level depends on the limit; exactly at the limit a picture is not late", () => {
-  const level = (age_ms) => worstOf({ front: age(age_ms, 10) }, live("front"), 200).level;
+  const level = (age_ms) => worst({ front: age(age_ms, 10) }, live("front"), 200).level;
   assert.deepEqual([140, 141, 190, 191].map(level), ["fine", "near", "near", "late"]);
 });
 
 test("late and damaged pictures move, frozen and lost ones have no latency", () => {
   const ages = { front: age(10), rear: age(40), left: age(9000), right: age(8000) };
   const statuses = { front: "damaged", rear: "late", left: "frozen", right: "lost" };
-  assert.equal(worstOf(ages, statuses, 200).camera, "rear");
-  assert.deepEqual(worstOf(ages, { ...statuses, front: "off", rear: "synchronising" }, 200), { camera: null, age_ms: null, bound_ms: null, level: "none" });
+  assert.equal(worst(ages, statuses, 200).camera, "rear");
+  assert.deepEqual(worst(ages, { ...statuses, front: "off", rear: "synchronising" }, 200), { camera: null, age_ms: null, bound_ms: null, level: "none" });
+});
+
+test("of one camera's pictures on the page and in a monitor, the older one counts", () => {
+  const pictures = [["front", 20], ["front (monitor)", 180]].map(([camera, age_ms]) => ({ camera, status: "live", age_ms, bound_ms: 5 }));
+  assert.deepEqual(worstOf(pictures, 200), { camera: "front (monitor)", age_ms: 180, bound_ms: 5, level: "near" });
 });
 
 test("a late picture is shown and marked, although the median is below the limit", () => {
   const ages = { front: age(90), rear: age(30) };
-  assert.deepEqual(worstOf(ages, { front: "live", rear: "late" }, 200), { camera: "rear", age_ms: 30, bound_ms: 5, level: "late" });
+  assert.deepEqual(worst(ages, { front: "live", rear: "late" }, 200), { camera: "rear", age_ms: 30, bound_ms: 5, level: "late" });
 });
 
 test("an age follows within half a second, whatever the frame rate", () => {
@@ -80,5 +86,5 @@ test("an age follows within half a second, whatever the frame rate", () => {
 
 test("one unknown age makes the worst one unknown", () => {
   for (const unknown of [age(null), age(50, NaN), age(50, Infinity)])
-    assert.deepEqual(worstOf({ front: age(10), rear: unknown }, live("front", "rear"), 200), { camera: "rear", age_ms: null, bound_ms: null, level: "unknown" });
+    assert.deepEqual(worst({ front: age(10), rear: unknown }, live("front", "rear"), 200), { camera: "rear", age_ms: null, bound_ms: null, level: "unknown" });
 });

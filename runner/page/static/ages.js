@@ -24,24 +24,25 @@ export function ageOf(pictures, bound_ms = Infinity) {
   return { age_ms: isKnown ? Math.max(0, age_ms ?? 0) : null, parts_ms: { page: part(1, 2), decode: part(2, 3), draw: part(3, 4) } };
 }
 
+/** @typedef {{camera: string, status: string, age_ms: number|null, bound_ms: number}} Picture */
+
 /**
- * The camera whose moving picture may be oldest: a late one if there is any, then the one whose age plus error bound is
- * the largest. `level` is "late" if its status is, or where that exceeds the limit, "near" where it exceeds 75 % of it;
+ * The moving picture that may be oldest: a late one if there is any, then the one whose age plus error bound is the
+ * largest. `level` is "late" if its status is, or where that exceeds the limit, "near" where it exceeds 75 % of it;
  * "unknown" if the age of any moving picture is unknown; "none" if no picture moves.
- * @param {Record<string, {age_ms: number|null, bound_ms: number}>} ages by camera
- * @param {Record<string, string>} statuses by camera
+ * @param {Picture[]} pictures
  * @param {number} late_ms
  * @returns {{camera: string|null, age_ms: number|null, bound_ms: number|null, level: "fine"|"near"|"late"|"unknown"|"none"}}
  */
-export function worstOf(ages, statuses, late_ms) {
-  const moving = Object.entries(ages).filter(([name]) => MOVING.includes(statuses[name]));
-  const unknown = moving.find(([, { age_ms, bound_ms }]) => !Number.isFinite(age_ms) || !Number.isFinite(bound_ms));
-  if (unknown || !moving.length) return { camera: unknown?.[0] ?? null, age_ms: null, bound_ms: null, level: unknown ? "unknown" : "none" };
+export function worstOf(pictures, late_ms) {
+  const moving = pictures.filter(({ status }) => MOVING.includes(status));
+  const unknown = moving.find(({ age_ms, bound_ms }) => !Number.isFinite(age_ms) || !Number.isFinite(bound_ms));
+  if (unknown || !moving.length) return { camera: unknown?.camera ?? null, age_ms: null, bound_ms: null, level: unknown ? "unknown" : "none" };
   const upperBound = ({ age_ms, bound_ms }) => (age_ms ?? 0) + bound_ms;
-  const late = moving.filter(([name]) => statuses[name] === "late"); // its median may be below the limit
-  const [camera, worst] = (late.length ? late : moving).reduce((a, b) => (upperBound(b[1]) > upperBound(a[1]) ? b : a));
+  const late = moving.filter(({ status }) => status === "late"); // its median may be below the limit
+  const worst = (late.length ? late : moving).reduce((a, b) => (upperBound(b) > upperBound(a) ? b : a));
   const level = late.length || upperBound(worst) > late_ms ? "late" : upperBound(worst) > NEAR * late_ms ? "near" : "fine";
-  return { camera, age_ms: worst.age_ms, bound_ms: worst.bound_ms, level };
+  return { camera: worst.camera, age_ms: worst.age_ms, bound_ms: worst.bound_ms, level };
 }
 
 /**

@@ -7,7 +7,7 @@ import { isGuided, nextChoice } from "./guides.js";
 import { holding, linkFault, toggleControl, whyNotHeeded } from "./header.js";
 import { withKey } from "./hints.js";
 import { reportAttention, showGuides } from "./link.js";
-import { monitored } from "./monitored.js";
+import { monitored, ownPictures } from "./monitored.js";
 import { showProblem } from "./requests.js";
 import { SHAPES } from "./tiles.js";
 import { limitReasons, pauseReason } from "./total.js";
@@ -44,14 +44,24 @@ function refresh() {
   fitted = text;
 }
 
-/** The worst latency of all pictures. A stalled picture has none, and is worse than any. */
+/** The worst latency of all pictures, in monitors as well. A stalled picture has none, and is worse than any. */
 function refreshLatency() {
-  const { camera, age_ms, bound_ms, level } = worstOf(store.ages, store.status, store.hello?.late_ms ?? 0);
-  const stalled = names().filter((name) => STALLED.includes(alertStatus(name)));
+  const { camera, age_ms, bound_ms, level } = worstOf([...ownPictures(), ...inMonitors()], store.hello?.late_ms ?? 0);
+  const stalled = names().filter(isStalled);
   const from = camera === null ? "no moving picture" : `${level === "unknown" ? "unknown" : "worst"}: ${displayName(camera)}`;
   setAttribute(byId("latency"), "data-level", stalled.length ? "late" : level);
   setText(byId("worst"), latency(age_ms, bound_ms));
   setText(byId("worst-of"), stalled.length ? `${stalled.length} of ${names().length} pictures not live` : from);
+}
+
+/** Pictures in monitors, which say where they are. */
+const inMonitors = () => monitored().map((picture) => ({ ...picture, camera: inMonitor(picture.camera) }));
+const inMonitor = (camera) => `${displayName(camera)} (monitor)`;
+
+/** Whether a camera's picture stands still, here or in a monitor. */
+function isStalled(camera) {
+  const shown = monitored().filter((other) => other.camera === camera).map(({ status }) => status);
+  return [store.status[camera], ...shown].some((status) => STALLED.includes(alertStatus(camera, status)));
 }
 
 function refreshSpeed() {
@@ -98,8 +108,7 @@ function showAlarms(element, cameras) {
 function picturesOf(status, cameras) {
   const own = cameras.filter((name) => alertStatus(name) === status);
   const others = monitored().filter((other) => alertStatus(other.camera, other.status) === status && store.status[other.camera] !== status);
-  const inMonitors = new Set(others.map(({ camera }) => displayName(camera)));
-  return [...own.map(displayName), ...[...inMonitors].map((name) => `${name} (monitor)`)];
+  return [...own.map(displayName), ...new Set(others.map(({ camera }) => inMonitor(camera)))];
 }
 
 /** Make the words smaller where they would be cut off. */

@@ -1,5 +1,5 @@
 /**
- * The statuses of the pictures in monitors: each monitor reports its own to the pages in the same browser, of which the one in
+ * The statuses and ages of the pictures in monitors: each monitor reports its own to the pages in the same browser, of which the one in
  * control alerts its driver.
  */
 
@@ -8,6 +8,7 @@ import { reportProblem } from "./requests.js";
 
 const REPORT_MS = 500; // at most; usually its worker makes a monitor report more often, also while it is hidden
 const SILENT_MS = 3000; // a monitor that has not reported for this long has crashed
+const NO_AGE = { age_ms: null, bound_ms: NaN };
 const channel = new BroadcastChannel("tod-status");
 const ownId = String(Math.random());
 
@@ -15,22 +16,30 @@ const ownId = String(Math.random());
  * @typedef {object} Report of a monitor
  * @property {string} id of the monitor's window
  * @property {Record<string, string>|null} status by camera; null: the monitor is being closed
+ * @property {Record<string, Age>} ages by camera
+ * @typedef {{age_ms: number|null, bound_ms: number}} Age of a picture
  */
 
-/** The last report of each open monitor, and when it arrived. @type {Map<string, {status: Record<string, string>, at: number}>} */
+/** The last report of each open monitor, and when it arrived. @type {Map<string, {status: Record<string, string>, ages: Record<string, Age>, at: number}>} */
 const reports = new Map();
 let checkedAt = performance.now();
 
-/** Each picture in a monitor. @returns {{camera: string, status: string}[]} */
-export const monitored = () => [...reports.values()].flatMap(({ status }) => Object.keys(status).map((camera) => ({ camera, status: status[camera] })));
+/** Each picture in a monitor. */
+export const monitored = () => [...reports.values()].flatMap(({ status, ages }) => picturesOf(status, ages));
+
+/** Each picture in this window. */
+export const ownPictures = () => picturesOf(store.status, store.ages);
+
+/** @param {Record<string, string>} status  @param {Record<string, Age>} ages  @returns {import("./ages.js").Picture[]} */
+const picturesOf = (status, ages) => Object.keys(status).map((camera) => ({ ...(ages[camera] ?? NO_AGE), camera, status: status[camera] }));
 
 /** @param {Record<string, string>|null} status */
-const report = (status) => channel.postMessage({ id: ownId, status });
+const report = (status) => channel.postMessage({ id: ownId, status, ages: store.ages });
 
 /** @param {Report} report */
-function onReport({ id, status }) {
+function onReport({ id, status, ages }) {
   const before = reports.get(id)?.status ?? {};
-  if (status) reports.set(id, { status, at: performance.now() });
+  if (status) reports.set(id, { status, ages, at: performance.now() });
   else reports.delete(id);
   const now = status ?? Object.fromEntries(Object.keys(before).map((camera) => [camera, "off"]));
   for (const camera of Object.keys(now)) if (now[camera] !== before[camera]) publishStatus(id, camera, now[camera]);
