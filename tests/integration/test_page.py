@@ -451,6 +451,8 @@ def test_without_its_worker_a_page_shows_no_camera_as_live(chromium, demo):
         all_live(page)
         page.evaluate("boot.worker.terminate()")
         page.wait_for_selector("#banner:not([hidden])")
+        expected = "✕ VIDEO STOPPED: the page's worker does not respond; reload the page"
+        assert page.inner_text("#banner") == expected
         assert {text.split()[1] for text in page.locator("[data-camera] .status").all_inner_texts()} == {"LOST"}
 
 
@@ -595,6 +597,9 @@ def test_stalled_pictures_are_named_and_sounded_in_the_drive_view(chromium, demo
         until(lambda: page.inner_text("#worst-of") == "8 of 8 pictures not live")
         assert page.inner_text("#alarms").startswith("✕ LOST front left, front center")
         assert page.inner_text("#worst") == "– ms"
+        assert {*page.locator(".tile .status").all_inner_texts()} == {"✕ LOST"}, "the worker cannot mark the pictures"
+        frame = "getComputedStyle(document.querySelector('.tile .picture'), '::after').borderTopWidth"
+        assert page.evaluate(frame) == "4px"
         assert page.get_attribute("#latency", "data-level") == "late"
         until(lambda: page.evaluate("globalThis.tones >= 4"))
 

@@ -110,16 +110,17 @@ function refreshControl() {
 
 function refreshBanner() {
   const isOffline = store.connected ? store.state && !store.state.online : performance.now() > START_MS;
-  const text = store.connected
-    ? "VEHICLE OFFLINE: video is not live"
+  const why = store.hung
+    ? "VIDEO STOPPED: the page's worker does not respond; reload the page"
     : "NO CONNECTION TO THE STATION: video is not live; reconnecting";
+  const text = store.connected ? "VEHICLE OFFLINE: video is not live" : why;
   byId("banner").hidden = !isOffline;
   setText(byId("banner"), isOffline ? `✕ ${text}` : "");
 }
 
 /** What is wrong with the connection to the vehicle; null: nothing. */
 export function linkFault() {
-  if (!store.connected) return "no station";
+  if (!store.connected) return store.hung ? "video stopped" : "no station";
   if (!store.state) return "no state yet";
   return !store.state.online ? "vehicle offline" : hearing.isLost ? "vehicle receives nothing" : null;
 }

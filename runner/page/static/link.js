@@ -59,13 +59,13 @@ function checkWorker() {
   checkedAt = time;
   if (hung || hasStalled || time - reportedAt < HUNG_MS || !Object.keys(store.status).length) return;
   hung = { connected: store.connected };
-  store.connected = false;
+  Object.assign(store, { hung: true, connected: false });
   publish("socket", false);
   for (const camera of Object.keys(store.status)) handlers.status({ camera, status: "lost", why: store.refused[camera] });
 }
 
 function onWorkerRecovered(ages) {
-  store.connected = hung?.connected ?? false;
+  Object.assign(store, { hung: false, connected: hung?.connected ?? false });
   hung = null;
   publish("socket", store.connected);
   for (const [camera, { status }] of Object.entries(ages)) handlers.status({ camera, status, why: store.refused[camera] });

@@ -41,7 +41,7 @@ export function pending(control) {
 }
 
 export function whyNoControl() {
-  if (!store.connected) return "no connection to the station";
+  if (!store.connected) return store.hung ? "the page's worker does not respond" : "no connection to the station";
   if (store.holder === "another") return "another page holds control";
   return store.view === "monitor" ? "the page of this monitor does not hold control" : withKey("take control first", "control");
 }

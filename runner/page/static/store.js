@@ -79,6 +79,7 @@ const listeners = new Map();
  * @property {boolean} elsewhere
  * @property {boolean} covered
  * @property {boolean} connected
+ * @property {boolean} hung
  * @property {Note[]} notes
  * @property {ReturnType<typeof emptySeries>} series
  * @property {Record<string, string>} status
@@ -101,6 +102,7 @@ export const store = {
   elsewhere: false, // whether another window of this page has the keyboard focus
   covered: false, // whether another window of this page is hidden
   connected: false,
+  hung: false, // whether the worker does not respond: nothing is known then
   notes: [],
   series: emptySeries([]),
   status: {}, // by camera, as judged by the worker
