@@ -49,8 +49,11 @@ test("a local selection is published to the page's other windows, a selection fr
 test("a window that opens adopts the selection of another window", () => {
   onStationMessage({ ...HELLO, selected: "rear" });
   assert.equal(store.selected, "rear");
+  assert.deepEqual([published[0].kind, published[1]], ["hello", "rear"], "edited numbers belong to the camera before");
+  published.length = 0;
   onStationMessage({ ...HELLO, selected: null });
   assert.equal(store.selected, "rear");
+  assert.equal(published.length, 1);
 });
 
 test("a monitor selects nothing by itself", () => {

@@ -130,6 +130,7 @@ export function publish(kind, payload) {
 /** Store a text message from the station, and publish it. */
 export function onStationMessage(message) {
   const { kind } = message;
+  const { selected } = store;
   if (kind === "hello") onHello(message);
   else if (kind === "state" || kind === "sample") store[kind] = message;
   else if (kind === "control") onControl(message);
@@ -139,6 +140,7 @@ export function onStationMessage(message) {
   else if (kind === "note") return note({ ...message, own: false });
   if (kind === "sample") appendSample(message);
   publish(kind, message);
+  if (store.selected !== selected) publish("selected", store.selected); // by a hello: another window has selected it meanwhile
 }
 
 function onControl({ holder, abandoned, elsewhere, covered }) {
