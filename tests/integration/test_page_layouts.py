@@ -333,7 +333,9 @@ def test_a_driver_is_warned_in_either_view(chromium, picture, pressed):
         page.evaluate("Object.defineProperty(document, 'hidden', {get: () => true, configurable: true})")
         page.evaluate("document.dispatchEvent(new Event('visibilitychange'))")
         until(lambda: tones(page) >= before + 4)
+        time.sleep(0.6)
         page.evaluate("delete document.hidden; document.dispatchEvent(new Event('visibilitychange'))")
+        until(lambda: "check every picture" in page.text_content("#alarms"))
         page.keyboard.press("t")
         until(lambda: page.evaluate("tod.control") == "nobody")
         server.silent.add("rear")
@@ -445,6 +447,7 @@ def test_a_driver_is_alerted_to_a_monitor_that_crashed(chromium, picture):
         monitor.evaluate("BroadcastChannel.prototype.postMessage = () => {}")  # all that the page sees of a crash
         until(lambda: "a monitor no longer responds: reload it" in page.inner_text("#toasts"))
         until(lambda: tones(page) >= before + 4)
+        until(lambda: "▲ MONITOR GONE front, mast" in page.text_content("#alarms"))
         for holder in ("nobody", "you"):
             page.keyboard.press("t")
             until(lambda holder=holder: monitor.evaluate("tod.control") == holder)

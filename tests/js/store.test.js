@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { beforeEach, test } from "node:test";
 
-import { alertStatus, camera, decisionOf, enlarge, inControl, listen, mode, note, onStationMessage, select, store } from "../../runner/page/static/store.js";
+import { alertStatus, camera, decisionOf, enlarge, inControl, listen, mode, note, onStationMessage, remind, select, store } from "../../runner/page/static/store.js";
 
 const HELLO = { kind: "hello", vehicle: "robot", cameras: [{ name: "front" }, { name: "rear" }] };
 const STATE = { kind: "state", online: true, mode: "single", cameras: { front: { kbps: 500 } } };
@@ -80,6 +80,18 @@ test("a pause alerts the driver unless nobody drives, or the camera has no weigh
   onStationMessage(state("single"));
   assert.deepEqual(alerts(), ["paused", "paused"]);
   assert.equal(alertStatus("front", "lost"), "lost");
+});
+
+test("a driver is reminded until something is settled, or control is gone; others are not", () => {
+  const reminded = () => [...store.reminders.values()];
+  remind("gamepad", "gone");
+  assert.deepEqual(reminded(), []);
+  onStationMessage({ kind: "control", holder: "you" });
+  for (const key of ["gamepad", "monitor"]) remind(key, `${key} gone`);
+  remind("gamepad", null);
+  assert.deepEqual(reminded(), ["monitor gone"]);
+  onStationMessage({ kind: "control", holder: "another" });
+  assert.deepEqual(reminded(), []);
 });
 
 test("control requires a connection", () => {

@@ -1,6 +1,6 @@
 /** The Drive view's figures: what a driver must not miss. */
 
-import { alertStatus, inControl, listen, mode, ofVehicle, publish, store } from "./store.js";
+import { alertStatus, inControl, listen, mode, ofVehicle, publish, remind, store } from "./store.js";
 import { worstOf } from "./ages.js";
 import { Attention } from "./attention.js";
 import { isGuided, nextChoice } from "./guides.js";
@@ -19,6 +19,7 @@ const WORDS = { unsupported: "NO PICTURE" };
 const STALLED = ["lost", "frozen", "unsupported", "paused"];
 const KMH = 3.6; // of 1 m/s
 const GUIDES = "tod-guides";
+const RETURNED_MS = 1000; // a press within this time belongs to the return
 const SETTLED_MS = 2500; // by then, pictures skipped while hidden no longer count
 
 const FITS = [1, 0.9, 0.8, 0.7, 0.6]; // of the usual size of words
@@ -28,6 +29,7 @@ const words = /** @type {HTMLElement} */ (byId("drive").querySelector(".words"))
 let fitted = ""; // the words when their size was chosen
 const attention = new Attention();
 let isFocused = document.hasFocus();
+let returnedAt = -Infinity; // when the page was last shown again
 let hiddenAt = -Infinity; // when the page was last hidden
 const names = () => (store.hello?.cameras ?? []).map(({ name }) => name);
 const isOnline = () => store.connected && store.state?.online;
@@ -90,16 +92,16 @@ function linkWords() {
 
 /** The pictures that are not live, in monitors as well; of the page's own, in the Configure view, those that the enlarged one hides. */
 function refreshAlarms() {
-  showAlarms(byId("alarms"), names());
+  showAlarms(byId("alarms"), names(), [...store.reminders.values()].map((text) => `▲ ${text}`));
   const hidden = store.enlarged ? names().filter((name) => name !== store.enlarged) : [];
   byId("hidden-alarms").hidden = store.view !== "configure" || !showAlarms(byId("hidden-alarms"), hidden);
 }
 
-/** Show pictures by status: FROZEN front left, rear (monitor). Returns whether there are any. */
-function showAlarms(element, cameras) {
+/** Show pictures by status, FROZEN front left, rear (monitor), and further words. Returns whether there are any pictures. */
+function showAlarms(element, cameras, further = []) {
   const found = ALARMS.map((status) => ({ status, pictures: picturesOf(status, cameras) })).filter(({ pictures }) => pictures.length);
   const texts = found.map(({ status, pictures }) => `${SHAPES[status]} ${WORDS[status] ?? status.toUpperCase()} ${pictures.join(", ")}`);
-  setText(element, texts.join("  "));
+  setText(element, [...texts, ...further].join("  "));
   setAttribute(element, "data-level", found.some(({ status }) => STALLED.includes(status)) ? "late" : "near");
   return found.length > 0;
 }
@@ -159,7 +161,19 @@ function updateAttention() {
   byId("attention").hidden = warning === null;
   setText(byId("attention"), warning ?? "");
   reportAttention(attention.state, isFocused && !hidden);
-  if (message && inControl()) showProblem(message);
+  if (message && inControl()) onReturn(message);
+}
+
+/** The driver is back, and reminded to check the pictures until a press that came later than the one that brought the page back. */
+function onReturn(message) {
+  showProblem(message);
+  if (attention.was_visible) return;
+  remind("return", message);
+  returnedAt = performance.now();
+}
+
+function onPress() {
+  if (performance.now() - returnedAt > RETURNED_MS) remind("return", null);
 }
 
 function warningText() {
@@ -186,8 +200,9 @@ export function startDrive() {
     updateAttention();
   });
   document.addEventListener("visibilitychange", updateAttention);
+  for (const kind of ["pointerdown", "keydown"]) addEventListener(kind, onPress, true);
   new ResizeObserver(fitWords).observe(words);
-  listen("hello state sample ages status monitored control socket requests view enlarged", refresh);
+  listen("hello state sample ages status monitored control socket requests view enlarged reminders", refresh);
   listen("control socket state view ages", updateAttention);
   listen("hello view", refreshGuides);
   addEventListener("storage", refreshGuides); // chosen in another window

@@ -1,6 +1,6 @@
 /** Buttons of gamepads and wheels, through the browser's Gamepad API, which must be polled. */
 
-import { listen, publish, store } from "./store.js";
+import { inControl, listen, publish, remind, store } from "./store.js";
 import { ACTIONS } from "./actions.js";
 import { withKey } from "./hints.js";
 import { actionOf, Presses } from "./presses.js";
@@ -18,6 +18,7 @@ let pollTimer;
 
 const pads = () => navigator.getGamepads().flatMap((pad) => (pad?.connected ? [pad] : []));
 const nameOf = ({ id }) => id.replace(/\s*\(.*/, "") || "gamepad";
+const keyOf = ({ id }) => `gamepad ${id}`; // of its reminder
 
 function poll() {
   if (!document.hasFocus()) return presses.reset(); // browsers report no change meanwhile
@@ -33,11 +34,14 @@ function onConnected({ gamepad }) {
   const isStandard = gamepad.mapping === "standard";
   const text = isStandard ? "connected" : withKey("connected: it numbers its buttons in its own order; check inputs.buttons; the list of keys shows what is pressed", "help");
   publish("toast", { text: `${nameOf(gamepad)} ${text}`, level: isStandard ? "hint" : "problem" });
+  remind(keyOf(gamepad), null);
   pollTimer ??= setInterval(poll, POLL_MS);
 }
 
 function onDisconnected({ gamepad }) {
   reportProblem(`${nameOf(gamepad)} disconnected: its buttons no longer work`);
+  remind(keyOf(gamepad), `GAMEPAD GONE ${nameOf(gamepad)}`);
+  if (inControl()) publish("unplugged");
   if (pads().length) return;
   clearInterval(pollTimer);
   pollTimer = undefined;

@@ -3,8 +3,9 @@
  * control alerts its driver.
  */
 
-import { listen, publish, store } from "./store.js";
+import { listen, publish, remind, store } from "./store.js";
 import { reportProblem } from "./requests.js";
+import { displayName } from "./format.js";
 
 const REPORT_MS = 500; // at most; usually its worker makes a monitor report more often, also while it is hidden
 const SILENT_MS = 3000; // a monitor that has not reported for this long has crashed
@@ -39,8 +40,10 @@ const report = (status) => channel.postMessage({ id: ownId, status, ages: store.
 /** @param {Report} report */
 function onReport({ id, status, ages }) {
   const before = reports.get(id)?.status ?? {};
-  if (status) reports.set(id, { status, ages, at: performance.now() });
-  else reports.delete(id);
+  if (status) {
+    reports.set(id, { status, ages, at: performance.now() });
+    remind(keyOf(Object.keys(status)), null);
+  } else reports.delete(id);
   const now = status ?? Object.fromEntries(Object.keys(before).map((camera) => [camera, "off"]));
   for (const camera of Object.keys(now)) if (now[camera] !== before[camera]) publishStatus(id, camera, now[camera]);
 }
@@ -56,9 +59,13 @@ function checkMonitors() {
 /** A monitor has crashed: the driver is alerted once, and its pictures no longer count. */
 function onSilent(id, cameras) {
   reportProblem("a monitor no longer responds: reload it");
+  remind(keyOf(cameras), `MONITOR GONE ${cameras.map(displayName).join(", ")}`);
   for (const camera of cameras) publishStatus(id, camera, "lost");
   reports.delete(id);
 }
+
+/** Of a reminder; a monitor that is reloaded has the same cameras. @param {string[]} cameras */
+const keyOf = (cameras) => `monitor ${[...cameras].sort().join()}`;
 
 /** `picture` tells apart pictures of the same camera. */
 const publishStatus = (id, camera, status) => publish("monitored", { picture: `${camera} ${id}`, camera, status });

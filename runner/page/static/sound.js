@@ -111,7 +111,7 @@ export function startSound() {
   listen("hello", refresh);
   listen("status", ({ camera, status }) => onStatus(camera, camera, status));
   listen("monitored", ({ picture, camera, status }) => onStatus(picture, camera, status));
-  listen("deposed unseen", () => sound("lost"));
+  listen("deposed unseen unplugged", () => sound("lost"));
   addEventListener("storage", refresh); // muted in another window
   setInterval(() => {
     const kind = alarm.overdue(performance.now());

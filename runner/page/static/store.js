@@ -82,6 +82,7 @@ const listeners = new Map();
  * @property {boolean} hung
  * @property {Note[]} notes
  * @property {ReturnType<typeof emptySeries>} series
+ * @property {Map<string, string>} reminders
  * @property {Record<string, string>} status
  * @property {Record<string, string>} refused
  * @property {Record<string, {age_ms: number|null, bound_ms: number, parts_ms: {page: number, decode: number, draw: number}|null}>} ages
@@ -105,6 +106,7 @@ export const store = {
   hung: false, // whether the worker does not respond: nothing is known then
   notes: [],
   series: emptySeries([]),
+  reminders: new Map(), // by key, what the driver is reminded of until it is settled, or the page no longer has control
   status: {}, // by camera, as judged by the worker
   refused: {}, // by camera, why its video cannot be shown, or ""
   ages: {}, // by camera, latency from capture to drawing, its error bound, and its parts on the page
@@ -145,6 +147,14 @@ export function onStationMessage(message) {
 
 function onControl({ holder, abandoned, elsewhere, covered }) {
   Object.assign(store, { holder, abandoned, elsewhere, covered });
+  if (holder !== "you") store.reminders.clear();
+}
+
+/** Remind whoever drives of something until it is settled: text null. @param {string} key  @param {string|null} text */
+export function remind(key, text) {
+  if (text === null ? !store.reminders.delete(key) : !inControl()) return;
+  if (text !== null) store.reminders.set(key, text);
+  publish("reminders");
 }
 
 function onHello(message) {
