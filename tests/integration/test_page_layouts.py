@@ -40,7 +40,7 @@ from runner.core.step import start, step
 from runner.h264.access_unit import read_unit
 from runner.page.server import PageServer
 from runner.page.viewer import PageViewer
-from runner.records import CameraState, Outcome, VehicleState, applied_to_json
+from runner.records import CameraState, Outcome, Position, Sample, VehicleState, applied_to_json
 
 pytestmark = [pytest.mark.gst, needs_browser]
 aiohttp = pytest.importorskip("aiohttp")
@@ -399,6 +399,11 @@ def test_a_driver_is_warned_if_the_vehicle_has_another_operator_in_control(chrom
         assert page.inner_text("#worst-of") == "3 of 3 pictures not live"
         until(lambda: tones(page) >= before + 4)
         shot(page, "paused-drive")
+        sample = Sample(1.0, None, 0, 0.0, Position(49.0, 8.4, 10.0), 0, {}, speed_factor=0.5)
+        until(lambda: server.on_sample(sample) or page.inner_text("#driven") == "36 km/h")
+        until(lambda: page.inner_text("#driven") == "– km/h")  # no further sample
+        assert page.inner_text("#advised") == "no speed advised"
+        until(lambda: "No measurements from the station" in page.inner_text("#warning"))
 
 
 def test_a_driver_is_alerted_to_a_picture_lost_in_a_monitor_only(chromium, picture, monkeypatch):

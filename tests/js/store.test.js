@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { beforeEach, test } from "node:test";
 
-import { alertStatus, camera, decisionOf, enlarge, inControl, listen, mode, note, onStationMessage, remind, select, store } from "../../runner/page/static/store.js";
+import { alertStatus, camera, decisionOf, dropOldSample, enlarge, inControl, listen, mode, note, onStationMessage, remind, select, store } from "../../runner/page/static/store.js";
 
 const HELLO = { kind: "hello", vehicle: "robot", cameras: [{ name: "front" }, { name: "rear" }] };
 const STATE = { kind: "state", online: true, mode: "single", cameras: { front: { kbps: 500 } } };
@@ -151,6 +151,16 @@ test("samples become one point per second, and unknown values are null", () => {
   assert.deepEqual(store.series.cameras.front.kbps, [0, 10, 20]);
   assert.deepEqual(store.series.cameras.rear.kbps, [null, null, null]);
   assert.deepEqual(store.series.lat, [null, null, null]);
+});
+
+test("a sample that no other follows is dropped after a second", () => {
+  onStationMessage(sample(1));
+  published.length = 0;
+  dropOldSample(performance.now() + 900);
+  assert.deepEqual([store.sample?.time, published], [1, []]);
+  for (const later of [1100, 1400]) dropOldSample(performance.now() + later);
+  assert.deepEqual([store.sample, published], [null, [null]]);
+  assert.deepEqual(store.series.time.at(-1), 1);
 });
 
 test("the series covers five minutes", () => {

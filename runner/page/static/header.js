@@ -9,13 +9,16 @@ import { MOVING } from "./status.js";
 import { byId, displayName, setAttribute, setText, whole } from "./format.js";
 
 const START_MS = 800; // no alarm while the page is opening
-const CLOCK_GRACE_MS = 2000;
+const GRACE_MS = 2000; // of a warning
 const UNKNOWN = "▲ Age of the pictures unknown: no capture times, or no answer from the vehicle's clock; LATE is not shown";
+const UNMEASURED = "▲ No measurements from the station: speed, advised speed and bitrates are unknown";
 const HOLDERS = { you: "You are in control", another: "Another page is in control", nobody: "Nobody is in control" };
 const UNHEARD = "the vehicle receives nothing from this station";
 
 let clockKnownAt = performance.now(); // when the clock offset was last known, or could not be measured
 
+let sampledAt = performance.now(); // when a sample was last known, or none was due
+let wasSampled = false; // whether any has arrived
 let wasOperator = false; // whether the vehicle had this page's operator in control
 
 export const holding = new Holding();
@@ -131,14 +134,22 @@ function refreshConnection() {
   setAttribute(byId("connection"), "data-state", fault ? "bad" : "fine");
 }
 
-/** Warn once the clock offset has been unknown for a while: measuring it takes time. */
+/** Warn once samples have ceased, or the clock offset has been unknown for a while: measuring it takes time. */
 function refreshWarning() {
-  const online = store.connected && store.state?.online && store.sample;
+  const now = performance.now();
+  const isOnline = store.connected && store.state?.online;
+  wasSampled ||= store.sample !== null;
+  if (!isOnline || store.sample || !wasSampled) sampledAt = now;
+  if (!isOnline || !store.sample || isClockKnown()) clockKnownAt = now;
+  const warning = now - sampledAt >= GRACE_MS ? UNMEASURED : now - clockKnownAt >= GRACE_MS ? UNKNOWN : "";
+  byId("warning").hidden = !warning;
+  setText(byId("warning"), warning);
+}
+
+function isClockKnown() {
   const moving = Object.entries(store.ages).filter(([name]) => MOVING.includes(store.status[name]));
   const known = moving.every(([, { age_ms, bound_ms }]) => Number.isFinite(age_ms) && Number.isFinite(bound_ms));
-  if (!online || (known && Number.isFinite(store.sample?.clock_bound_ms))) clockKnownAt = performance.now();
-  byId("warning").hidden = performance.now() - clockKnownAt < CLOCK_GRACE_MS;
-  setText(byId("warning"), byId("warning").hidden ? "" : UNKNOWN);
+  return known && Number.isFinite(store.sample?.clock_bound_ms);
 }
 
 function refreshTotals() {
@@ -178,6 +189,7 @@ export function startHeader() {
   listen("state socket ages", watchHearing);
   listen("hello state control requests socket", refresh);
   listen("sample socket state", refreshTotals);
+  listen("ages", refreshWarning);
   listen("ages", refreshSkew);
   setTimeout(refresh, START_MS + 50);
   refresh();

@@ -1,6 +1,6 @@
 /** The page's side of the worker link: messages from the station come in, requests and canvases go out. */
 
-import { onStationMessage, publish, store } from "./store.js";
+import { dropOldSample, onStationMessage, publish, store } from "./store.js";
 
 const { canShowVideo, early, worker } = globalThis.boot;
 const HUNG_MS = 1500; // the worker reports four times a second
@@ -49,15 +49,21 @@ const handlers = {
 export function start() {
   for (const data of early) handlers[data.kind](data);
   worker.onmessage = ({ data }) => handlers[data.kind](data);
-  setInterval(checkWorker, CHECK_MS);
+  setInterval(check, CHECK_MS);
 }
 
-/** If the worker hangs or has died, its last pictures still look live: mark them as lost. */
-function checkWorker() {
+function check() {
   const time = performance.now();
   const hasStalled = time - checkedAt > 2 * CHECK_MS; // the page itself: the worker's messages are still queued
   checkedAt = time;
-  if (hung || hasStalled || time - reportedAt < HUNG_MS || !Object.keys(store.status).length) return;
+  if (hasStalled) return;
+  dropOldSample();
+  checkWorker(time);
+}
+
+/** If the worker hangs or has died, its last pictures still look live: mark them as lost. */
+function checkWorker(time) {
+  if (hung || time - reportedAt < HUNG_MS || !Object.keys(store.status).length) return;
   hung = { connected: store.connected };
   Object.assign(store, { hung: true, connected: false });
   publish("socket", false);

@@ -3,7 +3,9 @@
 import { BIRDSEYE } from "./arrange.js";
 
 const SHOWN_S = 300;
+const SAMPLE_MS = 1000; // the station sends four samples a second
 const listeners = new Map();
+let sampledAt = -Infinity; // page time of the last sample
 
 /**
  * The part of the station's messages that the page uses.
@@ -73,7 +75,7 @@ const listeners = new Map();
  * @typedef {object} Store
  * @property {Hello|null} hello
  * @property {State|null} state
- * @property {Sample|null} sample
+ * @property {Sample|null} sample null: none yet, or none for a second
  * @property {string} holder
  * @property {boolean} abandoned
  * @property {boolean} elsewhere
@@ -124,6 +126,15 @@ export function listen(kinds, listener) {
 
 /** A key of the browser's storage for a choice about this vehicle's cameras: another vehicle's may not be calibrated. */
 export const ofVehicle = (key) => `${key}:${store.hello?.vehicle}`;
+
+listen("sample", () => (sampledAt = performance.now()));
+
+/** Drop a sample that no other has followed: its values would look current. To be called a few times a second. */
+export function dropOldSample(now = performance.now()) {
+  if (!store.sample || now - sampledAt <= SAMPLE_MS) return;
+  store.sample = null;
+  publish("sample", null);
+}
 
 export function publish(kind, payload) {
   for (const listener of listeners.get(kind) ?? []) listener(payload);
