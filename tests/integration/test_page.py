@@ -660,8 +660,10 @@ def test_keys_of_the_drive_view(page):
     assert page.locator("#map-panel").is_visible()
     page.keyboard.press("p")
     assert not page.locator("#map-panel").is_visible()
+    page.evaluate("navigator.keyboard.lock = async (keys) => void (globalThis.locked = keys)")
     page.keyboard.press("Shift+F")
     until(lambda: page.evaluate("document.fullscreenElement !== null"))
+    until(lambda: page.evaluate("globalThis.locked") == ["Escape"])
     page.keyboard.press("Shift+F")
     until(lambda: page.evaluate("document.fullscreenElement === null"))
 

@@ -57,10 +57,16 @@ function setDrawer(open) {
 export async function toggleFullScreen() {
   try {
     if (document.fullscreenElement) await document.exitFullscreen();
-    else await document.documentElement.requestFullscreen({ navigationUI: "hide" });
+    else await enterFullScreen();
   } catch (error) {
     showProblem(`full screen failed: ${error instanceof Error ? error.message : error}`);
   }
+}
+
+/** Enter full screen, where Escape is the page's key: browsers that can pass it on leave full screen only while it is held. */
+async function enterFullScreen() {
+  await document.documentElement.requestFullscreen({ navigationUI: "hide" });
+  await /** @type {any} */ (navigator).keyboard?.lock?.(["Escape"]).catch(() => {});
 }
 
 const showFullScreen = () => byId("full-screen").setAttribute("aria-pressed", String(document.fullscreenElement !== null));
