@@ -42,9 +42,10 @@ for (const [theme, palette] of Object.entries(PALETTES))
       assert.deepEqual(near, []);
     });
 
+const sheet = readFileSync(new URL("../../runner/page/static/style.css", import.meta.url), "utf8");
+
 /** Variables of the style sheet by theme. */
 function variables() {
-  const sheet = readFileSync(new URL("../../runner/page/static/style.css", import.meta.url), "utf8");
   const block = (selector) => sheet.slice(sheet.indexOf(`${selector} {`)).split("}")[0];
   const read = (text) => Object.fromEntries([...text.matchAll(/--([\w-]+):\s*(#[0-9a-f]{6})/g)].map(([, name, colour]) => [name, colour]));
   return { night: read(block(":root")), day: read(block(':root[data-theme="day"]')) };
@@ -68,4 +69,10 @@ for (const [theme, colours] of Object.entries(variables())) {
 
 test("alarm text is readable", () => {
   for (const [fore, behind] of [["#ffffff", "#e01b24"], ["#000000", "#ffb000"], ["#e6ebf0", "#2b333c"]]) assert.ok(contrast(fore, behind) >= TEXT, `${fore} on ${behind}: ${contrast(fore, behind).toFixed(2)}`);
+});
+
+test("what is wrong with the bird's-eye view is readable over a white picture", () => {
+  const [, colour] = sheet.match(/#birdseye-state \{ color: (#[0-9a-f]{6})/) ?? [];
+  const behind = "#404040"; // black of 75 %, as behind all names of pictures
+  assert.ok(contrast(colour, behind) >= TEXT, contrast(colour, behind).toFixed(2));
 });
