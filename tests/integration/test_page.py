@@ -570,6 +570,12 @@ def test_drive_shows_what_a_driver_must_not_miss(page):
     until(lambda: page.inner_text("#worst-of").removeprefix("worst: ").replace(" ", "_") in TUM)
     until(lambda: page.inner_text("#driven") == "115 km/h")  # 32 m/s
     assert page.inner_text("#advised") == "no speed advised"
+    shape = """level => {
+      const figure = document.querySelector("#speed-now");
+      figure.dataset.level = level;
+      return getComputedStyle(figure.firstElementChild, "::after").content;
+    }"""
+    assert [page.evaluate(shape, level) for level in ("fine", "near")] == ["none", '" ▲"'], "not by colour alone"
     until(lambda: re.match(r"Automatic · \d+( of \d+)? kbit/s · \w+", page.inner_text("#line")))
 
     def reports_its_return():
