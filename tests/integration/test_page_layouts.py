@@ -499,16 +499,18 @@ def test_keys_act_on_the_cameras_after_a_button_was_clicked(chromium, picture):
         until(lambda: page.evaluate("tod.control") == "you")
         assert page.evaluate("clicks") == 1
         spoken = """() => {
-          let spoken = 0;
-          const observer = new MutationObserver((all) => (spoken += all.length));
-          observer.observe(document.getElementById("announcer"), { childList: true });
+          const spoken = [];
+          const announcer = document.getElementById("announcer");
+          new MutationObserver(() => spoken.push(announcer.textContent)).observe(announcer, { childList: true });
           return import("/static/store.js").then(async ({ publish }) => {
-            for (const status of ["late", "live", "late"]) publish("status", { camera: "front", status });
-            await new Promise((done) => setTimeout(done));
+            for (let turn = 0; turn < 2; turn++) {
+              for (const camera of ["front", "rear"]) publish("status", { camera, status: "late" });
+              await new Promise((done) => setTimeout(done, 150));
+            }
             return spoken;
           });
         }"""
-        assert page.evaluate(spoken) == 2, "the same words again"
+        assert page.evaluate(spoken) == ["front late, rear late"] * 2, "the same words again"
 
 
 LIMITED = """async () => {

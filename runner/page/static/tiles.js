@@ -24,6 +24,7 @@ export const STALE = [...SILENT, "frozen"]; // the displayed picture is older th
 const THIN = "\u2009"; // space
 const NO_AGE = { age_ms: undefined, bound_ms: undefined };
 const UNCERTAIN_MS = 20; // a latency with a larger error bound is marked
+const TOGETHER_MS = 100; // a timer, since no animation frame comes while the page is hidden
 const BORDERS = 2; // of a tile, as in the style sheet
 
 const { canShowVideo } = globalThis.boot;
@@ -36,6 +37,7 @@ let camerasKey = ""; // the cameras that the tiles were built for
 let bandsKey = ""; // the bands that they were grouped into
 /** @type {Record<string, import("./layout.js").Place>|null} */
 let draft = null; // the layout that is being edited
+const spoken = new Map(); // by camera, alarms that are about to be spoken
 let wasHinted = false; // whether the hint on how to leave an enlarged picture was shown
 
 const sizes = new ResizeObserver((entries) => {
@@ -315,7 +317,19 @@ function onStatus({ camera: name, status }) {
   if (!part) return;
   refreshStatus(name, part);
   refreshCaption(name, part);
-  if (ALARMS.includes(alertStatus(name, status))) announce(`${displayName(name)} ${SHORT[status] ?? status} ${store.refused[name] ?? ""}`);
+  if (ALARMS.includes(alertStatus(name, status))) speak(name, `${displayName(name)} ${SHORT[status] ?? status} ${store.refused[name] ?? ""}`.trim());
+}
+
+/** Have alarms spoken together: a screen reader would drop all but the last of those that come at once. */
+function speak(name, text) {
+  if (!spoken.size) setTimeout(speakAll, TOGETHER_MS);
+  spoken.delete(name); // the newest last
+  spoken.set(name, text);
+}
+
+function speakAll() {
+  announce([...spoken.values()].join(", "));
+  spoken.clear();
 }
 
 export function startTiles() {
