@@ -648,6 +648,12 @@ def test_a_monitor_passes_on_keys_for_what_only_the_page_shows(chromium, picture
         until(lambda: "choose C to set it" in page.inner_text("#toasts"))
         monitor.keyboard.press("l")
         until(lambda: "rear: lines are already straight" in page.inner_text("#toasts"))
+        for muted in ("yes", "no"):
+            monitor.keyboard.press("b")
+            until(lambda muted=muted: page.evaluate("localStorage.getItem('tod-muted')") == muted)
+            until(lambda muted=muted: (page.inner_text("#sound") == "✕ Muted") == (muted == "yes"))
+            words = f"alarm tones of the page {'muted' if muted == 'yes' else 'on'}"
+            until(lambda words=words: words in monitor.inner_text("#toasts"))
         monitor.keyboard.press("w")
         page.wait_for_selector("#monitors[open]")
 

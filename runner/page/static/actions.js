@@ -57,7 +57,7 @@ export const ACTIONS = {
 };
 
 // Only the page shows what these change, so a monitor passes them on to it.
-const OF_PAGE = ["camera_left", "camera_front", "camera_right", "camera_rear", "reverse", "view", "birdseye", "drawer", "map", "monitors", "full_image", "total_lower", "total_raise"];
+const OF_PAGE = ["camera_left", "camera_front", "camera_right", "camera_rear", "reverse", "view", "birdseye", "drawer", "map", "monitors", "sound", "full_image", "total_lower", "total_raise"];
 const channel = new BroadcastChannel("tod-actions");
 
 export function startActions() {

@@ -39,7 +39,8 @@ startEdit();
 startActions();
 startKeys();
 startGamepads();
-if (store.view !== "monitor") for (const part of [startSound, startTotal, startPanel, startTabs, startCharts]) part();
+startSound();
+if (store.view !== "monitor") for (const part of [startTotal, startPanel, startTabs, startCharts]) part();
 start();
 
 /** For tests and benchmarks. With #measure in the address, the first picture of each camera is kept as well. */

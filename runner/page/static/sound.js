@@ -104,7 +104,13 @@ function refresh() {
   byId("sound-configure").hidden = !isDriving || !(isMuted() || isBlocked);
 }
 
+/** Say on a monitor what its key has changed on its page. @param {StorageEvent} event */
+function showMuted({ key }) {
+  if (key === KEY) publish("toast", { text: `alarm tones of the page ${isMuted() ? "muted" : "on"}`, level: "hint" });
+}
+
 export function startSound() {
+  if (store.view === "monitor") return addEventListener("storage", showMuted);
   for (const button of buttons) button.addEventListener("click", () => (!wasBlocked || isMuted()) && toggleSound()); // resumed since the press began
   for (const kind of ["pointerup", "keydown"]) addEventListener(kind, onPress, true);
   listen("control", onControl);
