@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import io
+import re
 import subprocess
 import threading
 import time
@@ -40,7 +41,16 @@ from runner.core.step import start, step
 from runner.h264.access_unit import read_unit
 from runner.page.server import PageServer
 from runner.page.viewer import PageViewer
-from runner.records import CameraState, Outcome, Position, Sample, VehicleState, applied_to_json
+from runner.records import (
+    CameraSample,
+    CameraState,
+    LatencyStages,
+    Outcome,
+    Position,
+    Sample,
+    VehicleState,
+    applied_to_json,
+)
 
 pytestmark = [pytest.mark.gst, needs_browser]
 aiohttp = pytest.importorskip("aiohttp")
@@ -88,13 +98,17 @@ def served(picture, layouts, *words, vehicle=SMALL_ROBOT, conf=None):
     station = Station(vehicle)
     page, ended = PageServer(vehicle, station, layouts=layouts), threading.Event()
     page.silent = set()  # names of cameras that send nothing
+    page.behind_s = 0.0  # how long ago pictures were captured
+    page.sample = None  # sent with each picture
 
     def send():
         while not ended.wait(EVERY_S):
             station.seen.append(station.attention)
             for name in vehicle.cameras:
                 if name not in page.silent:
-                    page.show(name, read_unit(picture, time.time(), time.time()))
+                    page.show(name, read_unit(picture, time.time() - page.behind_s, time.time()))
+            if page.sample:
+                page.on_sample(replace(page.sample, t=time.time()))
 
     page.start()
     sending = threading.Thread(target=send)
@@ -521,16 +535,13 @@ LIMITED = """async () => {
 }"""
 
 
-# As long as captions and stages get.
-WIDE = """async () => {
-  const { publish, store } = await import("/static/store.js");
-  const stages_ms = { capture: 100.5, encode: 100.5, link: 100.5, buffer: 100.5, decode: 100.5 };
-  const size = { width: 1920, height: 1200 };
-  const one = { fps: 40, kbps: 5999, ...size, latency_ms: 1250, lost: 12345, rebuilt: 12, buffer_ms: 120, stages_ms };
-  const cameras = Object.fromEntries(store.hello.cameras.map(({ name }) => [name, one]));
-  const totals = { predicted_kbps: 31999, allocated_kbps: 31999, actual_kbps: 31999 };
-  publish("sample", (store.sample = { ...store.sample, ...totals, speed_factor: 0.85, clock_bound_ms: 5, cameras }));
-}"""
+def wide(cameras):
+    """A sample in which captions, stages and totals are as long as they get."""
+    stages = LatencyStages(100.5, 100.5, 100.5, 100.5, 100.5)
+    rates = (40.0, 5999.0, 5999, 5999, 0.125, 1920, 1200)
+    one = CameraSample(*rates, latency_ms=1250.0, lost=12345, rebuilt=12, buffer_ms=120, stages_ms=stages)
+    figures = {"cameras": dict.fromkeys(cameras, one), "speed_factor": 0.85, "clock_bound_ms": 120.0}
+    return Sample(0.0, 31999, 31999, 31999.0, Position(49.0, 8.4, 100.0), 0, **figures)
 
 
 INSIDE = """() => {
@@ -564,9 +575,10 @@ def test_both_views_fit_every_screen(chromium, picture, tmp_path, owner):
     (tmp_path / "vehicle").mkdir()
     (tmp_path / "vehicle" / "truck.yaml").write_text(TRUCK.lstrip())
     with (
-        served(picture, None, vehicle=OWNERS[owner], conf=tmp_path) as (server, station),
+        served(picture, None, "page.late_ms=1500", vehicle=OWNERS[owner], conf=tmp_path) as (server, station),
         opened(chromium, server.url, 1920, 1080) as page,
     ):
+        server.behind_s, server.sample = 1.25, wide(station.state.cameras)
         controlling(page)
         all_live(page)
         front = next(name for name in station.state.cameras if name in ("front_center", "front", "cab"))
@@ -574,7 +586,7 @@ def test_both_views_fit_every_screen(chromium, picture, tmp_path, owner):
             viewing(page, view)
             for width, height in SCREENS:
                 sized(page, width, height)
-                page.evaluate(WIDE)
+                until(lambda view=view: has_wide_figures(page, view))
                 time.sleep(EVERY_S)  # for the picture of the screen
                 shot(page, f"{owner}-{view}-{width}")
                 pictures, wrong = boxes(page)
@@ -590,6 +602,14 @@ def test_both_views_fit_every_screen(chromium, picture, tmp_path, owner):
                 shot(page, f"{owner}-help-{width}")
                 assert boxes(page)[1] == FITS, ("help", width, height)
                 page.keyboard.press("Escape")
+
+
+def has_wide_figures(page, view):
+    """Whether the page shows the ages of pictures, with long numbers."""
+    if view == "drive":
+        return re.fullmatch(r"1[23]\d\d ± 1\d\d ms", page.inner_text("#worst"))
+    captions = page.locator(".caption .form").all_inner_texts()
+    return captions and all(re.search(r" 1[23]\d\d ± 1\d\d ms · 12345 lost", each) for each in captions)
 
 
 def test_eight_lost_pictures_are_named_in_full(chromium, picture):

@@ -22,11 +22,10 @@ const GUIDES = "tod-guides";
 const RETURNED_MS = 1000; // a press within this time belongs to the return
 const SETTLED_MS = 2500; // by then, pictures skipped while hidden no longer count
 
-const FITS = [1, 0.9, 0.8, 0.7, 0.6]; // of the usual size of words
+const FITS = [1, 0.9, 0.8, 0.7, 0.6]; // of the usual size of text
 
-const words = /** @type {HTMLElement} */ (byId("drive").querySelector(".words"));
-/** @type {string|null} */
-let fitted = ""; // the words when their size was chosen
+/** Parts of the band whose text is made smaller where it would be cut off, each with its text when its size was chosen. @type {Map<HTMLElement, string>} */
+const fitted = new Map([...byId("drive").querySelectorAll(".figures, .words")].map((part) => [/** @type {HTMLElement} */ (part), ""]));
 const attention = new Attention();
 let isFocused = document.hasFocus();
 let returnedAt = -Infinity; // when the page was last shown again
@@ -41,9 +40,11 @@ function refresh() {
   refreshSpeed();
   setText(byId("line"), [MODES[mode() ?? ""] ?? "no mode", totalWords(), linkWords()].join(" · "));
   refreshControl();
-  const text = words.textContent;
-  if (text !== fitted) fitWords();
-  fitted = text;
+  for (const [part, before] of fitted) {
+    const text = (part.textContent ?? "").replace(/\d/g, "0"); // all digits are equally wide
+    if (text !== before) fit(part);
+    fitted.set(part, text);
+  }
 }
 
 /** The worst latency of all pictures, in monitors as well. A stalled picture has none, and is worse than any. */
@@ -113,11 +114,11 @@ function picturesOf(status, cameras) {
   return [...own.map(displayName), ...new Set(others.map(({ camera }) => inMonitor(camera)))];
 }
 
-/** Make the words smaller where they would be cut off. */
-function fitWords() {
-  for (const fit of FITS) {
-    words.style.setProperty("--fit", String(fit));
-    if (words.scrollHeight <= words.clientHeight && words.scrollWidth <= words.clientWidth) return;
+/** Make the text of a part smaller where it would be cut off. @param {HTMLElement} part */
+function fit(part) {
+  for (const scale of FITS) {
+    part.style.setProperty("--fit", String(scale));
+    if (part.scrollHeight <= part.clientHeight && part.scrollWidth <= part.clientWidth) return;
   }
 }
 
@@ -201,7 +202,8 @@ export function startDrive() {
   });
   document.addEventListener("visibilitychange", updateAttention);
   for (const kind of ["pointerdown", "keydown"]) addEventListener(kind, onPress, true);
-  new ResizeObserver(fitWords).observe(words);
+  const resized = new ResizeObserver((entries) => entries.forEach(({ target }) => fit(/** @type {HTMLElement} */ (target))));
+  for (const part of fitted.keys()) resized.observe(part);
   listen("hello state sample ages status monitored control socket requests view enlarged reminders", refresh);
   listen("control socket state view ages", updateAttention);
   listen("hello view", refreshGuides);
