@@ -170,7 +170,8 @@ BOXES = """() => {
   const find = (selector) => [...document.querySelectorAll(selector)].filter(isSeen);
   const isOutside = ({ x, y, width, height }) =>
     Math.min(x, y, innerWidth - x - width, innerHeight - y - height) < -1;
-  const isCut = ({ scrollWidth, clientWidth }) => clientWidth && scrollWidth > clientWidth + 1;
+  const isRead = ({ clientWidth }) => clientWidth > 1; // others are for screen readers
+  const isCut = (element) => isRead(element) && element.scrollWidth > element.clientWidth + 1;
   const isLow = ({ scrollHeight, clientHeight }) => scrollHeight > clientHeight + 1;
   const named = ({ id, className, tagName, textContent }) => `${id || className || tagName}: ${textContent}`;
   const seen = ".tile, .picture, #header > *, #side, #drive *";

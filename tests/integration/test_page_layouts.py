@@ -594,6 +594,10 @@ def test_both_views_fit_every_screen(chromium, picture, tmp_path, owner):
                 assert set(pictures) == set(station.state.cameras)
                 share = pictures[front]["width"] * pictures[front]["height"] / (width * height)
                 assert view == "configure" or width < height or share >= 0.4, (view, width, height)
+                for status in OTHERS:
+                    page.evaluate(ALL_AS, status)
+                    assert boxes(page)[1] == FITS, (status, view, width, height)
+                page.evaluate(ALL_AS, "live")
                 for tab in ("latency", "charts", "map", "camera") if view == "configure" else ():
                     if page.locator(f"#tab-{tab}").is_visible():
                         page.click(f"#tab-{tab}")
@@ -602,6 +606,18 @@ def test_both_views_fit_every_screen(chromium, picture, tmp_path, owner):
                 shot(page, f"{owner}-help-{width}")
                 assert boxes(page)[1] == FITS, ("help", width, height)
                 page.keyboard.press("Escape")
+
+
+OTHERS = ("synchronising", "late", "damaged", "frozen", "lost", "unsupported", "off", "paused")
+
+# Show all pictures with a status, until that changes.
+ALL_AS = """async (status) => {
+  const { publish, store } = await import("/static/store.js");
+  for (const camera of Object.keys(store.status)) {
+    store.status[camera] = status;
+    publish("status", { camera, status });
+  }
+}"""
 
 
 def has_wide_figures(page, view):

@@ -98,17 +98,19 @@ function buildTile({ name }) {
     canvas,
     swatch: make("span", { class: "swatch", "aria-hidden": "true" }),
     shown: make("span", { class: "shown" }),
-    status: make("span", { class: "status" }),
+    shape: make("span"),
+    word: make("span", { class: "word" }),
     on: make("button", { class: "switch", role: "switch", tabindex: "0", onclick: () => switchCamera(name) }),
     box: make("div", { class: "picture", "data-name": name }, canvas),
     rates: make("span", { class: "rates" }),
     form: make("span", { class: "form" }),
     frame: new RegionFrame(),
   };
+  const status = make("span", { class: "status" }, parts.shape, " ", parts.word);
   const reason = make("div", { class: "reason", role: "tooltip" });
   const refused = make("p", { class: "refused", hidden: true });
   parts.box.append(parts.frame.element, reason, refused);
-  const head = make("div", { class: "head" }, parts.swatch, make("b", {}, ...breakable(name)), parts.shown, parts.status, parts.on);
+  const head = make("div", { class: "head" }, parts.swatch, make("b", {}, ...breakable(name)), parts.shown, status, parts.on);
   const foot = make("div", { class: "caption" }, parts.rates, parts.form);
   const element = make(
     "article",
@@ -118,7 +120,7 @@ function buildTile({ name }) {
   );
   parts.box.addEventListener("dblclick", () => enlarge(store.enlarged === name ? null : name));
   parts.on.addEventListener("dblclick", (event) => event.stopPropagation());
-  tiles.set(name, { element, reason, refused, ...parts });
+  tiles.set(name, { element, status, reason, refused, ...parts });
   transferCanvas(name, canvas);
   dragRegion(name, parts.box, () => tiles.get(name).view);
   zoomRegion(name, parts.box, () => tiles.get(name).view);
@@ -246,14 +248,15 @@ function refresh(name, index) {
   refreshFraming(name, part);
 }
 
-function refreshStatus(name, { element, status, refused }) {
-  const word = store.status[name] ?? "synchronising";
-  const why = word === "unsupported" ? store.refused[name] : decisionOf(name)?.fault;
+function refreshStatus(name, { element, status, shape, word, refused }) {
+  const now = store.status[name] ?? "synchronising";
+  const why = now === "unsupported" ? store.refused[name] : decisionOf(name)?.fault;
   refused.hidden = !why;
   setText(refused, why ?? "");
-  setAttribute(element, "data-status", word);
-  setAttribute(status, "data-quiet", word === "live" ? "" : null);
-  setText(status, `${SHAPES[word]} ${SHORT[word] ?? word.toUpperCase()}`);
+  setAttribute(element, "data-status", now);
+  setAttribute(status, "data-quiet", now === "live" ? "" : null);
+  setText(shape, SHAPES[now]);
+  setText(word, SHORT[now] ?? now.toUpperCase());
 }
 
 function refreshSwitch(name, { on }) {
