@@ -157,3 +157,21 @@ def on_screen(locator, before, mode="L"):
 
     png, known, _ = until(lambda: (taken := pictured())[1] and taken[1] == taken[2] and taken)
     return np.asarray(image.open(io.BytesIO(png)).convert(mode), float), known
+
+
+@contextmanager
+def steering(served, rad):
+    """Report the steering angle 20 times a second."""
+    ended = threading.Event()
+
+    def report():
+        while not ended.wait(0.05):
+            served.on_steering(time.time(), rad)
+
+    reporting = threading.Thread(target=report)
+    reporting.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        reporting.join()

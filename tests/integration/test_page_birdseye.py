@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 from painted import ALL_AROUND, CAR, FINER, TOP_CAMERAS, TOP_SIZE, Mounted, corner, native_pictures, paint
-from stills import MARKS, Station, image, on_screen, serving
+from stills import MARKS, Station, image, on_screen, serving, steering
 
 from browser import all_live, opened, shot, until
 from rig import BROWSER, CHROMIUM_FLAGS
@@ -22,6 +22,7 @@ MAX_MARK_M = 0.65  # compared part of a mark: the view ends 1 m beyond the last 
 FRONT = Mounted(Pose(2.0, 0.0, 1.5, 0, 5), (), native=TOP_SIZE)
 BODY = (0x39, 0x43, 0x4D)
 AMBER = (0xFF, 0xB0, 0x00)
+PATH = (0x5C, 0xD6, 0xFF)
 
 
 @pytest.fixture(scope="module")
@@ -35,9 +36,15 @@ def station(tmp_path_factory):
 
 
 @pytest.fixture
-def page(chromium, station):
+def served(station):
+    with serving(station) as page:
+        yield page
+
+
+@pytest.fixture
+def page(chromium, station, served):
     """The Drive view, large, without the bird's-eye view: one of its cameras is not calibrated."""
-    with serving(station) as served, opened(chromium, served.url, 1280, 800) as page:
+    with opened(chromium, served.url, 1280, 800) as page:
         all_live(page)
         page.locator("body").press("v")
         page.add_style_tag(content="#attention, #toasts { visibility: hidden; }")  # they may appear on a busy machine
@@ -125,6 +132,26 @@ def test_the_vehicle_is_drawn_to_scale(page):
     shown_large(page)
     until(lambda: is_to_scale(page))  # on a busy machine a label may briefly cover it
     shot(page, "birdseye")
+
+
+def test_the_path_of_the_wheels_turns_as_they_do(page, served):
+    def beside():
+        """Share of pixels in the path's colour, to the left and right of the lane straight ahead."""
+        pixels, view = on_screen(page.locator("#birdseye"), lambda: placement(above(page)), "RGB")
+        px, half = view["px_per_m"], CAR.width_m / 2 + 0.5
+        ahead = slice(round(view["y"] - px * (CAR.front_m + 8)), round(view["y"] - px * CAR.front_m))
+        columns = [slice(*sorted(round(view["x"] - side * px * metres) for metres in (half, 8))) for side in (1, -1)]
+        return [share(pixels[ahead, each], PATH) for each in columns]
+
+    shown_large(page)
+    until(lambda: beside() == [0, 0])
+    for rad in (0.3, -0.3):
+        with steering(served, rad):
+            until(lambda rad=rad: np.sign(np.diff(beside())) == -np.sign(rad))
+            shot(page, f"birdseye-steering-{'left' if rad > 0 else 'right'}")
+            left, right = beside()
+            assert min(left, right) == 0 and max(left, right) > 0.001, (rad, left, right)
+    until(lambda: beside() == [0, 0])
 
 
 def is_to_scale(page):

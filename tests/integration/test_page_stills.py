@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-import threading
 import time
 from contextlib import contextmanager
 
 import numpy as np
 import pytest
 from painted import CAMERAS, SIZE, STEERED, STEERED_RAD, WITHIN_PX, ends_of, found, native_pictures, paint
-from stills import MARKS, Station, on_screen, serving
+from stills import MARKS, Station, on_screen, serving, steering
 
 from browser import PADS, all_live, measure, opened, shot, until
 from runner.records import Sample
@@ -261,6 +260,11 @@ def test_the_path_follows_the_steering_and_disappears_with_it(page, served):
         middle = page.locator("[data-camera=scaled] .picture").bounding_box()["width"] / 2
         assert len(paths) == 2 and max(path[-1]["x"] for path in paths) < middle, "to the left"
         shot(page, "guides-steering")
+        on, lines = seen(page, "scaled")
+        with without_guides(page):
+            off, _ = seen(page, "scaled", guided=False)
+        drawn = [is_drawn(on - off, piece) for line in lines if line["kind"] == "path" for piece in line["pieces"]]
+        assert drawn and all(drawn)
     until(lambda: kinds() == {"width", "distance"})
 
 
@@ -281,24 +285,6 @@ def test_the_path_passes_the_marks_where_the_wheels_will_go(page, served):
     apart = [round(math.dist(*pair) / scale, 2) for pair in zip(drawn, marks, strict=True)]
     print(apart)
     assert max(apart) < WITHIN_PX
-
-
-@contextmanager
-def steering(served, rad):
-    """Report the angle 20 times a second."""
-    ended = threading.Event()
-
-    def report():
-        while not ended.wait(0.05):
-            served.on_steering(time.time(), rad)
-
-    reporting = threading.Thread(target=report)
-    reporting.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        reporting.join()
 
 
 def test_buttons_act_once_and_a_pad_that_disconnects_is_announced(page, station):
