@@ -85,3 +85,15 @@ test("a composition under way counts although the box changes, but not once the 
   }
   assert.deepEqual(counted, { box: 1, hidden: 0, cameras: 0 });
 });
+
+test("a picture is late as soon as it arrives too late, before it is drawn: the one before must not look live meanwhile", () => {
+  const clock = Object.assign(new Clock(), { offset: 0, bound: 5 });
+  const stream = slowStream({ display: BOX }, 0);
+  Object.assign(stream.station, { clock, bound: 10 });
+  const unit = (age_ms) => ({ flags: 0, sequence: 1, captured: now() - age_ms, arrived: now(), data: null });
+  stream.decoded = now();
+  stream.decode(unit(180), now());
+  assert.equal(statusOf(stream), "live");
+  stream.decode(unit(190), now());
+  assert.equal(statusOf(stream), "late");
+});

@@ -230,6 +230,8 @@ export class Stream {
   decode(unit, received) {
     this.timestamp += 1000;
     this.meta.set(this.timestamp, { ...unit, data: null, timestamp: this.timestamp, received });
+    // The picture is at least that late when it is drawn; until then the one before would count as live.
+    if (this.drawn && !(unit.flags & CATCH_UP) && !this.isOnlyInBirdseye) this.checkAge(unit, received);
     const type = unit.flags & KEY ? "key" : "delta";
     try {
       this.decoder?.decode(new EncodedVideoChunk({ type, timestamp: this.timestamp, data: unit.data }));
