@@ -365,7 +365,7 @@ def test_a_truncated_drive_is_reported_and_exported(tmp_path):
     write(drive, "drive.jsonl", began("vehicle"), *VEHICLE, end='\n{"t": 1.6, "ev')
     done = run("export", str(drive))
     assert done.returncode == 0
-    assert "line 8 is cut off" in done.stderr
+    assert "line 8 is truncated" in done.stderr
     assert len(messages(drive / "drive.mcap")["/position"][2]) == 2
 
 
