@@ -4,7 +4,7 @@ import { alertStatus, inControl, listen, mode, ofVehicle, publish, remind, store
 import { worstOf } from "./ages.js";
 import { Attention } from "./attention.js";
 import { isGuided, nextChoice } from "./guides.js";
-import { holding, linkFault, toggleControl, whyNotHeeded } from "./header.js";
+import { holding, linkFault, toggleControl, whyNotInControl } from "./header.js";
 import { withKey } from "./hints.js";
 import { reportAttention, showGuides } from "./link.js";
 import { monitored, ownPictures } from "./monitored.js";
@@ -179,7 +179,7 @@ function onPress() {
 
 function warningText() {
   if (!inControl()) return holding.isLost ? `CONTROL LOST: ${lossWords()}` : null;
-  const why = whyNotHeeded();
+  const why = whyNotInControl();
   return [why && `NOT IN CONTROL: ${why}`, attention.warning].filter(Boolean).join(" · ") || null;
 }
 

@@ -55,7 +55,7 @@ function watchHearing() {
 }
 
 /** Why this page does not control the vehicle, although it is in control of its station; null: it does. */
-export function whyNotHeeded() {
+export function whyNotInControl() {
   const other = otherOperator();
   return other ? `operator ${other} is in control` : hearing.isLost ? UNHEARD : null;
 }
