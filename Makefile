@@ -26,8 +26,10 @@ demo: $(READY)
 test: $(TEST_READY)
 	$(MAKE) --no-print-directory -j 2 --output-sync=line timed untimed
 
+# Each worker imports all files that it is given.
+ALONE = $(shell grep -l mark.alone tests/integration/test_*.py)
 timed: $(TEST_READY)
-	$(BIN)/pytest tests/integration -m "alone and not soak" -n $$(($$(nproc) + 1)) --dist loadgroup --durations=10
+	$(BIN)/pytest $(ALONE) -m "alone and not soak" -n $$(($$(nproc) + 1)) --dist loadgroup --durations=10
 	$(BIN)/pytest tests/integration -m "timed and not soak" -n $$(($$(nproc) + 1)) --dist loadfile --no-loadscope-reorder --durations=30
 
 untimed: $(TEST_READY)

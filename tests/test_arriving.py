@@ -42,7 +42,10 @@ def test_the_marker_ends_a_frame() -> None:
 
 
 class Stream:
-    """Frames of two packets of 1000 bytes, one every 50 ms; the packets of a frame are 2 ms apart."""
+    """Frames of two packets of 1000 bytes, one every 50 ms; the packets of a frame are 2 ms apart.
+
+    The first one states when the frame was captured.
+    """
 
     def __init__(self) -> None:
         self.frames, self._first = ArrivingFrames(), 65_530  # numbers wrap around soon
@@ -50,9 +53,8 @@ class Stream:
     def send(self, frame: int, parts: str = "01", *, after_ms: float = 0, retransmitted: bool = False) -> bool:
         newer = False
         for part in map(int, parts):
-            packet = Packet(
-                (self._first + 2 * frame + part) % 65536, 4500 * frame % 2**32, part == 1, 1000, CAPTURED + frame / 20
-            )
+            captured = CAPTURED + frame / 20 if part == 0 else None  # as sent by GStreamer
+            packet = Packet((self._first + 2 * frame + part) % 65536, 4500 * frame % 2**32, part == 1, 1000, captured)
             newer = self.frames.add(packet, self.at(frame, 2 * part + after_ms), retransmitted=retransmitted)
         return newer
 

@@ -79,6 +79,7 @@ class ArrivingFrames:
         self._newest: Packet | None = None
         self._arrived = 0.0  # when the newest packet arrived
         self._captured, self._bytes = 0.0, 0  # of its frame; bytes not emitted yet
+        self._ahead = 0.0  # how far capture times are ahead of the media clock, s
         self._whole = False  # no packet of the frame is missing so far
         self._open = self._emitted = False  # the frame has not ended; its arrival is in `_frames`
         self._gap = 0.0
@@ -166,7 +167,9 @@ class ArrivingFrames:
             # Frames that all arrive late are queued, not lost: requesting them again would lengthen the queue.
             self._interval = max(self._clock.seconds - before, now - self._began)
         self._began = now
-        self._captured = self._clock.seconds if packet.captured is None else packet.captured
+        if packet.captured is not None:
+            self._ahead = packet.captured - self._clock.seconds
+        self._captured = self._clock.seconds + self._ahead  # only the first packet states it, and may be lost
         self._whole = True
 
     def _emit(self) -> None:
