@@ -384,9 +384,11 @@ def _is_contested(cap: LinkCap) -> bool:
 def _yielded(cap: LinkCap, t: float) -> Fraction:
     """The share of the most that arrived, below which the cameras do not yield; less after EASED_S of a long queue.
 
-    If the link fell to just that share, the cameras' own queue would never drain.
+    If the link fell to just that share, the cameras' own queue would never drain. Not on a contested link, whose queue
+    others keep full: some cameras would fall below their floors.
     """
-    return YIELDED * EASED if t - cap.short >= EASED_S else YIELDED
+    has_fallen = t - cap.short >= EASED_S and not _is_contested(cap)
+    return YIELDED * EASED if has_fallen else YIELDED
 
 
 def _burst(cap: LinkCap, link: LinkMeasured, t: float) -> Fraction:
