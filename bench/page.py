@@ -17,7 +17,6 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -31,7 +30,7 @@ from table import Row, show, spread
 from usage import processor_s
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "integration"))
-from rig import CHROMIUM_FLAGS, Operator, answers, free_port, process, until
+from rig import CHROMIUM_FLAGS, Operator, answers, free_port, process, repeating, until
 from runner.configuration.config import configuration
 from runner.core.model import Endpoint
 from runner.mqtt.broker import private_broker
@@ -214,19 +213,15 @@ def _skipped(before: Sequence[Mapping[str, int]], after: Sequence[Mapping[str, i
 @contextmanager
 def _steering(broker: Endpoint) -> Iterator[None]:
     """The steering wheel turns from side to side, reported to the vehicle."""
-    ended, driver = threading.Event(), Operator(broker, "bench")
+    driver = Operator(broker, "bench")
 
     def turn() -> None:
-        while not ended.wait(STEERING_S):
-            driver.send("steering", event="steering_reported", rad=STEERING_RAD * math.sin(time.time()))
+        driver.send("steering", event="steering_reported", rad=STEERING_RAD * math.sin(time.time()))
 
-    turning = threading.Thread(target=turn)
-    turning.start()
     try:
-        yield
+        with repeating(turn, STEERING_S):
+            yield
     finally:
-        ended.set()
-        turning.join()
         driver.link.close()
 
 

@@ -11,6 +11,7 @@ import shutil
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -236,6 +237,24 @@ def passes(done: Callable[[], Any], seconds: float = WAIT_S) -> bool:
         return bool(until(done, seconds))
     except AssertionError:
         return False
+
+
+@contextmanager
+def repeating(call: Callable[[], Any], every_s: float) -> Iterator[None]:
+    """Call a function regularly, in a thread of its own."""
+    ended = threading.Event()
+
+    def repeat() -> None:
+        while not ended.wait(every_s):
+            call()
+
+    thread = threading.Thread(target=repeat)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
 
 
 class RecordingListener(Listener):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import subprocess
-import threading
 import time
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -16,7 +15,7 @@ import pytest
 from painted import CAR
 
 from browser import until
-from rig import free_port, needs_browser
+from rig import free_port, needs_browser, repeating
 from runner.configuration.config import configuration
 from runner.core.events import parse
 from runner.core.model import plain
@@ -127,23 +126,19 @@ def vehicle_file(cameras, size, estimated):
 @contextmanager
 def serving(station):
     """The page's server, sending the pictures of all cameras except the silent ones."""
-    page, ended = PageServer(station.vehicle, station), threading.Event()
+    page = PageServer(station.vehicle, station)
     page.behind_s = 0.0  # how long ago pictures were captured
 
     def send():
-        while not ended.wait(EVERY_S):
-            for name, data in station.units.items():
-                if name not in station.silent:
-                    page.show(name, read_unit(data, time.time() - page.behind_s, time.time()))
+        for name, data in station.units.items():
+            if name not in station.silent:
+                page.show(name, read_unit(data, time.time() - page.behind_s, time.time()))
 
     page.start()
-    sending = threading.Thread(target=send)
-    sending.start()
     try:
-        yield page
+        with repeating(send, EVERY_S):
+            yield page
     finally:
-        ended.set()
-        sending.join()
         page.stop()
 
 
@@ -159,19 +154,6 @@ def on_screen(locator, before, mode="L"):
     return np.asarray(image.open(io.BytesIO(png)).convert(mode), float), known
 
 
-@contextmanager
 def steering(served, rad):
     """Report the steering angle 20 times a second."""
-    ended = threading.Event()
-
-    def report():
-        while not ended.wait(0.05):
-            served.on_steering(time.time(), rad)
-
-    reporting = threading.Thread(target=report)
-    reporting.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        reporting.join()
+    return repeating(lambda: served.on_steering(time.time(), rad), 0.05)
