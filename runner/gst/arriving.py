@@ -77,7 +77,7 @@ class ArrivingFrames:
         self._frames: deque[Arrival] = deque(maxlen=MAX_FRAMES)
         self._clock = MediaClock(1 / RTP_HZ)
         self._newest: Packet | None = None
-        self._arrived = 0.0  # when the newest packet arrived
+        self._handled = self._arrived = 0.0  # when the newest packet was added, and when it arrived
         self._captured, self._bytes = 0.0, 0  # of its frame; bytes not emitted yet
         self._ahead = 0.0  # how far capture times are ahead of the media clock, s
         self._whole = False  # no packet of the frame is missing so far
@@ -88,10 +88,11 @@ class ArrivingFrames:
         self._restarted: int | None = None  # the sequence number that confirms a restart
         self.received = self.missing = 0  # packets received, and packets missing when a later one arrived
 
-    def add(self, packet: Packet, now: float, *, retransmitted: bool = False) -> bool:
+    def add(self, packet: Packet, now: float, arrived: float | None = None, *, retransmitted: bool = False) -> bool:
         """Add a packet; returns whether it is newer than all earlier ones.
 
-        now  s, when it arrived
+        now      s
+        arrived  when the kernel received it, s; None: now
         """
         with self._lock:
             ahead = 0 if self._newest is None else (packet.number - self._newest.number - 1) % (2 * HALF)
@@ -99,19 +100,19 @@ class ArrivingFrames:
                 self._add_older(packet, retransmitted)
                 return False
             if ahead < DROPOUT:
-                self._add_newer(packet, now, retransmitted, whole=not ahead)
+                self._add_newer(packet, now, now if arrived is None else arrived, retransmitted, whole=not ahead)
                 self._note_missing(packet.number, ahead)
                 return True
             expected, self._restarted = self._restarted, (packet.number + 1) % (2 * HALF)
             if packet.number != expected:
                 return False
-            self._add_newer(packet, now, retransmitted, whole=False)
+            self._add_newer(packet, now, now if arrived is None else arrived, retransmitted, whole=False)
             return True
 
     def is_late(self, now: float) -> bool:
         """Whether the rest of the current frame, or all of the next one, is overdue, so that packets are missing."""
         if self._open:
-            return now - self._arrived > max(TAIL_S, TAIL_GAPS * self._gap)
+            return now - self._handled > max(TAIL_S, TAIL_GAPS * self._gap)
         return now - self._began > INTERVALS * self._interval
 
     def next_number(self) -> int:
@@ -138,15 +139,16 @@ class ArrivingFrames:
             self._bytes += packet.bytes
             self.received, self.missing = self.received + 1, self.missing - 1
 
-    def _add_newer(self, packet: Packet, now: float, retransmitted: bool, *, whole: bool) -> None:
+    def _add_newer(self, packet: Packet, now: float, arrived: float, retransmitted: bool, *, whole: bool) -> None:
         """Add a packet that is newer than all earlier ones. whole: no packet is missing before it."""
         self.received, self.missing = self.received + (not retransmitted), self.missing + retransmitted
         if self._newest is None or packet.stamp != self._newest.stamp:
             self._begin(packet, now, regular=whole and not retransmitted)
         elif not retransmitted:
-            self._gap = max(now - self._arrived, GAP_DECAY * self._gap)
+            self._gap = max(now - self._handled, GAP_DECAY * self._gap)
         self._whole &= whole and not retransmitted
-        self._newest, self._arrived, self._bytes = packet, now, self._bytes + packet.bytes
+        self._newest, self._handled, self._bytes = packet, now, self._bytes + packet.bytes
+        self._arrived = arrived
         self._open, self._emitted = not packet.last, False
         if packet.last:
             self._emit()

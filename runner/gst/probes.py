@@ -81,6 +81,12 @@ class PassingBuffer:
         return None if pts == Gst.CLOCK_TIME_NONE else pts
 
     @property
+    def dts(self) -> int | None:
+        """ns; None if not set."""
+        dts = int(_Buffer.from_address(self._address).dts)
+        return None if dts == Gst.CLOCK_TIME_NONE else dts
+
+    @property
     def size(self) -> int:
         """Bytes."""
         return int(_get_size(self._address))

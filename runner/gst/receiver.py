@@ -14,6 +14,7 @@ from gi.repository import Gst, GstSdp
 from runner.graph import Plan, video_codec
 from runner.gst.arriving import MAX_FRAMES, NTP_EPOCH_S, RTP_HZ, MediaClock
 from runner.gst.caps import structure
+from runner.gst.packet_times import state_arrivals
 from runner.gst.probes import BufferProbe, PassingBuffer
 from runner.gst.repair import RepairBuffer
 from runner.gst.rtspsrc import STREAM_ENDED, Opening, handle_stream_end, is_rtsp_client, limit_teardown
@@ -278,7 +279,9 @@ class Receiver:
         factory = element.get_factory().get_name() if element.get_factory() else ""
         if factory == "rtpjitterbuffer":
             self._buffers.append(RepairBuffer(element, self._reorder_ms))
-        self._over_udp |= factory == "udpsrc"
+        if factory == "udpsrc":
+            self._over_udp = True
+            self._time_packets(element)
         if element.find_property("used-socket") and element.get_static_pad("src"):
             self._filter_senders(element)
 
@@ -290,6 +293,12 @@ class Receiver:
     def _on_stream_ended(self, client: Gst.Element) -> None:
         if client is self._client:
             self._supervised.restart(STREAM_ENDED)
+
+    def _time_packets(self, source: Gst.Element) -> None:
+        try:
+            state_arrivals(source)
+        except OSError as error:
+            self._on_report(self._name, f"the kernel does not state when packets arrive: {error}")
 
     def _filter_senders(self, source: Gst.Element) -> None:
         """Make a socket of the client accept packets from the vehicle only. From the client's thread."""

@@ -20,6 +20,7 @@ DECAY = 0.75  # of both counts, from one update to the next
 INITIAL_RTT_MS = 100  # round trip assumed until the first retransmission
 LONGEST_MS = 300  # a picture that is later is useless for driving
 RETRANSMITTED = Gst.BufferFlags.LAST  # GST_RTP_BUFFER_FLAG_RETRANSMISSION, which has the same value
+LONGEST_S = 2.0  # a packet that seems to have arrived earlier has another clock's time
 FRAMES = 64  # whose end is remembered
 
 
@@ -102,11 +103,18 @@ class RepairBuffer:
         request.set_value("seqnum", GObject.Value(GObject.TYPE_UINT, self.frames.next_number()))
         self._pad.push_event(Gst.Event.new_custom(Gst.EventType.CUSTOM_UPSTREAM, request))
 
+    def _arrived(self, buffer: PassingBuffer, now: float) -> float:
+        """When the kernel received a packet, s, where the DTS states it: see `runner.gst.packet_times`."""
+        if buffer.dts is None:
+            return now
+        arrived = (self._buffer.get_base_time() + buffer.dts) / Gst.SECOND  # a pipeline's clock is the monotonic one
+        return arrived if now - LONGEST_S < arrived < now else now
+
     def _on_packet(self, _pad: Gst.Pad, buffer: PassingBuffer) -> bool:
         now = time.monotonic()
         packet = read_packet(buffer.extract(0, HEADER_BYTES), buffer.size)
         retransmitted = buffer.has_flags(RETRANSMITTED)
-        if not self.frames.add(packet, now, retransmitted=retransmitted):
+        if not self.frames.add(packet, now, self._arrived(buffer, now), retransmitted=retransmitted):
             return False
         if self._tail_requested and retransmitted:
             buffer.unset_flags(RETRANSMITTED)  # the buffer drops retransmissions that it has not requested itself

@@ -1,0 +1,25 @@
+"""Arrival times of UDP packets by the kernel: those of a process that is held up would be late."""
+
+from __future__ import annotations
+
+import os
+import socket
+
+from gi.repository import Gst
+
+SO_TIMESTAMPNS = 35  # asm-generic/socket.h
+REALTIME = 1  # GstSocketTimestampMode, GStreamer 1.20
+
+
+def state_arrivals(source: Gst.Element) -> None:
+    """Make a udpsrc state in the DTS of each packet when the kernel received it, not when the element read it.
+
+    The element asks the kernel for it when it opens, which a client's has done before it can be configured.
+
+    raises  OSError if the system lacks such times
+    """
+    if source.find_property("socket-timestamp") is None or (used := source.get_property("used-socket")) is None:
+        return
+    with socket.socket(fileno=os.dup(used.get_fd())) as duplicate:
+        duplicate.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+    source.set_property("socket-timestamp", REALTIME)
