@@ -40,7 +40,7 @@ from runner.gst.supervised import CameraCaller
 from runner.gst.timers import every
 from runner.gst.video_files import VideoFile, VideoFiles
 from runner.gst.watched import WatchedSource
-from runner.records import Arrivals
+from runner.records import Arrivals, SentFrame
 
 if TYPE_CHECKING:
     from fractions import Fraction
@@ -82,6 +82,7 @@ __all__ = [
 ]
 
 CALL_S = 10.0  # timeout of a call into GLib's thread, which normally takes milliseconds
+LOOK_MS = 20  # how often it looks which frames have left: their times are known as precisely as this
 BEAT_MS = 200  # how often GLib's thread shows that it runs
 TAILS_MS = 10  # how often receivers check for frames whose end is missing
 STOP_S = 2.0  # how long teardown waits for pipelines to stop
@@ -250,6 +251,7 @@ class VehicleSide:
                 self._server = CameraServer(served, media, self._build, on_report, keyring)
             for caller in self._callers.values():
                 caller.start()
+            self._looking = GLib.timeout_add(LOOK_MS, self._look)
 
         self._glib.call("starting the cameras", start)
 
@@ -309,6 +311,14 @@ class VehicleSide:
         pipelines = {name: pipeline for name in self._wanted if (pipeline := self._pipeline(name))}
         return {name: stages for name, pipeline in pipelines.items() if (stages := pipeline.stages())}
 
+    def sent_frames(self) -> dict[str, list[SentFrame]]:
+        """By camera, when the frames left that were seen since the last call. From any one thread."""
+        return {
+            name: pipeline.sent_frames.take()
+            for name in self._wanted
+            if (pipeline := self._pipeline(name)) and pipeline.sent_frames
+        }
+
     def send_key_frames(self, cameras: Iterable[str]) -> None:
         """Make the encoders of these cameras send key frames, as their graphs allow; unknown cameras are ignored."""
         for name in cameras:
@@ -337,6 +347,7 @@ class VehicleSide:
 
     def stop(self) -> None:
         def stop() -> None:
+            GLib.source_remove(self._looking)
             for caller in self._callers.values():
                 caller.stop()
             if self._server:
@@ -364,6 +375,13 @@ class VehicleSide:
             lambda what: self._on_report(name, what),
             source,
         )
+
+    def _look(self) -> bool:
+        """Look which frame each camera has sent last."""
+        for name in self._wanted:
+            if (pipeline := self._pipeline(name)) and pipeline.sent_frames:
+                pipeline.sent_frames.look()
+        return True
 
     def _on_knobs_turned(self) -> None:
         self.on_turned()  # looked up now: it may have been set after the pipeline was built

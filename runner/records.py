@@ -337,6 +337,18 @@ class Arrival(NamedTuple):
     whole: bool = True
 
 
+class SentFrame(NamedTuple):
+    """A frame that a camera's payloader has output, seen by looking now and then; s since 1970 by the vehicle's clock.
+
+    unsent  when the camera was last seen sending an older one
+    sent    when it was first seen sending this one
+    """
+
+    captured: float
+    unsent: float
+    sent: float
+
+
 class Arrivals(NamedTuple):
     """What the operator's side has received since the last call.
 
@@ -381,6 +393,7 @@ class ReceptionReport:
     damaged        cameras whose newest picture shows unrecovered packet loss; absent: none
     sent           s since 1970 by the operator's clock; present if the vehicle should answer with a `ClockAnswer`
     run            random number of this run of the operator's side, to which delays and times are relative
+    offset_s       the constant that delays are less by; absent: no unit
     """
 
     at: float
@@ -392,16 +405,23 @@ class ReceptionReport:
     damaged: tuple[str, ...] | UnsetType = UNSET
     sent: float | UnsetType = UNSET
     run: int | UnsetType = UNSET
+    offset_s: float | UnsetType = UNSET
 
 
 @dataclass(frozen=True, slots=True)
 class ReceptionReported:
-    """Vehicle's log line: a reception report that arrived at t, and whether its operator was in control."""
+    """Vehicle's log line: a reception report that arrived at t, and whether its operator was in control.
+
+    late_s        of each unit: by how much longer than usual the vehicle at least took to send it; absent: by nothing
+    all_received  nothing was on its way when the report was made; absent: unknown, or not so, or the report has units
+    """
 
     t: float
     operator: str
     in_control: bool
     report: ReceptionReport
+    late_s: tuple[float, ...] | UnsetType = UNSET
+    all_received: bool | UnsetType = UNSET
 
 
 # --- other log lines --------------------------------------------------------------------------------------------------

@@ -13,10 +13,13 @@ from typing import Any
 from runner.core.events import LinkMeasured, PositionReported
 from runner.core.link_cap import UNCAPPED, LinkCap, believed_limit, start_cap, update_cap
 from runner.core.uplink import LinkEstimate, LinkReport, ReceivedUnit, UplinkMemory, estimate
+from runner.records import SentFrame
+from runner.vehicle.sending import SendingTimes
 
 Profile = Callable[[float], float]  # value over time, s
 SLOT_S = 0.01  # capacity is constant for this long
 PACKET = 1200  # bytes
+LOOK_S = 0.02
 
 
 @dataclass(repr=False)
@@ -156,6 +159,7 @@ def drive(
     start: Fraction = Fraction(1),
     key_frame: float = 1,
     late: Callable[[int, float], float] = lambda camera, t: 0.0,
+    watched: bool = False,
     filled: float = 1.0,
     flows: type[Tcp] = Tcp,
     predicted: bool = True,
@@ -169,13 +173,14 @@ def drive(
     start  share of the limit until the link is measured
     key_frame  size of each camera's first frame, in multiples of the others
     late  delay until the frame that a camera captures at t is sent, s
+    watched  whether the vehicle looks every LOOK_S which frames it has sent
     filled  share of their bitrate that the encoders use
     predicted  whether the limit is a prediction; otherwise only the measurement limits the total
     """
     rng, order, uplink = random.Random(seed), itertools.count(), UplinkMemory()
     begin, end = tcp_s or (seconds, seconds)
     link_queue, tcp = Queue(link, queued_s), flows(end, 2 * link.one_way_s)
-    done, cap = Drive(tcp=tcp.delivered), _first_cap(limit(0.0), start, predicted)
+    done, cap, sending = Drive(tcp=tcp.delivered), _first_cap(limit(0.0), start, predicted), SendingTimes()
     events: list[tuple[float, int, str, Any]] = [
         (0.001 * number, next(order), "frame", number) for number in range(cameras)
     ]
@@ -187,8 +192,7 @@ def drive(
 
     last_unit = last_report = 0.0
     in_flight: list[tuple[ReceivedUnit, int, int]] = []  # with packets received, and those missing until then
-    missing = [0] * cameras
-    in_force = limit(0.0) if cap.kbps is None else float(cap.kbps)
+    missing, in_force = [0] * cameras, limit(0.0) if cap.kbps is None else float(cap.kbps)
     while events and events[0][0] < seconds:
         t, _, kind, what = heapq.heappop(events)
         if kind == "frame":
@@ -214,6 +218,7 @@ def drive(
                             size,
                             not lost_packets,
                             link.playout_s,
+                            _look(sending, camera, captured, t) if watched else 0.0,
                         ),
                         len(left),
                         missing[camera],
@@ -230,7 +235,8 @@ def drive(
             in_flight = in_flight[len(arrived) :]
             last_report = max(last_report, t + link.one_way_s + link.delay_s(t))
             units, packets, lost = zip(*arrived, strict=True) if arrived else ((), (), ())
-            schedule(last_report, "arrived", LinkReport(t, units, sum(packets), sum(lost)))
+            counts = (sum(packets), sum(lost), not units and sending.is_all_received(t))
+            schedule(last_report, "arrived", LinkReport(t, units, *counts))
         else:
             uplink, estimated = estimate(uplink, what)
             if estimated:
@@ -246,6 +252,13 @@ def drive(
 
 def _first_cap(limit: float, start: Fraction, predicted: bool) -> LinkCap:
     return start_cap(UNCAPPED._replace(alone=not predicted, predicted=predicted), None, 0.0, Fraction(limit), start)
+
+
+def _look(sending: SendingTimes, camera: int, captured: float, t: float) -> float:
+    """What the vehicle knows of how late it sent a frame, at t, s."""
+    looked = t // LOOK_S * LOOK_S
+    sending.add({f"camera {camera}": [SentFrame(captured, looked, looked + LOOK_S)]})
+    return sending.late_s(f"camera {camera}", captured)
 
 
 def _send_frame(queue: Queue, t: float, size: int, is_lost: Callable[[], bool]) -> tuple[list[float], int]:

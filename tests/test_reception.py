@@ -53,7 +53,8 @@ def test_a_report_is_read_back_as_it_was_sent() -> None:
         ({"lost": -1}, "lost: -1: must be at least 0"),
         (
             {"extra": 1},
-            "extra: unknown key; expected one of at, as_of, units, packets, lost, latency_ms, damaged, sent, run",
+            "extra: unknown key; expected one of at, as_of, units, packets, lost, latency_ms, damaged, sent, run, "
+            "offset_s",
         ),
     ],
 )

@@ -217,6 +217,31 @@ def test_frames_that_a_busy_machine_sends_late_do_not_starve_the_video(
     assert utilisation(done, link, total, 5, 29) >= least
 
 
+def pauses(seconds: float, long_s: float) -> Callable[[int, float], float]:
+    """Every second a machine stands still for so long, and then sends all frames of that time."""
+    until = stalls(*((float(begin), begin + long_s) for begin in range(2, int(seconds))))
+    return lambda _camera, t: until(t)
+
+
+@pytest.mark.parametrize("long_s", [0.25, 0.45])
+def test_pauses_that_a_vehicle_knows_of_cut_nothing(long_s: float) -> None:
+    link, limit = Link(steps((0, 50_000))), steps((0, RIGHT))  # wide: afterwards no queue remains
+    watched, unwatched = (drive(link, limit, 20, late=pauses(20, long_s), watched=each) for each in (True, False))
+    assert watched.cuts(1, 20) == 0
+    assert unwatched.cuts(1, 20) > 10
+
+
+@pytest.mark.parametrize("ms", [60, 120])
+def test_a_vehicle_that_knows_its_own_delays_still_sees_the_link_fall(ms: float) -> None:
+    link, limit = Link(steps((0, 4000), (10, 2000))), steps((0, RIGHT))
+    watched, unwatched = (
+        drive(link, limit, 20, cameras=3, fps=15, late=busy(0.5, 0.5, ms), watched=each) for each in (True, False)
+    )
+    assert watched.lowest(10, 10.5) <= 2000
+    assert watched.wait_ms(0.95, 11) <= 100
+    assert watched.kbps(11, 19) >= unwatched.kbps(11, 19)
+
+
 @pytest.mark.parametrize("fps", [5, 10, 15, 40])
 def test_any_frame_rate(fps: float) -> None:
     link, limit = Link(steps((0, 4000), (10, 2000), (20, 4000))), steps((0, HIGH))

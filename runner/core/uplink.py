@@ -68,6 +68,7 @@ class ReceivedUnit:
     bytes     received on the wire, including headers
     whole     whether no packet was initially missing
     playout   s for which the transport holds a unit back, which hides a shorter wait in the queue
+    late      s by which the vehicle at least took longer than usual to send it: no queue
     """
 
     camera: str
@@ -76,6 +77,7 @@ class ReceivedUnit:
     bytes: int
     whole: bool = True
     playout: float = 0.0
+    late: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,12 +87,14 @@ class LinkReport:
     at             s, time of the report by the operator's monotonic clock
     units          in order of arrival
     packets, lost  RTP packets of all cameras received, and missing
+    all_received   the vehicle had sent nothing that was still on its way
     """
 
     at: float
     units: tuple[ReceivedUnit, ...] = ()
     packets: int = 0
     lost: int = 0
+    all_received: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,7 +204,7 @@ def estimate(uplink: UplinkMemory, report: LinkReport) -> tuple[UplinkMemory, Li
         onset = max((u.arrived for u in uplink.units if u.queue <= EMPTY_S), default=uplink.units[0].arrived)
     else:
         onset = uplink.onset
-    stalled = report.at - last > _longest_gap(frame)
+    stalled = not report.all_received and report.at - last > _longest_gap(frame)
     # In a stall nothing new is known of the queue, which would seem not to drain.
     waits = () if stalled else _entries_since(uplink.queues, report.at - STUCK_S)
     queues = (*waits, (report.at, queue, report.packets, report.lost))
@@ -243,7 +247,7 @@ def _add_units(uplink: UplinkMemory, units: Iterable[ReceivedUnit]) -> UplinkMem
         if newest and unit.arrived - newest > PAUSE_S + 1.5 * _frame_interval(intervals, captured):
             resumed = unit.arrived
         newest = max(newest, unit.arrived) if newest else unit.arrived
-        queue = max(0.0, unit.arrived - unit.captured - shortest)
+        queue = max(0.0, unit.arrived - unit.captured - unit.late - shortest)
         kept.append(_Unit(unit.arrived, queue, unit.bytes, unit.playout))
     kept.sort(key=attrgetter("arrived"))  # a unit without its last packets is reported late
     recent = tuple(unit for unit in kept if unit.arrived > kept[-1].arrived - KEPT_S)[-MAX_UNITS:]

@@ -16,6 +16,7 @@ from runner.gst.probes import BufferProbe, PassingBuffer, TypeProbe
 from runner.gst.repeats import RepeatDetector
 from runner.gst.requests import RequestLimit
 from runner.gst.sender_stages import EncoderWatch, SenderStages
+from runner.gst.sent_frames import SentFrames
 from runner.gst.source import loop_clip
 from runner.gst.watched import WatchedSource
 
@@ -42,8 +43,9 @@ class CameraPipeline:
     on_report  called, from a streaming thread, with a fault of the source, and on its recovery
     source     the source, if it is watched
 
-    untimed    whether the source does not know when the last picture was captured
-    requests   limits what viewers request
+    untimed      whether the source does not know when the last picture was captured
+    requests     limits what viewers request
+    sent_frames  when frames left; None without RTP
     """
 
     def __init__(
@@ -71,7 +73,9 @@ class CameraPipeline:
         entry = self._elements[0].get_static_pad("sink")
         self._repeats = RepeatDetector(entry, plan.camera.source.repeated_s, on_report)
         last = next(pad for element in reversed(self._elements) if (pad := element.get_static_pad("src")))
-        self._add_capture_time(last.get_parent_element())
+        payloader = last.get_parent_element()
+        self._add_capture_time(payloader)
+        self.sent_frames = SentFrames(payloader) if isinstance(payloader, GstRtp.RTPBasePayload) else None
         self.knobs.set_now(self._allowed(self._first))
         self.requests = RequestLimit(last, on_report)
         self._first_packet = BufferProbe(last, self._on_first_packet, in_lists=True)

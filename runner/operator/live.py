@@ -30,6 +30,7 @@ from runner.operator.station import Listener, Station
 from runner.plans import compile_plans
 from runner.records import Outcome, Sample, VehicleState
 from runner.security.exposure import viewer_keyring
+from runner.system.held_up import LateCheck
 from runner.system.service import notify
 
 if TYPE_CHECKING:
@@ -71,6 +72,7 @@ class LiveOperator:
         self._requests = deque(requests)
         self._failure: RunError | None = None
         self._sampled = time.monotonic()
+        self._late = LateCheck(2.5 * REPORT_S)
         self._thread = threading.Thread(target=self._run, name="sampling", daemon=True)
         self._reporting = threading.Thread(target=self._report, name="reporting", daemon=True)
 
@@ -145,7 +147,8 @@ class LiveOperator:
         self._repeat("reception report", REPORT_S, lambda: self._report_reception(side))
 
     def _report_reception(self, side: OperatorSide) -> None:
-        if self.station.may_report():
+        is_held_up = self._late.is_excused(time.monotonic())  # other threads first read what has arrived meanwhile
+        if not is_held_up and self.station.may_report():
             self.station.report_reception(side.take_arrivals())
 
     def _repeat(self, what: str, every_s: float, work: Callable[[], None]) -> None:

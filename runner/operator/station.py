@@ -272,6 +272,8 @@ class Station:
             return
         counts = (arrivals.packets, arrivals.lost)
         report = ReceptionReport(round(now, 4), self._vehicle_now(now), received, *counts, run=self._run)
+        if received:
+            report = replace(report, offset_s=round(base, 4))
         if arrivals.damaged:
             report = replace(report, damaged=tuple(arrivals.damaged))
         if (latency_ms := self._worst_latency_ms(now)) is not None:

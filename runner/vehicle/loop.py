@@ -38,6 +38,7 @@ from runner.records import (
     Position,
     ReceptionReport,
     ReceptionReported,
+    SentFrame,
     SpeedAdvice,
     SteeringAngle,
     Telemetry,
@@ -45,10 +46,12 @@ from runner.records import (
     applied_to_json,
 )
 from runner.schema import event_problem, shortened
+from runner.system.held_up import LateCheck
 from runner.system.reports import LimitedReports
 from runner.vehicle.access import Access
 from runner.vehicle.inbox import MAX_QUEUED, Answer, Inbox, Item, QueuedReport, Request
 from runner.vehicle.operators import SILENT_S, Operators
+from runner.vehicle.sending import SendingTimes
 from runner.vehicle.uplink import PRESENT_S, MeasuredUplink
 
 if TYPE_CHECKING:
@@ -79,6 +82,7 @@ class Applier(Protocol):
     def sources(self) -> Mapping[str, str]: ...
     def untimed(self) -> Collection[str]: ...
     def stages(self) -> Mapping[str, tuple[float, float]]: ...
+    def sent_frames(self) -> Mapping[str, Iterable[SentFrame]]: ...
     def copies(self) -> Mapping[str, int]: ...
     def give_control(self, operator: str) -> None: ...
     def send_key_frames(self, cameras: Iterable[str]) -> None: ...
@@ -141,7 +145,7 @@ class ControlLoop:
 
     def __post_init__(self) -> None:
         self._operators = Operators(self.vehicle.expires_s, self.access.may_control)
-        self._uplink = MeasuredUplink(self.vehicle)
+        self._uplink, self._sending = MeasuredUplink(self.vehicle), SendingTimes()
         self._report_denial = LimitedReports(self.on_report)
         self._in_control = ""
         self._operators_checked = 0.0  # when operators were last checked for silence
@@ -211,9 +215,12 @@ class ControlLoop:
         self._warned = 0
         self._run = start(self.vehicle)
         self._guarded("start", lambda: self._take(ClockAdvanced(t=0.0)))
-        next_tick = TICK_S
+        next_tick, late = TICK_S, LateCheck(2 * TICK_S)
+        late.is_excused(0)
         while not self._stopped and (duration_s is None or self._now() < duration_s):
-            if self._now() >= next_tick:
+            if (now := self._now()) >= next_tick and late.is_excused(now):  # first handle what has arrived meanwhile
+                next_tick = now + TICK_S / 2
+            elif now >= next_tick:
                 self._tick()
                 next_tick = max(next_tick + TICK_S, self._now() - TICK_S)
             item = self._inbox.get(self._began + next_tick)
@@ -317,6 +324,8 @@ class ControlLoop:
                 (item.sender, item.report.run): t
             }
         reported = ReceptionReported(t, item.sender, item.sender == self._operators.in_control, item.report)
+        if reported.in_control:
+            reported = self._with_lateness(reported)
         self.log.record(reported if reported.in_control else replace(reported, report=_totals(reported.report)))
         link = self._uplink.take(reported)
         if self._uplink.has_rival:
@@ -330,6 +339,21 @@ class ControlLoop:
             self._take(link)
         if reported.in_control and item.report.damaged is not UNSET:
             self._repair(item.report.damaged, t)
+
+    def _with_lateness(self, reported: ReceptionReported) -> ReceptionReported:
+        """The report, with what this side knows of its own delays."""
+        report = reported.report
+        self._sending.add(self.applier.sent_frames())
+        if not report.units:
+            made_at = time.time() - (reported.t - report.as_of)
+            return replace(reported, all_received=self._sending.is_all_received(made_at) or UNSET)
+        if report.offset_s is UNSET:
+            return reported
+        captured = report.at - report.offset_s
+        late_s = tuple(
+            round(self._sending.late_s(unit.camera, captured - unit.ago_s - unit.delay_s), 4) for unit in report.units
+        )
+        return replace(reported, late_s=late_s if any(late_s) else UNSET)
 
     def _goes_on(self, goodbye: Request, t: float) -> bool:
         """Whether another process of the operator that says goodbye still sends reports."""

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field
+from itertools import repeat
 from operator import attrgetter
+
+from msgspec import UNSET
 
 from runner.core.budget import on_the_wire
 from runner.core.events import LinkMeasured
 from runner.core.model import Vehicle, exact
 from runner.core.uplink import LinkReport, ReceivedUnit, UplinkMemory, estimate
-from runner.records import ReceptionReport, ReceptionReported
+from runner.records import ReceptionReported
 
 ROUND_TRIPS = 64  # remembered; the smallest is the round trip
 LONGEST_S = 60.0  # upper limit of a reported round trip
@@ -46,7 +49,7 @@ class MeasuredUplink:
             self._round_trips.clear()
         self._at, self._t = reported.report.at, reported.t
         self._round_trips.append(max(0.0, reported.t - reported.report.as_of))
-        self._memory, link = estimate(self._memory, _on_the_wire(self.vehicle, reported.report))
+        self._memory, link = estimate(self._memory, _on_the_wire(self.vehicle, reported))
         if link is None:
             return None
         return LinkMeasured(
@@ -59,8 +62,10 @@ class MeasuredUplink:
         )
 
 
-def _on_the_wire(vehicle: Vehicle, report: ReceptionReport) -> LinkReport:
+def _on_the_wire(vehicle: Vehicle, reported: ReceptionReported) -> LinkReport:
     """The report with packet headers added; units of unknown cameras are omitted."""
+    report = reported.report
+    late_s = repeat(0.0) if reported.late_s is UNSET else reported.late_s
     units = [
         ReceivedUnit(
             unit.camera,
@@ -69,8 +74,10 @@ def _on_the_wire(vehicle: Vehicle, report: ReceptionReport) -> LinkReport:
             on_the_wire(vehicle.cameras[unit.camera].graph, unit.bytes),
             unit.whole,
             float(vehicle.cameras[unit.camera].graph.settings.get("srt_latency_ms", 0)) / 1000,
+            late,
         )
-        for unit in report.units
+        for unit, late in zip(report.units, late_s, strict=False)
         if unit.camera in vehicle.cameras
     ]
-    return LinkReport(report.at, tuple(sorted(units, key=attrgetter("arrived"))), report.packets, report.lost)
+    arrived = tuple(sorted(units, key=attrgetter("arrived")))
+    return LinkReport(report.at, arrived, report.packets, report.lost, reported.all_received is True)

@@ -11,7 +11,7 @@ from typing import Any
 from runner.apply import Reception
 from runner.core.commands import Command, KnobValue, KnobValues
 from runner.graph import Plan
-from runner.records import Arrivals
+from runner.records import Arrivals, SentFrame
 
 FRAMES = 5  # delivered by a sending camera between two samples
 FRAME_BYTES = 1000
@@ -70,6 +70,9 @@ class RecordingVehicle:
         return frozenset()
 
     def stages(self) -> dict[str, tuple[float, float]]:
+        return {}
+
+    def sent_frames(self) -> dict[str, list[SentFrame]]:
         return {}
 
     def copies(self) -> dict[str, int]:

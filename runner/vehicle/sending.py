@@ -1,0 +1,94 @@
+"""How late the vehicle itself sent what has arrived: a busy machine must not be mistaken for a busy link. Pure.
+
+A frame that the payloader had not output yet, longer after its capture than usual, was delayed by the vehicle. Where
+that is certain only within a longer time than normal, the machine was too busy to look, and the frame counts as sent at
+the end of it. Otherwise a queue in front of the link is never underestimated.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import takewhile
+from math import inf
+from operator import attrgetter
+
+from runner.records import SentFrame
+
+BUSY_S = 0.04  # between two looks at a payloader, twice the usual time
+KEPT_S = 5.0  # a frame that arrives later is not looked up
+BUCKET_S = 10.0  # the usual duration is the shortest of the current time bucket and the previous one
+SAME_S = 0.002  # capture times of the same frame, rounded by RTP and in reports, differ by less
+ON_ITS_WAY_S = 0.05  # what was sent less than this before an operator's view of the vehicle may still arrive
+
+
+@dataclass
+class _Camera:
+    """The frames that a camera sent recently, in order, and the shortest time from capture to sending."""
+
+    frames: list[SentFrame] = field(default_factory=list)
+    arrived: float = -inf  # capture time of the newest frame that has arrived
+    began: float = -inf  # of the current time bucket
+    before: float = inf
+    shortest: float = inf
+
+    @property
+    def usual_s(self) -> float:
+        return min(self.before, self.shortest)
+
+    def add(self, frame: SentFrame) -> None:
+        if self.frames and frame.captured < self.frames[-1].captured:  # a clock was set
+            self.frames, self.arrived, self.began, self.shortest = [], -inf, -inf, inf
+        if frame.captured - self.began > BUCKET_S:
+            self.began, self.before, self.shortest = frame.captured, self.shortest, inf
+        self.shortest = min(self.shortest, frame.sent - frame.captured)
+        self.frames.append(frame)
+        if self.frames[0].captured < frame.captured - 2 * KEPT_S:
+            del self.frames[: self._index(frame.captured - KEPT_S)]
+
+    def late_s(self, captured: float) -> float:
+        index = self._index(captured - SAME_S)
+        if index == len(self.frames) or captured < self.frames[0].captured - SAME_S:
+            return 0.0
+        frame = self.frames[index]
+        left = frame.sent if frame.sent - frame.unsent > BUSY_S else frame.unsent
+        return max(0.0, left - captured - self.usual_s)
+
+    def missing(self) -> Iterator[SentFrame]:
+        """The frames newer than all that have arrived, the newest first."""
+        return takewhile(lambda frame: frame.captured > self.arrived + SAME_S, reversed(self.frames))
+
+    def _index(self, captured: float) -> int:
+        """Of the first frame captured then or later."""
+        return bisect_left(self.frames, captured, key=attrgetter("captured"))
+
+
+@dataclass
+class SendingTimes:
+    """What each camera sent recently, and how much of it has arrived. Times are s since 1970 by the vehicle's clock."""
+
+    _cameras: dict[str, _Camera] = field(default_factory=dict)
+
+    def add(self, sent: Mapping[str, Iterable[SentFrame]]) -> None:
+        """Add frames, in the order in which they were sent."""
+        for name, frames in sent.items():
+            camera = self._cameras.setdefault(name, _Camera())
+            for frame in frames:
+                camera.add(frame)
+
+    def late_s(self, name: str, captured: float) -> float:
+        """By how much longer than usual the vehicle at least took to send a frame that has arrived; 0: unknown, too."""
+        camera = self._cameras.get(name)
+        if camera is None:
+            return 0.0
+        camera.arrived = max(captured, camera.arrived)
+        return camera.late_s(captured)
+
+    def is_all_received(self, at: float) -> bool:
+        """Whether nothing is on its way that was sent before this time: each frame, or a newer one, has arrived.
+
+        False if that is not known.
+        """
+        sending = [camera for camera in self._cameras.values() if camera.frames]
+        return bool(sending) and all(frame.sent > at - ON_ITS_WAY_S for camera in sending for frame in camera.missing())
