@@ -130,6 +130,16 @@ def test_frames_that_all_arrive_late_are_not_overdue() -> None:
         assert frame < 2 or not stream.frames.is_late(stream.at(frame + 1, 25 * (frame + 1)))
 
 
+def test_packets_that_are_read_late_arrived_earlier_and_their_frame_is_not_overdue() -> None:
+    """A process that was held up reads them 0.2 s after the kernel received them."""
+    frames = ArrivingFrames()
+    for number in range(4):
+        read = 10.2 + 0.001 * number
+        frames.add(Packet(number, 4500, number == 3, 1000, CAPTURED), read, read - 0.2)
+        assert not frames.is_late(read + 0.005)
+    assert [frame.arrived for frame in frames.take(10.21)] == [pytest.approx(10.003)]
+
+
 def test_a_reordered_packet_is_not_missing() -> None:
     stream = Stream()
     stream.send(0)

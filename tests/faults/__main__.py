@@ -49,6 +49,7 @@ FAULTS = [
     Fault(
         "vehicle/operators.py", "t - o.last_message > SILENT_S", "t - o.last_message > 9 * SILENT_S", "test_operators"
     ),
+    Fault("vehicle/sending.py", "left - captured - self.usual_s", "left - captured", "test_sending"),
     Fault("vehicle/inbox.py", "len(waiting) >= MAX_QUEUED", "len(waiting) > MAX_QUEUED", "test_inbox"),
     Fault("operator/meter.py", "* 8 / 1000 /", "/ 1000 /", "test_meter"),
     Fault("operator/notes.py", "if factors[0] != factors[1]", "if True", "test_notes"),
