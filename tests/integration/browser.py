@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import base64
 import os
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import pytest
@@ -45,7 +46,7 @@ def opened(browser, url, width=1280, height=800, refused=False, script="", **con
     script   runs before the page's own
     """
     with browser.new_context(viewport={"width": width, "height": height}, **context) as tab:
-        wrong, own = [], (url.partition("#")[0], "data:", "blob:")
+        wrong, own = _wrong.setdefault(tab, []), (url.partition("#")[0], "data:", "blob:")
         tab.on("weberror", lambda error: wrong.append(str(error.error)))
         tab.on("console", lambda message: wrong.append(message.text) if message.type == "error" else None)
         tab.on("request", lambda request: request.url.startswith(own) or wrong.append(request.url))
@@ -53,15 +54,43 @@ def opened(browser, url, width=1280, height=800, refused=False, script="", **con
         page = tab.new_page()
         visit(page, url)
         assert rig.passes(lambda: has_started(page)), (wrong, loaded(page))
-        try:
+        with checked(page, refused):
             yield page
-        finally:  # pytest prints it of a test that fails
-            with suppress(sync_api.Error):
-                print(page.evaluate("Promise.all([tod.measure(), tod.birdseye()])"))
-        expected = ["WebSocket connection", "net::ERR_" if refused else NETWORK_CHANGED]
-        expected += ["'globalThis.boot' as it is undefined"] * any(NETWORK_CHANGED in text for text in wrong)
-        unexpected = [text for text in wrong if not any(each in text for each in expected)]
-        assert not unexpected, unexpected
+
+
+_wrong = WeakKeyDictionary()  # by browser context: errors, and addresses of other hosts
+
+
+@contextmanager
+def checked(page, refused=False):
+    """The page must have stayed free of errors; see `opened`."""
+    wrong = _wrong[page.context]
+    try:
+        yield
+    finally:  # pytest prints it of a test that fails
+        with suppress(sync_api.Error):
+            print(page.evaluate("Promise.all([tod.measure(), tod.birdseye()])"))
+    expected = ["WebSocket connection", "net::ERR_" if refused else NETWORK_CHANGED]
+    expected += ["'globalThis.boot' as it is undefined"] * any(NETWORK_CHANGED in text for text in wrong)
+    unexpected = [text for text in wrong if not any(each in text for each in expected)]
+    assert not unexpected, unexpected
+
+
+class SharedPage:
+    """A page that tests share: to open one takes a second and a half of processor time."""
+
+    def __init__(self, browser, url):
+        self._browser, self._url = browser, url
+        self._stack = ExitStack()
+        self.page = None
+
+    def open(self):
+        self.page = self.page or self._stack.enter_context(opened(self._browser, self._url))
+        return self.page
+
+    def close(self):
+        self.page = None
+        self._stack.close()
 
 
 def visit(page, url):

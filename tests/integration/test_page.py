@@ -19,8 +19,10 @@ import pytest
 
 from browser import (
     SCREENS,
+    SharedPage,
     all_live,
     boxes,
+    checked,
     luma,
     measure,
     opened,
@@ -80,15 +82,46 @@ def demo():
         child.wait(timeout=15)
 
 
+@pytest.fixture(scope="module")
+def shared(chromium, demo):
+    shared = SharedPage(chromium, demo)
+    yield shared
+    shared.close()
+
+
 @pytest.fixture
-def page(chromium, demo):
-    with opened(chromium, demo) as page:
+def page(shared, request):
+    """The page that tests share, in control, and left as it was found."""
+    page, failed = shared.open(), request.session.testsfailed
+    with checked(page):
         all_live(page)
         if page.evaluate("tod.control") != "you":
             take_control(page)
         yield page
-        viewing(page, "configure")
-        choose(page, "automatic")
+    if request.session.testsfailed > failed:
+        shared.close()  # whatever this test has left behind
+    else:
+        restored(page)
+
+
+@pytest.fixture
+def fresh(shared, request):
+    """A page that shows nothing of earlier tests; later ones share it."""
+    shared.close()
+    return request.getfixturevalue("page")
+
+
+@pytest.fixture
+def unshared(shared):
+    """The page that tests share is closed: it takes a third of a processor while it is open."""
+    shared.close()
+
+
+def restored(page):
+    viewing(page, "configure")
+    choose(page, "automatic")
+    page.evaluate("document.activeElement.blur()")
+    sized(page, 1280, 800)
 
 
 def run_in_thread(coroutine):
@@ -121,6 +154,20 @@ def choose(page, mode):
             return state_when(page, lambda now: now["mode"] == mode, seconds=10)
 
     return until(chosen)
+
+
+def test_automatic_the_drop_of_the_map_lowers_factors(fresh):
+    page = fresh
+    choose(page, "automatic")
+    high = state_when(page, lambda now: now["total_kbps"] > 6500, seconds=60)
+    low = state_when(page, lambda now: now["total_kbps"] < 4000, seconds=60)
+    lower = [name for name in TUM if low["cameras"][name]["scaling"] < high["cameras"][name]["scaling"]]
+    assert {"front_left", "front_right"} <= set(lower)
+    assert "front_center" not in lower
+    sizes = {name: (low["cameras"][name]["height"], low["cameras"][name]["width"]) for name in lower}
+    until(lambda: state(page)["total_kbps"] > 4000 or all(luma(page, name)[0].shape == sizes[name] for name in lower))
+    note = r"Prediction \d+ kbit/s: .*front_left, front_right 0\.5 -> 0\.25"
+    until(lambda: re.search(note, page.evaluate("document.querySelector('#news').innerText")))
 
 
 def test_eight_pictures_move(page):
@@ -233,87 +280,6 @@ def test_collective_the_slider_changes_all(page):
     shot(page, "collective")
 
 
-def test_automatic_the_drop_of_the_map_lowers_factors(page):
-    choose(page, "automatic")
-    high = state_when(page, lambda now: now["total_kbps"] > 6500, seconds=60)
-    low = state_when(page, lambda now: now["total_kbps"] < 4000, seconds=60)
-    lower = [name for name in TUM if low["cameras"][name]["scaling"] < high["cameras"][name]["scaling"]]
-    assert {"front_left", "front_right"} <= set(lower)
-    assert "front_center" not in lower
-    sizes = {name: (low["cameras"][name]["height"], low["cameras"][name]["width"]) for name in lower}
-    until(lambda: state(page)["total_kbps"] > 4000 or all(luma(page, name)[0].shape == sizes[name] for name in lower))
-    note = r"Prediction \d+ kbit/s: .*front_left, front_right 0\.5 -> 0\.25"
-    until(lambda: re.search(note, page.evaluate("document.querySelector('#news').innerText")))
-
-
-def test_a_page_opened_mid_drive_starts_with_intact_pictures(chromium, demo):
-    """Compares the first drawn picture of each camera with a clean decode; in mode single sizes do not change."""
-    single = ({"take_control": True}, {"id": "1", "event": "mode_selected", "mode": "single"})
-    with recorded(demo, *single, viewer="holder"):
-        time.sleep(1.5)  # until size changes have settled
-        with recorded(demo) as units:
-            time.sleep(4)
-            with opened(chromium, f"{demo}#measure") as late:
-                until(lambda: all(camera["first_drawn_ms"] for camera in measure(late).values()))
-                first = {name: camera["first_drawn_ms"] for name, camera in measure(late).items()}
-                assert max(first.values()) < 10_000, first  # ten times the normal time
-                pictures = {name: luma_first(late, name) for name in TUM}
-                until(lambda: late.evaluate("tod.control") == "another")
-            time.sleep(0.5)
-    errors = {}
-    for number, name in enumerate(TUM):
-        drawn, captured = pictures[name]
-        clean = decoded([data for _, data in units[number]], drawn.shape)
-        at = next(n for n, (ms, _) in enumerate(units[number]) if abs(ms - captured) < 0.01)
-        errors[name] = np.mean((clean[at].astype(float) - drawn) ** 2)
-    assert max(errors.values()) < 255**2 / 10**4, errors  # 40 dB
-
-
-def luma_first(page, camera):
-    """The first picture drawn of a camera."""
-    picture = page.evaluate(f"tod.first('{camera}')")
-    data = np.frombuffer(base64.b64decode(picture["luma"]), np.uint8)
-    return data.reshape(picture["height"], picture["width"]), picture["captured"]
-
-
-@contextmanager
-def recorded(url, *orders, viewer="recorder"):
-    """Every unit that a watching page receives: by camera, (captured ms, data)."""
-    units, stopped = [[] for _ in TUM], threading.Event()
-
-    async def watch():
-        async with (
-            aiohttp.ClientSession() as session,
-            session.ws_connect(f"{url}live?viewer={viewer}", origin=url.rstrip("/"), max_msg_size=0) as ws,
-        ):
-            for order in orders:
-                await ws.send_json(order)
-            while not stopped.is_set():
-                message = await ws.receive()
-                if message.type == aiohttp.WSMsgType.BINARY:
-                    header = np.frombuffer(message.data[: HEADER.itemsize], HEADER)[0]
-                    units[header["camera"]].append((float(header["captured"]), message.data[HEADER.itemsize :]))
-
-    thread = threading.Thread(target=lambda: asyncio.run(watch()))
-    thread.start()
-    try:
-        yield units
-    finally:
-        stopped.set()
-        thread.join()
-
-
-def decoded(units, shape):
-    """Luma of every unit, decoded by ffmpeg."""
-    command = ["ffmpeg", "-v", "error", "-threads", "1", "-f", "h264", "-i", "-", "-fps_mode", "passthrough"]
-    command += ["-f", "rawvideo", "-pix_fmt", "yuv420p", "-"]
-    data = subprocess.run(command, input=b"".join(units), capture_output=True, check=True).stdout
-    height, width = shape
-    pictures = np.frombuffer(data, np.uint8).reshape(-1, height * width * 3 // 2)
-    assert len(pictures) == len(units)
-    return pictures[:, : height * width].reshape(-1, height, width)
-
-
 def test_a_reload_keeps_control_history_and_mode(page):
     choose(page, "collective")
     before = page.evaluate("tod.history.time.length")
@@ -405,25 +371,6 @@ def test_invalid_messages_do_not_disturb_the_streams(page, demo):
     until(lambda: page.evaluate("tod.control") == "you")
 
 
-@pytest.mark.parametrize(
-    ("headers", "status"),
-    [
-        ({}, 200),
-        ({"Origin": "http://evil.example"}, 403),
-        ({"Host": "evil.example"}, 403),
-    ],
-)
-def test_only_pages_of_this_server_have_access(demo, headers, status):
-    async def ask():
-        async with aiohttp.ClientSession() as session, session.get(demo, headers=headers) as answer:
-            return answer.status, answer.headers.get("Content-Security-Policy")
-
-    answered, policy = run_in_thread(ask())
-    assert answered == status
-    if status == 200:
-        assert "default-src 'self'" in policy
-
-
 def test_a_viewer_that_does_not_read_disturbs_no_other(page, demo):
     counted = measure(page)
     with upgraded(demo, "lazy"):
@@ -446,16 +393,6 @@ def test_another_page_watches_and_may_take_control(chromium, demo, page):
     take_control(page)
 
 
-def test_without_its_worker_a_page_shows_no_camera_as_live(chromium, demo):
-    with opened(chromium, demo) as page:
-        all_live(page)
-        page.evaluate("boot.worker.terminate()")
-        page.wait_for_selector("#banner:not([hidden])")
-        expected = "✕ VIDEO STOPPED: the page's worker does not respond; reload the page"
-        assert page.inner_text("#banner") == expected
-        assert {text.split()[1] for text in page.locator("[data-camera] .status").all_inner_texts()} == {"LOST"}
-
-
 def test_a_duplicated_page_only_watches(page):
     with page.expect_popup() as opening:
         page.evaluate("void open(location.href)")  # copies the storage of its tab, as duplicating a tab does
@@ -464,15 +401,6 @@ def test_a_duplicated_page_only_watches(page):
     until(lambda: copy.evaluate("tod.control") == "another")
     copy.close()
     until(lambda: page.evaluate("tod.control") == "you")
-
-
-def test_without_webcodecs_a_message_names_the_requirement(chromium, demo):
-    with chromium.new_context() as tab:
-        tab.add_init_script("delete window.VideoDecoder")
-        blind = tab.new_page()
-        visit(blind, demo)
-        until(lambda: "WebCodecs" in blind.inner_text("body"))
-        assert "Chromium" in blind.inner_text("body")
 
 
 def test_keys_choose_modes_cameras_and_help(page):
@@ -547,7 +475,8 @@ def whole(page):
     return pictures
 
 
-def test_drive_the_front_camera_is_large_and_nothing_is_cut_off(page):
+def test_drive_the_front_camera_is_large_and_nothing_is_cut_off(fresh):
+    page = fresh
     page.locator("#offer-drive").click()
     assert page.locator("#offer").is_hidden()
     assert page.evaluate("tod.view") == "drive"
@@ -591,26 +520,8 @@ def test_drive_shows_what_a_driver_must_not_miss(page):
     until(reports_its_return)
 
 
-def test_stalled_pictures_are_named_and_sounded_in_the_drive_view(chromium, demo):
-    with opened(chromium, demo) as page:
-        all_live(page)
-        take_control(page)
-        viewing(page, "drive")  # the key press allows the page to play sound
-        count = "start(at) { globalThis.tones = (globalThis.tones ?? 0) + 1; super.start(at); }"
-        page.evaluate(f"void (OscillatorNode = class extends OscillatorNode {{ {count} }})")
-        until(lambda: page.inner_text("#sound") == "Sound on")
-        page.evaluate("boot.worker.terminate()")
-        until(lambda: page.inner_text("#worst-of") == "8 of 8 pictures not live")
-        assert page.inner_text("#alarms").startswith("✕ LOST front left, front center")
-        assert page.inner_text("#worst") == "– ms"
-        assert {*page.locator(".tile .status").all_inner_texts()} == {"✕ LOST"}, "the worker cannot mark the pictures"
-        frame = "getComputedStyle(document.querySelector('.tile .picture'), '::after').borderTopWidth"
-        assert page.evaluate(frame) == "4px"
-        assert page.get_attribute("#latency", "data-level") == "late"
-        until(lambda: page.evaluate("globalThis.tones >= 4"))
-
-
-def test_drive_is_offered_once_and_only_the_driver_changes_the_view(page):
+def test_drive_is_offered_once_and_only_the_driver_changes_the_view(fresh):
+    page = fresh
     offer = page.locator("#offer")
     offer.wait_for(state="visible")
     page.locator("#offer-no").click()
@@ -722,33 +633,6 @@ def lost_alarm(page, mirrored):
     return np.reshape(found, (300, 600)).astype(float)
 
 
-def test_a_viewer_that_does_not_answer_pings_is_dropped(demo):
-    with upgraded(demo, "silent") as viewer:
-        began = time.monotonic()
-        with suppress(ConnectionResetError):
-            while viewer.recv(65_536):  # reads but sends nothing
-                pass
-        assert 1 < time.monotonic() - began < 20
-
-
-def test_a_slow_viewer_that_answers_pings_stays_connected(demo):
-    async def watch():
-        read = 0
-        async with (
-            aiohttp.ClientSession() as session,
-            session.ws_connect(f"{demo}live?viewer=slow", origin=demo.rstrip("/"), max_msg_size=0) as ws,
-        ):
-            until = time.monotonic() + 6
-            while time.monotonic() < until:
-                message = await ws.receive()
-                assert message.type in (aiohttp.WSMsgType.TEXT, aiohttp.WSMsgType.BINARY)
-                read += len(message.data)
-                await asyncio.sleep(len(message.data) / 50_000)  # 400 kbit/s
-        return read
-
-    assert run_in_thread(watch()) > 100_000
-
-
 @contextmanager
 def upgraded(url, viewer):
     """A raw socket, upgraded to a WebSocket as a viewer."""
@@ -771,10 +655,169 @@ def upgraded(url, viewer):
         ("h265", "420101214000000300b0000003000003009999", "hev1.1.2.H153.B0"),
     ],
 )
-def test_the_codec_string_is_valid_for_webcodecs(chromium, demo, codec, start, string):
+def test_the_codec_string_is_valid_for_webcodecs(page, codec, start, string):
+    unit = [0, 0, 0, 1, *bytes.fromhex(start), 0xA0]
+    script = f"import('/static/codec.js').then((m) => m.codecOf(m.spsOf(new Uint8Array({unit}), '{codec}'), '{codec}'))"
+    assert page.evaluate(script) == string
+
+
+# --- without the page that the tests above share ------------------------------------------------------------------
+
+
+def test_a_page_opened_mid_drive_starts_with_intact_pictures(chromium, demo, unshared):
+    """Compares the first drawn picture of each camera with a clean decode; in mode single sizes do not change."""
+    single = ({"take_control": True}, {"id": "1", "event": "mode_selected", "mode": "single"})
+    with recorded(demo, *single, viewer="holder"):
+        time.sleep(1.5)  # until size changes have settled
+        with recorded(demo) as units:
+            time.sleep(4)
+            with opened(chromium, f"{demo}#measure") as late:
+                until(lambda: all(camera["first_drawn_ms"] for camera in measure(late).values()))
+                first = {name: camera["first_drawn_ms"] for name, camera in measure(late).items()}
+                assert max(first.values()) < 10_000, first  # ten times the normal time
+                pictures = {name: luma_first(late, name) for name in TUM}
+                until(lambda: late.evaluate("tod.control") == "another")
+            time.sleep(0.5)
+    errors = {}
+    for number, name in enumerate(TUM):
+        drawn, captured = pictures[name]
+        clean = decoded([data for _, data in units[number]], drawn.shape)
+        at = next(n for n, (ms, _) in enumerate(units[number]) if abs(ms - captured) < 0.01)
+        errors[name] = np.mean((clean[at].astype(float) - drawn) ** 2)
+    assert max(errors.values()) < 255**2 / 10**4, errors  # 40 dB
+
+
+def luma_first(page, camera):
+    """The first picture drawn of a camera."""
+    picture = page.evaluate(f"tod.first('{camera}')")
+    data = np.frombuffer(base64.b64decode(picture["luma"]), np.uint8)
+    return data.reshape(picture["height"], picture["width"]), picture["captured"]
+
+
+@contextmanager
+def recorded(url, *orders, viewer="recorder"):
+    """Every unit that a watching page receives: by camera, (captured ms, data)."""
+    units, stopped = [[] for _ in TUM], threading.Event()
+
+    async def watch():
+        async with (
+            aiohttp.ClientSession() as session,
+            session.ws_connect(f"{url}live?viewer={viewer}", origin=url.rstrip("/"), max_msg_size=0) as ws,
+        ):
+            for order in orders:
+                await ws.send_json(order)
+            while not stopped.is_set():
+                message = await ws.receive()
+                if message.type == aiohttp.WSMsgType.BINARY:
+                    header = np.frombuffer(message.data[: HEADER.itemsize], HEADER)[0]
+                    units[header["camera"]].append((float(header["captured"]), message.data[HEADER.itemsize :]))
+
+    thread = threading.Thread(target=lambda: asyncio.run(watch()))
+    thread.start()
+    try:
+        yield units
+    finally:
+        stopped.set()
+        thread.join()
+
+
+def decoded(units, shape):
+    """Luma of every unit, decoded by ffmpeg."""
+    command = ["ffmpeg", "-v", "error", "-threads", "1", "-f", "h264", "-i", "-", "-fps_mode", "passthrough"]
+    command += ["-f", "rawvideo", "-pix_fmt", "yuv420p", "-"]
+    data = subprocess.run(command, input=b"".join(units), capture_output=True, check=True).stdout
+    height, width = shape
+    pictures = np.frombuffer(data, np.uint8).reshape(-1, height * width * 3 // 2)
+    assert len(pictures) == len(units)
+    return pictures[:, : height * width].reshape(-1, height, width)
+
+
+@pytest.mark.parametrize(
+    ("headers", "status"),
+    [
+        ({}, 200),
+        ({"Origin": "http://evil.example"}, 403),
+        ({"Host": "evil.example"}, 403),
+    ],
+)
+def test_only_pages_of_this_server_have_access(demo, unshared, headers, status):
+    async def ask():
+        async with aiohttp.ClientSession() as session, session.get(demo, headers=headers) as answer:
+            return answer.status, answer.headers.get("Content-Security-Policy")
+
+    answered, policy = run_in_thread(ask())
+    assert answered == status
+    if status == 200:
+        assert "default-src 'self'" in policy
+
+
+def test_without_webcodecs_a_message_names_the_requirement(chromium, demo, unshared):
+    with chromium.new_context() as tab:
+        tab.add_init_script("delete window.VideoDecoder")
+        blind = tab.new_page()
+        visit(blind, demo)
+        until(lambda: "WebCodecs" in blind.inner_text("body"))
+        assert "Chromium" in blind.inner_text("body")
+
+
+def test_a_viewer_that_does_not_answer_pings_is_dropped(demo, unshared):
+    with upgraded(demo, "silent") as viewer:
+        began = time.monotonic()
+        with suppress(ConnectionResetError):
+            while viewer.recv(65_536):  # reads but sends nothing
+                pass
+        assert 1 < time.monotonic() - began < 20
+
+
+def test_a_slow_viewer_that_answers_pings_stays_connected(demo, unshared):
+    async def watch():
+        read = 0
+        async with (
+            aiohttp.ClientSession() as session,
+            session.ws_connect(f"{demo}live?viewer=slow", origin=demo.rstrip("/"), max_msg_size=0) as ws,
+        ):
+            until = time.monotonic() + 6
+            while time.monotonic() < until:
+                message = await ws.receive()
+                assert message.type in (aiohttp.WSMsgType.TEXT, aiohttp.WSMsgType.BINARY)
+                read += len(message.data)
+                await asyncio.sleep(len(message.data) / 50_000)  # 400 kbit/s
+        return read
+
+    assert run_in_thread(watch()) > 100_000
+
+
+@pytest.fixture(scope="module")
+def stopped(shared, chromium, demo):
+    """A page whose worker was stopped in the drive view; it counts its tones."""
+    shared.close()
     with opened(chromium, demo) as page:
-        unit = [0, 0, 0, 1, *bytes.fromhex(start), 0xA0]
-        script = (
-            f"import('/static/codec.js').then((m) => m.codecOf(m.spsOf(new Uint8Array({unit}), '{codec}'), '{codec}'))"
-        )
-        assert page.evaluate(script) == string
+        all_live(page)
+        take_control(page)
+        viewing(page, "drive")  # the key press allows the page to play sound
+        count = "start(at) { globalThis.tones = (globalThis.tones ?? 0) + 1; super.start(at); }"
+        page.evaluate(f"void (OscillatorNode = class extends OscillatorNode {{ {count} }})")
+        until(lambda: page.inner_text("#sound") == "Sound on")
+        page.evaluate("boot.worker.terminate()")
+        yield page
+
+
+def test_stalled_pictures_are_named_and_sounded_in_the_drive_view(stopped):
+    page = stopped
+    until(lambda: page.inner_text("#worst-of") == "8 of 8 pictures not live")
+    assert page.inner_text("#alarms").startswith("✕ LOST front left, front center")
+    assert page.inner_text("#worst") == "– ms"
+    assert {*page.locator(".tile .status").all_inner_texts()} == {"✕ LOST"}, "the worker cannot mark the pictures"
+    frame = "getComputedStyle(document.querySelector('.tile .picture'), '::after').borderTopWidth"
+    assert page.evaluate(frame) == "4px"
+    assert page.get_attribute("#latency", "data-level") == "late"
+    until(lambda: page.evaluate("globalThis.tones >= 4"))
+
+
+def test_without_its_worker_a_page_shows_no_camera_as_live(stopped):
+    page = stopped
+    viewing(page, "configure")
+    page.wait_for_selector("#banner:not([hidden])")
+    expected = "✕ VIDEO STOPPED: the page's worker does not respond; reload the page"
+    assert page.inner_text("#banner") == expected
+    assert {text.split()[1] for text in page.locator("[data-camera] .status").all_inner_texts()} == {"LOST"}
