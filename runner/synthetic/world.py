@@ -228,12 +228,13 @@ def draw_ground(
     rows, columns = luma.shape
     texel, samples = period / columns, len(xs) - 1
     step = length / samples
+    below = np.searchsorted(xs, np.arange(columns) * texel)  # the sample at the same x
     for j in range(rows):
         nearest = -1
         for i in range(columns):
             x = i * texel
             if nearest < 0:
-                nearest = np.searchsorted(xs, x)
+                nearest = below[i]
             s = d = 0.0
             for _ in range(3):
                 lap, k = nearest // samples, nearest % samples
@@ -243,7 +244,10 @@ def draw_ground(
                 if abs(d) > 12.0:
                     break
                 s = nearest * step + along
-                nearest += math.floor(along / (1.0 - bends[k] * d) / step + 0.5)
+                farther = math.floor(along / (1.0 - bends[k] * d) / step + 0.5)
+                if farther == 0:
+                    break
+                nearest += farther
             if abs(d) > WALL_D + 0.6:
                 nearest = -1
                 put(luma, u, v, j, i, 80.0, -8.0, -5.0)
@@ -325,10 +329,10 @@ def draw_facade(
     """Fronts of the houses of one side of the street; columns run along the street, rows up from the ground."""
     rows, columns = luma.shape
     piece = texel * columns / len(house)
-    for i in range(columns):
-        h = house[int(i * texel / piece)]
-        x, width = i * texel - starts[h] * piece, (starts[h + 1] - starts[h]) * piece
-        for j in range(rows):
+    for j in range(rows):
+        for i in range(columns):
+            h = house[int(i * texel / piece)]
+            x, width = i * texel - starts[h] * piece, (starts[h + 1] - starts[h]) * piece
             fine, coarse = noise[0, j & 1023, i & 1023], noise[1, (j >> 1) & 1023, (i >> 1) & 1023]
             grain = chance(i, j) - 0.5
             y, blue, red = front(x, j * texel, width, heights[h], h, fine, coarse)
