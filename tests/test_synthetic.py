@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from fractions import Fraction
+from functools import cache as cache_results
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -48,7 +49,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def see(world: Path) -> Callable[[View], Any]:
+def render_luma(world: Path) -> Callable[[View], Any]:
     """All pictures of a view as luma, [frame, row, column], without any file."""
     from runner.synthetic.picture import pictures
 
@@ -57,6 +58,12 @@ def see(world: Path) -> Callable[[View], Any]:
         return np.stack(frames)[:, : view.width * view.height].reshape(-1, view.height, view.width).astype(float)
 
     return luma
+
+
+@pytest.fixture(scope="module")
+def see(render_luma: Callable[[View], Any]) -> Callable[[View], Any]:
+    """The same, each view rendered once for all tests, which only read it."""
+    return cache_results(render_luma)
 
 
 @contextmanager
@@ -303,8 +310,8 @@ def test_side_view_moves_more_than_forward_view(see: Callable[[View], Any]) -> N
     assert min(left, right) > 1.15 * forward
 
 
-def test_rendering_is_deterministic(see: Callable[[View], Any]) -> None:
-    assert (see(TOP) == see(TOP)).all()
+def test_rendering_is_deterministic(render_luma: Callable[[View], Any]) -> None:
+    assert (render_luma(TOP) == render_luma(TOP)).all()
 
 
 def test_turned_camera_sees_the_same_world(see: Callable[[View], Any]) -> None:
