@@ -5,15 +5,17 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import subprocess
+import sys
 from html.parser import HTMLParser
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 from drives import Lines, write_drive, write_models
-from helpers import CONF, Command, process
+from helpers import CONF, Command, Result, process
 
 from runner.configuration.compose import compose
 from runner.core.events import CameraSwitched
@@ -42,6 +44,38 @@ STATIC = Path(CONF).parent / "runner" / "page" / "static"
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("drives") / "test_drive"
     return write_drive(path, seconds=20, freezes={"top_rear": [(6.0, 1.5)]}, congested=0.5)
+
+
+class Report(NamedTuple):
+    """A report with all its figures, which takes seconds: tests that only read it share it."""
+
+    result: Result
+    output: Path
+
+
+@pytest.fixture(scope="module")
+def made(drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Report:
+    output = tmp_path_factory.mktemp("made") / "deep" / "report"
+    return Report(process("report", str(drive), f"output={output}"), output)
+
+
+@pytest.fixture(scope="module")
+def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_models(tmp_path_factory.mktemp("models"), compose(["source=test"]).document)
+
+
+@pytest.fixture(scope="module")
+def made_with_models(drive: Path, models: Path, tmp_path_factory: pytest.TempPathFactory) -> Report:
+    """Made without GStreamer, OpenCV and other libraries that a report does not need."""
+    output = tmp_path_factory.mktemp("made") / "with_models"
+    program = (
+        "import sys\n"
+        "sys.modules.update(dict.fromkeys(('gi', 'cv2', 'numba', 'scipy', 'aiohttp', 'paho')))\n"
+        "from runner.__main__ import main\n"
+        f"sys.exit(main(['report', {str(drive)!r}, 'output={output}', 'models={models}']))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    return Report(Result(done.returncode, done.stdout, done.stderr), output)
 
 
 @pytest.fixture
@@ -83,9 +117,8 @@ def check_figures(output: Path, names: list[str]) -> None:
         assert pdf.rstrip().endswith(b"%%EOF")
 
 
-def test_a_drive(tod: Command, drive: Path, tmp_path: Path) -> None:
-    output = tmp_path / "deep" / "report"
-    status, out, _ = tod("report", str(drive), f"output={output}")
+def test_a_drive(made: Report) -> None:
+    (status, out, _), output = made
     assert status == 0
     assert out.splitlines()[-1] == str(output / "index.html")
     check_figures(output, FIGURES)
@@ -105,18 +138,18 @@ def test_a_drive(tod: Command, drive: Path, tmp_path: Path) -> None:
     assert note in out
 
 
+@pytest.mark.usefixtures("unprinted")
 def test_with_models_quality_is_estimated(
-    tod: Command, drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tod: Command, drive: Path, tmp_path: Path, models: Path, made_with_models: Report
 ) -> None:
-    models = write_models(tmp_path / "models", compose(["source=test"]).document)
-    assert tod("report", str(drive), f"output={tmp_path / 'out'}", f"models={models}").status == 0
-    check_figures(tmp_path / "out", [*FIGURES, "quality"])
-    (one,) = document(tmp_path / "out")["drives"]
+    assert made_with_models.result.status == 0
+    check_figures(made_with_models.output, [*FIGURES, "quality"])
+    (one,) = document(made_with_models.output)["drives"]
     assert one["quality"]["metric"] == "mssim"
     assert 0.7 < one["quality"]["mean"] < 0.95
-    (models / "top_left.model.json").unlink()
-    monkeypatch.setattr("runner.drive.print.write_figures", lambda *_: None)
-    assert tod("report", str(drive), f"output={tmp_path / 'out'}", f"models={models}").status == 0
+    fewer = shutil.copytree(models, tmp_path / "models")
+    (fewer / "top_left.model.json").unlink()
+    assert tod("report", str(drive), f"output={tmp_path / 'out'}", f"models={fewer}").status == 0
     (one,) = document(tmp_path / "out")["drives"]
     assert one["notes"][-1].startswith("estimated quality: all but top_left have one; ")
     assert [camera["name"] for camera in one["cameras"] if camera["quality"] is None] == ["top_left"]
@@ -364,11 +397,11 @@ def test_notes_appear_once_and_figures_above_versions(tod: Command, drive: Path,
     assert text.index('id="bitrate_on_track"') < text.index("GStreamer 1.22.0")
 
 
-def test_the_same_drive_gives_the_same_files(tod: Command, drive: Path, tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        tod("report", str(drive), f"output={tmp_path / name}")
-    for path in (tmp_path / "a").iterdir():
-        assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes(), path.name
+def test_the_same_drive_gives_the_same_files(tod: Command, drive: Path, tmp_path: Path, made: Report) -> None:
+    """Here and in another process."""
+    tod("report", str(drive), f"output={tmp_path}")
+    for path in made.output.iterdir():
+        assert path.read_bytes() == (tmp_path / path.name).read_bytes(), path.name
 
 
 def test_colours_are_those_of_the_operators_page() -> None:
@@ -453,21 +486,9 @@ def test_charts_of_many_drives_have_letters_of_their_own(drive: Path, monkeypatc
     assert [title.split()[0] for title in titles if title.startswith("(")] == ["(a)", "(aa)"]
 
 
-def test_it_needs_neither_gstreamer_nor_opencv(drive: Path, tmp_path: Path) -> None:
-    program = (
-        "import sys\n"
-        "sys.modules.update(dict.fromkeys(('gi', 'cv2', 'numba', 'scipy', 'aiohttp', 'paho')))\n"
-        "from runner.__main__ import main\n"
-        f"sys.exit(main(['report', {str(drive)!r}, 'output={tmp_path / 'out'}', 'models={tmp_path / 'models'}']))"
-    )
-    import subprocess
-    import sys
-
-    write_models(tmp_path / "models", compose(["source=test"]).document)
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+def test_it_needs_neither_gstreamer_nor_opencv(made_with_models: Report) -> None:
+    assert made_with_models.result.status == 0, made_with_models.result.err
 
 
-def test_progress_is_shown_on_standard_error(drive: Path, tmp_path: Path) -> None:
-    result = process("report", str(drive), f"output={tmp_path / 'out'}")
-    assert "figures: 100%" in result.err
+def test_progress_is_shown_on_standard_error(made: Report) -> None:
+    assert "figures: 100%" in made.result.err
