@@ -35,12 +35,14 @@ def value_at(document: Any, path: Path, otherwise: Any = None) -> Any:
     """The value at a path of a document; `otherwise` if there is none."""
     for key in path:
         if isinstance(document, dict):
-            known = next((each for each in (key, str(key)) if each in document), None)  # overrides name an entry a.0
+            known = key if key in document else str(key)  # overrides name an entry a.0
+            if known not in document:
+                return otherwise
+            document = document[known]
+        elif isinstance(document, list) and isinstance(key, int) and key < len(document):
+            document = document[key]
         else:
-            known = key if isinstance(document, list) and isinstance(key, int) and key < len(document) else None
-        if known is None:
             return otherwise
-        document = document[known]
     return document
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import pickle
 import re
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, cast
 
 from runner.configuration.interpolation import expands_within, spliced
@@ -51,9 +53,26 @@ def without(composed: Composed, part: Part) -> Composed | None:
 
 
 def _merged(parts: Sequence[Part]) -> Composed | None:
-    from omegaconf import OmegaConf
-
     try:
-        return resolved(OmegaConf.create(merged(parts)), parts)
+        return resolved(_config(merged(parts)), parts)
     except ConfigError:
         return None
+
+
+def _config(document: dict[Any, Any]) -> DictConfig:
+    """A document as OmegaConf holds it.
+
+    Documents without one of their parts differ in few mappings: the others are copied, in a tenth of the time.
+    """
+    from omegaconf import OmegaConf
+
+    config = OmegaConf.create(flags={"no_deepcopy_set_nodes": True})
+    for key, value in document.items():
+        config[key] = pickle.loads(_pickled_config(pickle.dumps(value))) if isinstance(value, dict) else value
+    return config
+
+
+@lru_cache(maxsize=1024)
+def _pickled_config(document: bytes) -> bytes:
+    """The same for a pickled document, pickled."""
+    return pickle.dumps(_config(pickle.loads(document)))
