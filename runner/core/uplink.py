@@ -11,6 +11,7 @@ shows a queue that does not drain although less is sent.
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
@@ -135,7 +136,7 @@ class _Path:
             return _Path(delay, delay, unit.arrived, own=True)
         if unit.arrived - self.began > BUCKET_S:
             return _Path(self.current, delay, unit.arrived, self.own)
-        return replace(self, current=min(self.current, delay))
+        return replace(self, current=delay) if delay < self.current else self
 
 
 def _new_path(unit: ReceivedUnit, others: Iterable[_Path]) -> _Path:
@@ -197,7 +198,7 @@ def estimate(uplink: UplinkMemory, report: LinkReport) -> tuple[UplinkMemory, Li
     if not uplink.units:
         return uplink, None
     frame, last = _frame_interval(uplink.intervals, uplink.captured), uplink.units[-1].arrived
-    queue = min(unit.queue for unit in uplink.units if unit.arrived > last - max(RECENT_S, frame))
+    queue = min(unit.queue for unit in _later(uplink.units, last - max(RECENT_S, frame)))
     if queue <= EMPTY_S:
         onset = None
     elif uplink.onset is None:
@@ -244,14 +245,20 @@ def _add_units(uplink: UplinkMemory, units: Iterable[ReceivedUnit]) -> UplinkMem
             path = (path or _new_path(unit, paths.values())).after(unit, empty=uplink.onset is None)
             paths[unit.camera] = path
         shortest = path.delay if path and path.own else min((other.delay for other in paths.values()), default=inf)
-        if newest and unit.arrived - newest > PAUSE_S + 1.5 * _frame_interval(intervals, captured):
+        gap = unit.arrived - newest if newest else 0.0
+        if gap > PAUSE_S and gap > PAUSE_S + 1.5 * _frame_interval(intervals, captured):  # rarely compute the second
             resumed = unit.arrived
         newest = max(newest, unit.arrived) if newest else unit.arrived
         queue = max(0.0, unit.arrived - unit.captured - unit.late - shortest)
         kept.append(_Unit(unit.arrived, queue, unit.bytes, unit.playout))
     kept.sort(key=attrgetter("arrived"))  # a unit without its last packets is reported late
-    recent = tuple(unit for unit in kept if unit.arrived > kept[-1].arrived - KEPT_S)[-MAX_UNITS:]
+    recent = tuple(_later(kept, kept[-1].arrived - KEPT_S)[-MAX_UNITS:]) if kept else ()
     return replace(uplink, paths=paths, captured=captured, intervals=intervals, units=recent, resumed=resumed)
+
+
+def _later(units: Sequence[_Unit], time: float) -> Sequence[_Unit]:
+    """Those that arrived after a time; units are in order of arrival."""
+    return units[bisect_right(units, time, key=attrgetter("arrived")) :]
 
 
 def _frame_interval(intervals: Mapping[str, float], captured: Mapping[str, float]) -> float:
@@ -273,8 +280,8 @@ def _rate(uplink: UplinkMemory, last: float, window: float, queue: float, frame:
     """
     evidence = max(LATE_EVIDENCE_S if uplink.units[-1].playout else EVIDENCE_S, frame)
     # From one arrival to another: a window that begins in between would count too much or too little.
-    begin = max((unit.arrived for unit in uplink.units if unit.arrived <= last - window), default=-inf)
-    begin = max(begin, uplink.units[0].arrived)
+    within = len(_later(uplink.units, last - window))
+    begin = uplink.units[max(0, len(uplink.units) - within - 1)].arrived
     began = uplink.resumed if uplink.onset is None else max(uplink.resumed, uplink.onset)
     small = (unit.arrived for unit in uplink.units if 2 * unit.queue <= queue and uplink.onset is not None)
     for since in (max(begin, began, max(small, default=began)), max(begin, began)):
@@ -285,8 +292,8 @@ def _rate(uplink: UplinkMemory, last: float, window: float, queue: float, frame:
     return _kbps(uplink.units, begin, last), begin
 
 
-def _kbps(units: Iterable[_Unit], since: float, until: float) -> float:
-    return sum(unit.bytes for unit in units if unit.arrived > since) * 8 / 1000 / (until - since)
+def _kbps(units: Sequence[_Unit], since: float, until: float) -> float:
+    return sum(unit.bytes for unit in _later(units, since)) * 8 / 1000 / (until - since)
 
 
 def _state(queues: Sequence[tuple[float, float, int, int]], queue: float, onset: float | None) -> LinkState:
