@@ -39,7 +39,7 @@ def built(source: Path, made: Path) -> Path:
     pip = (sys.executable, "-m", "pip", "--disable-pip-version-check", "-q")
     run(*pip, "wheel", "--no-deps", "--no-build-isolation", "-w", str(made), str(source))
     (wheel,) = made.glob("*.whl")
-    run(*pip, "install", "--no-deps", "--no-index", "--target", str(made / "site"), str(wheel))
+    run(*pip, "install", "--no-deps", "--no-index", "--no-compile", "--target", str(made / "site"), str(wheel))
     return made / "site"
 
 

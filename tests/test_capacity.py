@@ -62,7 +62,7 @@ def test_samples_count_only_where_the_link_was_the_limit(tmp_path: Path) -> None
 
 def test_the_verb_writes_a_map_that_pqos_reads(tod: Command, tmp_path: Path) -> None:
     drives = [
-        str(write_drive(tmp_path / name, seconds=100, seed=seed, congested=3.0)) for name, seed in (("a", 1), ("b", 2))
+        str(write_drive(tmp_path / name, seconds=40, seed=seed, congested=3.0)) for name, seed in (("a", 1), ("b", 2))
     ]
     output = tmp_path / "map.csv"
     result = tod("map", *drives, f"output={output}", "percentile=20", "cell_m=20")
