@@ -29,7 +29,7 @@ pytestmark = pytest.mark.gst
 cv2 = pytest.importorskip("cv2")
 pytest.importorskip("scipy")
 
-WIDTH, HEIGHT, FPS, FRAMES = 320, 192, 25, 60
+WIDTH, HEIGHT, FPS, FRAMES = 320, 192, 25, 40
 CAMERA = ("camera=front_center",)
 SMALL = ("scalings=[0.25,0.5,1.0]", "bitrates_kbps=[50,100,200,400,800]")
 TINY = ("scalings=[0.5,1.0]", "bitrates_kbps=[100,400]")  # when any points will do
@@ -46,7 +46,7 @@ def picture(number: int, texture: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two and a half seconds of 320x192 at 25 Hz, nearly lossless."""
+    """1.6 seconds of 320x192 at 25 Hz, nearly lossless."""
     from runner.gst.clip_writer import write_clip
 
     noise = np.random.default_rng(1).integers(0, 256, (HEIGHT, 2 * WIDTH)).astype(np.uint8)
