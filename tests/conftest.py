@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import gc
+from collections.abc import Sequence
 from pathlib import Path
 
+import helpers
 import pytest
 from helpers import Command, UserConf, shared_cache
 from hypothesis import settings
+
+from runner.configuration import config
+from runner.configuration.origin import Composed
 
 # A busy machine may take longer than 0.2 s for an example. The same examples in each run; `make soak` draws others.
 settings.register_profile("same", deadline=None, derandomize=True)
@@ -36,6 +41,17 @@ def clean_environment(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.
 def tod(capfd: pytest.CaptureFixture[str]) -> Command:
     """The command line, run in this process."""
     return Command(capfd)
+
+
+@pytest.fixture
+def composed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compose each packaged configuration once for all tests that use this."""
+
+    def compose(overrides: Sequence[str], user: Path | None = None) -> Composed:
+        return helpers.composed_once(tuple(overrides)) if user is None else real(overrides, user)
+
+    real = config.compose
+    monkeypatch.setattr(config, "compose", compose)
 
 
 @pytest.fixture

@@ -14,7 +14,9 @@ from typing import Any, NamedTuple
 import pytest
 
 from runner.__main__ import main
+from runner.configuration.compose import compose
 from runner.configuration.config import configuration
+from runner.configuration.origin import Composed
 from runner.core.decision import Setting
 from runner.core.events import parse
 from runner.core.model import Vehicle
@@ -27,6 +29,12 @@ CONF = directory("conf")
 @cache
 def vehicle(*overrides: str) -> Vehicle:
     return configuration(["source=test", *overrides]).vehicle()
+
+
+@cache
+def composed_once(overrides: tuple[str, ...]) -> Composed:
+    """A packaged configuration for tests that only read it: composing takes most of the time of many."""
+    return compose(overrides)
 
 
 def shared_cache(factory: pytest.TempPathFactory) -> Path:

@@ -17,6 +17,8 @@ from runner.configuration.config import configuration
 from runner.configuration.listing import UNSTATED, listing
 from runner.configuration.origin import Composed, Part
 
+pytestmark = pytest.mark.usefixtures("composed_once")
+
 GRAPHS = sorted(path.stem for path in (CONF / "graph").glob("*.yaml"))
 SETTING = {"on", "sending", "demand_kbps", "kbps", "scaling", "roi", "width", "height", "reason"}
 

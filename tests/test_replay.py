@@ -19,6 +19,8 @@ from runner.core.model import Vehicle
 from runner.pqos import Pqos, build_pqos
 from runner.verbs.replay import events, replay
 
+pytestmark = pytest.mark.usefixtures("composed_once")
+
 VEHICLE = vehicle("modes=paper")
 PAPER = ("modes=paper", "source=test")
 CLOCK = {"t": 0, "event": "clock_advanced"}
