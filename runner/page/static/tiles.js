@@ -95,6 +95,7 @@ function buildTile({ name }) {
   const canvas = make("canvas", { "data-name": name, role: "img", "aria-label": `picture of ${displayName(name)}` });
   const parts = {
     view: WHOLE,
+    measured: { width: 0, height: 0 },
     canvas,
     swatch: make("span", { class: "swatch", "aria-hidden": "true" }),
     shown: make("span", { class: "shown" }),
@@ -200,19 +201,20 @@ function setView(name, view) {
 function reportFrame(name) {
   const part = tiles.get(name);
   if (!part) return;
+  part.measured = { width: part.box.clientWidth, height: part.box.clientHeight };
   reportSize(name, part.box, part.view);
   refreshFraming(name, part);
 }
 
-/** State which part of the picture is shown. */
-function refreshFraming(name, { box, shown, view, frame }) {
+/** State which part of the picture is shown. To read the size from the box would lay out the page for each tile. */
+function refreshFraming(name, { measured, shown, view, frame }) {
   const info = camera(name);
   const isPart = info && !isStraight(name) && showsPart(name);
   frame.element.hidden = !isPart;
   if (isPart) frame.refresh(name);
   const picture = (isStraight(name) ? null : shownRegion(name)) ?? info;
-  const isLaidOut = info && picture && box.clientWidth && box.clientHeight;
-  const framing = isLaidOut ? framingText({ width: box.clientWidth, height: box.clientHeight }, picture, view) : "";
+  const isLaidOut = info && picture && measured.width && measured.height;
+  const framing = isLaidOut ? framingText(measured, picture, view) : "";
   const straight = info && isStraight(name) ? `straight, ${straightOptics(info).fov_deg}° of ${info.fov_deg}°` : "";
   setText(shown, [framing, straight].filter(Boolean).join(", "));
 }
