@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from runner.configuration.compose import compose
 from runner.configuration.config import configuration
 from runner.core.events import ClockAdvanced, Event, PositionReported, to_json
 from runner.core.model import plain
@@ -87,12 +86,10 @@ def _drive(
     congested: float,
     frozen: tuple[tuple[str, float, float], ...],
 ) -> tuple[dict[str, Any], dict[str, Lines]]:
-    words = ["source=test", *overrides]
-    config = configuration(words)
+    config = configuration(["source=test", *overrides])
     made = _Made(np.random.default_rng(seed), config.vehicle(), *config.pqos(), seconds, congested, frozen)
     made.drive(sorted(events, key=lambda event: event.t))
-    config = compose(words).document
-    return config, {"vehicle": made.vehicle_log, "operator": made.operator_log, "link": made.link_log}
+    return config.document, {"vehicle": made.vehicle_log, "operator": made.operator_log, "link": made.link_log}
 
 
 @dataclass
