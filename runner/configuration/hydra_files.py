@@ -60,7 +60,7 @@ def search(directories: Sequence[Path]) -> None:
 
 @contextmanager
 def only_what_composing_needs() -> Iterator[None]:
-    """Compose without what nothing here uses but takes a third of the time.
+    """Compose without what nothing here uses but takes a fifth of the time.
 
     That is Hydra's own configuration of launcher, logging and so on; and for each file the values that interpolations
     in its defaults list may refer to, although hardly any list has one.
