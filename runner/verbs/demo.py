@@ -2,8 +2,8 @@
 
 Runs both sides on this machine: vehicle and operator as two processes over real RTSP and a real control link, along a
 drive through a bandwidth map in mode A. Open the page that it prints, http://127.0.0.1:8090/, in a browser; the table
-in the terminal shows the same. Every camera runs at 5 Hz for each core, which is enough for the eight cameras of
-tum_q7, both sides and a browser without a GPU; to change this, give fps_max=40, or null for the cameras' own rates.
+in the terminal shows the same. Every camera runs at 3 Hz for each core, so that two cores also draw the page of the
+eight cameras without a GPU; to change this, give fps_max=40, or null for the cameras' own rates.
 
 With log=DIR both sides write their logs to DIR. With output=OUT a report is written at the end, as by the verb report
 (models= is passed to it); the drive is stored in OUT/drive, unless log= names another directory. An experiment
@@ -56,7 +56,7 @@ from runner.verbs import Arguments
 from runner.verbs.report import check_report, report
 from runner.verbs.screen import progress_bar, say, streaming
 
-FPS_PER_CORE = 5  # Hz; eight cameras are encoded, sent, decoded and shown at this rate without falling behind
+FPS_PER_CORE = 3  # Hz; eight cameras are encoded, sent, decoded and drawn without a GPU at this rate
 LOOK_S = 0.05  # how soon the other side is stopped once one has ended
 SIDE_END_S = signals.END_S + 0.2  # a side ends itself by force before it is killed
 END_S = 2.8  # both sides, link and broker
