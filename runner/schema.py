@@ -12,7 +12,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
-from itertools import islice
+from itertools import groupby, islice
 from typing import TYPE_CHECKING, Any
 
 from runner.core.model import suggest
@@ -320,7 +320,11 @@ def _in_one_line(reference: str, document: Any) -> str | None:
     """The problems of a document, of limited number and length since it may be hostile; None if it is valid."""
     findings = (finding for error in _errors(reference, document) for finding in _explain(error))
     found = _without_misspelt(islice(findings, MAX_ERRORS))
-    texts = (": ".join(filter(None, (shortened(dotted(f.path)), f.found, f.rule))) for f in found)
+    texts = []
+    for _, alike in groupby(found, key=lambda f: (f.rule, f.found and f.path)):  # unknown keys share a sentence
+        first, *others = alike
+        paths = ", ".join(shortened(dotted(f.path)) for f in (first, *others))
+        texts.append(": ".join(filter(None, (paths, first.found, first.rule))))
     return "; ".join(texts) if found else None
 
 

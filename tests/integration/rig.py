@@ -161,8 +161,23 @@ def set_clock(directory: Path, seconds: float) -> None:
 
 
 # Below the ephemeral range of Linux: a client might take one of those before a side under test has bound it.
-_PORTS = itertools.cycle(range(10_000, 30_000))
-next(itertools.islice(_PORTS, random.SystemRandom().randrange(20_000), None))  # other processes start elsewhere
+def _own_ports() -> Iterator[int]:
+    """Ports that no other process of the tests hands out: until its end, an abstract socket claims a block of them."""
+    blocks = list(range(10_000, 30_000, 100))
+    random.SystemRandom().shuffle(blocks)
+    for begin in blocks:
+        claim = socket.socket(socket.AF_UNIX)
+        try:
+            claim.bind(f"\0tod-runner-tests-{begin}")
+        except OSError:
+            claim.close()
+            continue
+        _CLAIMS.append(claim)
+        yield from range(begin, begin + 100)
+
+
+_CLAIMS: list[socket.socket] = []
+_PORTS = itertools.cycle(_own_ports())
 
 WAIT_S = 60.0  # a demo starts in 3 s, and in 15 if five such tests run in parallel
 ANSWERED_S = 10.0  # before a request is sent again
@@ -181,10 +196,7 @@ LOOPBACK6 = "::1" if _has_ipv6() else "127.0.0.1"  # some tests run with it, so 
 
 
 def free_port(count: int = 1) -> int:
-    """The first of so many ports in a row that nothing is bound to, UDP or TCP, and that were not handed out before.
-
-    "Before" is as far as this process knows; others start elsewhere.
-    """
+    """The first of so many ports in a row that nothing is bound to, UDP or TCP, and that were not handed out before."""
     row: list[int] = []
     while len(row) < count:
         port = next(_PORTS)
