@@ -22,7 +22,14 @@ def station(tmp_path_factory):
     place = tmp_path_factory.mktemp("stills")
     paint(place / "world")
     pictures = dict(native_pictures(place / "world"))
-    return Station(place, CAMERAS, pictures, SIZE, ["fisheye"], ["inputs.keys.view=x", "inputs.buttons.view=7"])
+    return Station(
+        place,
+        CAMERAS,
+        pictures,
+        SIZE,
+        ["fisheye"],
+        ["inputs.keys.view=x", "inputs.buttons.view=7", "inputs.buttons.help=6"],
+    )
 
 
 @pytest.fixture
@@ -322,7 +329,10 @@ def test_buttons_act_once_and_a_pad_that_disconnects_is_announced(page, station)
     assert page.inner_text("#pressed") == "Pressed: axis1-, hat1-up"
     shot(page, "pressed")
     assert page.locator(".tile.selected").get_attribute("data-camera") == "mirrored", "a dialog is open"
-    page.keyboard.press("Escape")
+    hold(1)
+    assert page.locator("dialog[open]").count() == 1, "the list of keys shows what is pressed"
+    hold(6)  # help
+    page.wait_for_selector("dialog[open]", state="hidden")
     page.evaluate("unplug()")
     assert "Wheel disconnected" in page.locator("#news").text_content()
 

@@ -126,6 +126,7 @@ function onKeyDown(event, name) {
   if (!step || event.ctrlKey || event.altKey || event.metaKey) return;
   event.preventDefault();
   event.stopPropagation(); // otherwise these keys select cameras
+  if (event.repeat) return;
   const { row, column, row_span, column_span } = place(name);
   if (event.shiftKey) resize(name, row_span + step[0], column_span + step[1]);
   else move(name, row + step[0], column + step[1]);

@@ -7,6 +7,8 @@ import { actionOf, Presses } from "./presses.js";
 import { reportProblem } from "./requests.js";
 
 const POLL_MS = 15;
+/** @type {Record<string, string[]>} by dialog, the actions whose buttons close it; the list of keys shows which button is pressed */
+const CLOSING = { help: ["help"], confirm: ["back", "control"], monitors: ["back", "monitors"] };
 const EFFECTS = {
   lost: { duration: 600, strongMagnitude: 1, weakMagnitude: 1 },
   late: { duration: 200, strongMagnitude: 0.3, weakMagnitude: 0.6 },
@@ -25,8 +27,10 @@ function poll() {
   const pressed = presses.poll(pads());
   if (pressed.length) publish("pressed", pressed);
   for (const button of pressed) {
-    const action = ACTIONS[actionOf(store.hello?.inputs.buttons ?? {}, button) ?? ""];
-    if (!document.querySelector("dialog[open]")) action?.run();
+    const name = actionOf(store.hello?.inputs.buttons ?? {}, button) ?? "";
+    const dialog = document.querySelector("dialog[open]");
+    if (!dialog) ACTIONS[name]?.run();
+    else if ((CLOSING[dialog.id] ?? ["back"]).includes(name)) /** @type {HTMLDialogElement} */ (dialog).close();
   }
 }
 
