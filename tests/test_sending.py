@@ -139,6 +139,21 @@ def test_what_the_vehicle_sent_late_did_not_wait_in_a_queue() -> None:
     assert (measured(0.3, late_s=late_s).queue_ms, measured(0.3, late_s=late_s).state) == (20, LinkState.CLEAR)
 
 
+@pytest.mark.parametrize(("interval_s", "state"), [(0.04, LinkState.STALLED), (0.25, LinkState.CLEAR)])
+def test_an_operator_that_is_held_up_is_no_stalled_link(interval_s: float, state: LinkState) -> None:
+    """It has reported for 1.2 s, then receives nothing for 0.25 s, and reports that at once or meanwhile, too."""
+    uplink, link = MeasuredUplink(ROBOT), None
+    times = [
+        *(50 + 0.04 * n for n in range(30)),
+        *(51.16 + n * interval_s for n in range(1, round(0.25 / interval_s) + 1)),
+    ]
+    for at in times:
+        units = tuple(UnitReceived(name, 0.02, 0.0, 4000) for name in ROBOT.cameras) if at < 51.17 else ()
+        link = uplink.take(ReceptionReported(at - 49, "me", True, ReceptionReport(at, at - 49.05, units, 9, 0)))
+    assert link
+    assert link.state is state
+
+
 @pytest.mark.parametrize(("all_received", "state"), [(True, LinkState.CLEAR), (False, LinkState.STALLED)])
 def test_a_vehicle_that_sends_nothing_is_no_stalled_link(all_received: bool, state: LinkState) -> None:
     uplink, link = MeasuredUplink(ROBOT), None

@@ -42,6 +42,7 @@ COMPARED_S = 0.08
 LONG_S = 0.060  # a queue from here on is too long unless it drains
 UNDRAINED_S = 0.4  # a queue that is no shorter after this time is not draining
 PAUSE_S = 0.01  # without a unit for this long and 1.5 frame intervals, measurement of the rate restarts
+LATE_REPORT_S = 0.06  # between two reports; a longer time means that the operator's side was held up
 GAP_S = 0.12  # without a unit for this long, or for two frame intervals, the link has stalled
 COUNTED_S, LONGEST_S = 1.0, 2.0  # losses are counted for this long; with few packets for longer ...
 FEW_PACKETS = 100  # ... until there are so many; with fewer the loss share is not reported
@@ -205,7 +206,9 @@ def estimate(uplink: UplinkMemory, report: LinkReport) -> tuple[UplinkMemory, Li
         onset = max((u.arrived for u in uplink.units if u.queue <= EMPTY_S), default=uplink.units[0].arrived)
     else:
         onset = uplink.onset
-    stalled = not report.all_received and report.at - last > _longest_gap(frame)
+    # While the operator's side is held up it reads nothing, and reports nothing either.
+    held_up_s = max(0.0, report.at - uplink.queues[-1][0] - LATE_REPORT_S) if uplink.queues else 0.0
+    stalled = not report.all_received and report.at - last > _longest_gap(frame) + held_up_s
     # In a stall nothing new is known of the queue, which would seem not to drain.
     waits = () if stalled else _entries_since(uplink.queues, report.at - STUCK_S)
     queues = (*waits, (report.at, queue, report.packets, report.lost))

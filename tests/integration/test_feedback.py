@@ -23,7 +23,7 @@ pytestmark = [
 
 ROBOT = (*SMALL_ROBOT, "fps_max=15", "page.serve=false", "pqos=constant", "pqos.kbps=4000")
 SECONDS, SETTLED_S = 14, 6
-PAUSES, PAUSE_S = 6, 0.2
+PAUSES, PAUSE_S = 4, 0.2
 
 
 @pytest.fixture(scope="module")
