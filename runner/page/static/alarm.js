@@ -3,7 +3,8 @@
 const TOGETHER_MS = 1000; // a link that fails takes eight pictures with it: one tone
 const REPEAT_MS = 2000; // a picture that flickers does not sound each time
 const PAUSED_MS = 1000; // a shorter pause, as until a vehicle hears of its operator, does not sound
-const KINDS = { lost: "lost", frozen: "lost", unsupported: "lost", paused: "lost", late: "late", damaged: "late" };
+/** The statuses that trigger a tone, the worst first, and its kind: "lost" where nothing moves. */
+export const ALARMS = { lost: "lost", frozen: "lost", unsupported: "lost", paused: "lost", damaged: "late", late: "late" };
 const never = () => ({ lost: -Infinity, late: -Infinity });
 /**
  * @typedef {object} Sounded what was sounded of a camera
@@ -17,7 +18,7 @@ const never = () => ({ lost: -Infinity, late: -Infinity });
 
 /** The tone for the worst of these statuses; null: none is needed. @param {string[]} statuses @returns {"lost"|"late"|null} */
 export function worstKind(statuses) {
-  const kinds = statuses.map((status) => KINDS[status]);
+  const kinds = statuses.map((status) => ALARMS[status]);
   return kinds.includes("lost") ? "lost" : kinds.includes("late") ? "late" : null;
 }
 
@@ -36,7 +37,7 @@ export class Alarm {
    * @returns {"lost"|"late"|null} the tone that is due
    */
   due(camera, status, now) {
-    const kind = KINDS[status];
+    const kind = ALARMS[status];
     const own = (this.#ofCamera[camera] ??= { ...never(), recovered: false, moved: false, waiting: null, earliest: 0 });
     Object.assign(own, { waiting: null, earliest: status === "paused" ? now + PAUSED_MS : now });
     own.recovered ||= !kind;

@@ -2,6 +2,7 @@
 
 import { alertStatus, inControl, listen, mode, ofVehicle, publish, remind, store } from "./store.js";
 import { worstOf } from "./ages.js";
+import { ALARMS } from "./alarm.js";
 import { Attention } from "./attention.js";
 import { isGuided, nextChoice } from "./guides.js";
 import { holding, linkFault, toggleControl, whyNotInControl } from "./header.js";
@@ -14,9 +15,8 @@ import { limitReasons, pauseReason } from "./total.js";
 import { byId, displayName, latency, setAttribute, setText, whole } from "./format.js";
 
 const MODES = { single: "Single", automatic: "Automatic", collective: "Collective" };
-const ALARMS = ["lost", "frozen", "unsupported", "paused", "damaged", "late"]; // the worst first
 const WORDS = { unsupported: "NO PICTURE" };
-const STALLED = ["lost", "frozen", "unsupported", "paused"];
+const STALLED = Object.keys(ALARMS).filter((status) => ALARMS[status] === "lost");
 const KMH = 3.6; // of 1 m/s
 const GUIDES = "tod-guides";
 const RETURNED_MS = 1000; // a press within this time belongs to the return
@@ -100,7 +100,7 @@ function refreshAlarms() {
 
 /** Show pictures by status, FROZEN front left, rear (monitor), and further words. Returns whether there are any pictures. */
 function showAlarms(element, cameras, further = []) {
-  const found = ALARMS.map((status) => ({ status, pictures: picturesOf(status, cameras) })).filter(({ pictures }) => pictures.length);
+  const found = Object.keys(ALARMS).map((status) => ({ status, pictures: picturesOf(status, cameras) })).filter(({ pictures }) => pictures.length);
   const texts = found.map(({ status, pictures }) => `${SHAPES[status]} ${WORDS[status] ?? status.toUpperCase()} ${pictures.join(", ")}`);
   setText(element, [...texts, ...further].join("  "));
   setAttribute(element, "data-level", found.some(({ status }) => STALLED.includes(status)) ? "late" : "near");
