@@ -5,14 +5,15 @@ import { listen, store } from "./store.js";
 import { colourOf, themed } from "./colours.js";
 import { byId, displayName, factor, make } from "./format.js";
 
-const SETTLE_MS = 1500; // from the first picture to loading the charts
-const AT_LATEST_MS = 4000; // if no picture is live by then
+const SETTLE_MS = 3000; // from the first picture: loading keeps the controls busy for most of a second, not when they are first needed
+const AT_LATEST_MS = 5000; // if no picture is live by then
 const LEAST_PX = 70; // Plotly cannot place the axes in a lower chart; the rest is clipped
 const BETWEEN_MS = 60; // from one chart to the next, to avoid long tasks
 const EARTH_M = 6371000;
 
 const visible = new Set();
 let isLoading = false;
+let isSettled = false;
 
 // --- traces -----------------------------------------------------------------------------------------------------------
 
@@ -139,8 +140,9 @@ function drawAll() {
   for (const [i, chart] of charts.entries()) setTimeout(draw, i * BETWEEN_MS, chart);
 }
 
+/** Once the first pictures are settled and a chart is on the screen: in the Drive view none is until its drawer opens. */
 function loadPlotly() {
-  if (isLoading) return;
+  if (isLoading || !isSettled || !visible.size) return;
   isLoading = true;
   const script = make("script", { src: "/plotly.js" });
   script.addEventListener("load", () => {
@@ -149,6 +151,11 @@ function loadPlotly() {
   });
   script.addEventListener("error", () => charts.forEach(({ id }) => byId(id).replaceChildren("charts are not available: /plotly.js failed to load")));
   document.head.append(script);
+}
+
+function settle() {
+  isSettled = true;
+  loadPlotly();
 }
 
 function showLegend() {
@@ -166,15 +173,16 @@ export function startCharts() {
       else visible.delete(target.id);
       if (isIntersecting) draw(charts.find(({ id }) => id === target.id));
     }
+    loadPlotly();
   });
   for (const { id } of charts) observer.observe(byId(id));
   let isLive = false;
   listen("status", ({ status }) => {
     if (isLive || status !== "live") return;
     isLive = true;
-    setTimeout(loadPlotly, SETTLE_MS);
+    setTimeout(settle, SETTLE_MS);
   });
-  setTimeout(loadPlotly, AT_LATEST_MS);
+  setTimeout(settle, AT_LATEST_MS);
   listen("hello theme", showLegend);
   listen("theme selected", drawAll);
   new ResizeObserver(drawAll).observe(byId("side"));
