@@ -116,7 +116,7 @@ def adapted(line: str, words: tuple[str, ...] = ()) -> list[str]:
     _, verb, *rest = shlex.split(line)
     if verb not in SHORT or rest[:1] == ["compare"]:
         return [verb, *rest]
-    rest = [word for word in rest if not word.startswith(("duration_s=", "fps_max="))]
+    rest = [word for word in rest if not word.startswith("duration_s=")]
     robot = "vehicle=delivery_robot" in rest
     own = [word for word in SHORT[verb] if not any(given.startswith(word.partition("=")[0]) for given in rest)]
     if robot:
