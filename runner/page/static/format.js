@@ -11,6 +11,9 @@ export const tenth = (value) => (Number.isFinite(value) ? Math.max(0, value).toF
 /** A factor in its shortest exact form: 0.25, 0.125. */
 export const factor = (value) => (Number.isFinite(value) ? String(Math.round(value * 1e4) / 1e4) : "–");
 
+/** Size of an element's contents, CSS px. To read it may lay out the page. @param {Element} element */
+export const boxSize = ({ clientWidth: width, clientHeight: height }) => ({ width, height });
+
 export const size = (width, height) => (width && height ? `${width}×${height}` : "–");
 
 /** A latency in ms and its error bound: 48 ± 6 ms. */

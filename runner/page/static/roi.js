@@ -6,7 +6,7 @@ import { toBox, toPicture, visible } from "./framing.js";
 import { withKey } from "./hints.js";
 import { isStraight } from "./straighten.js";
 import { inside, SMALLEST, withAspect } from "./region.js";
-import { make, sameRegion } from "./format.js";
+import { boxSize, make, sameRegion } from "./format.js";
 
 const DRAG_START_PX = 6; // a click moves the pointer less than this
 const ASPECT = "tod-roi-aspect";
@@ -26,12 +26,10 @@ export function toggleLocked() {
   publish("aspect");
 }
 
-const sizeOf = ({ clientWidth: width, clientHeight: height }) => ({ width, height });
-
 /** A region of the full image from two corners in the box, in whole pixels, within the visible part and not too small. */
 function regionOf(box, view, roi, full, a, b) {
-  const corners = [a, b].map((corner) => toPicture(corner, sizeOf(box), roi, view));
-  const seen = visible(sizeOf(box), roi, view);
+  const corners = [a, b].map((corner) => toPicture(corner, boxSize(box), roi, view));
+  const seen = visible(boxSize(box), roi, view);
   const along = (key, from, length, end) => {
     const sides = corners.map((corner) => roi[key] + corner[key]).sort((p, q) => p - q);
     return snap(sides, roi[key] + from, roi[key] + from + length, end);
@@ -88,7 +86,7 @@ export function dragRegion(name, box, view) {
   const place = (roi) => {
     const seen = shownRegion(name);
     if (!seen) return;
-    const shown = toBox({ ...roi, x: roi.x - seen.x, y: roi.y - seen.y }, sizeOf(box), seen, view());
+    const shown = toBox({ ...roi, x: roi.x - seen.x, y: roi.y - seen.y }, boxSize(box), seen, view());
     Object.assign(rectangle.style, {
       left: `${shown.x}px`, top: `${shown.y}px`, width: `${shown.width}px`, height: `${shown.height}px`,
     });

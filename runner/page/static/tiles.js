@@ -14,7 +14,7 @@ import { isStraight } from "./straighten.js";
 import { straightOptics } from "./straight.js";
 import { withKey } from "./hints.js";
 import { colourOf } from "./colours.js";
-import { announce, byId, displayName, factor, latency, make, setAttribute, setText, size, whole } from "./format.js";
+import { announce, boxSize, byId, displayName, factor, latency, make, setAttribute, setText, size, whole } from "./format.js";
 
 export const SHAPES = { live: "●", late: "▲", damaged: "◪", frozen: "■", lost: "✕", off: "○", paused: "❚❚", synchronising: "◌", unsupported: "⊘" };
 const SHORT = { synchronising: "SYNC", unsupported: "NO PICTURE" }; // the overlay has the full word
@@ -201,7 +201,7 @@ function setView(name, view) {
 function reportFrame(name) {
   const part = tiles.get(name);
   if (!part) return;
-  part.measured = { width: part.box.clientWidth, height: part.box.clientHeight };
+  part.measured = boxSize(part.box);
   reportSize(name, part.box, part.view);
   refreshFraming(name, part);
 }

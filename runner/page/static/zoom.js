@@ -1,5 +1,6 @@
 /** Zooming and moving the region of interest in mode S: wheel, pinch of two fingers, middle button. */
 
+import { boxSize } from "./format.js";
 import { camera, publish } from "./store.js";
 import { placement, toPicture } from "./framing.js";
 import { moved, zoomed } from "./region.js";
@@ -30,7 +31,7 @@ export function zoomRegion(name, box, view) {
   let gesture = null; // how a pinch or drag began
   let hinted = -Infinity;
 
-  const size = () => ({ width: box.clientWidth, height: box.clientHeight });
+  const size = () => boxSize(box);
   const positionOf = ({ clientX, clientY }) => ({ x: clientX - box.getBoundingClientRect().x, y: clientY - box.getBoundingClientRect().y });
 
   /** The region requested or in force; null: it may not be changed. */
