@@ -321,10 +321,10 @@ def _in_one_line(reference: str, document: Any) -> str | None:
     findings = (finding for error in _errors(reference, document) for finding in _explain(error))
     found = _without_misspelt(islice(findings, MAX_ERRORS))
     texts = []
-    for _, alike in groupby(found, key=lambda f: (f.rule, f.found and f.path)):  # unknown keys share a sentence
-        first, *others = alike
-        paths = ", ".join(shortened(dotted(f.path)) for f in (first, *others))
-        texts.append(": ".join(filter(None, (paths, first.found, first.rule))))
+    for (rule, _), group in groupby(found, key=lambda f: (f.rule, f.found and f.path)):  # unknown keys share a sentence
+        alike = list(group)
+        paths = ", ".join(shortened(dotted(f.path)) for f in alike)
+        texts.append(": ".join(filter(None, (paths, alike[0].found, rule))))
     return "; ".join(texts) if found else None
 
 

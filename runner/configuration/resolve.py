@@ -74,5 +74,5 @@ def _config(document: dict[Any, Any]) -> DictConfig:
 
 @lru_cache(maxsize=1024)
 def _pickled_config(document: bytes) -> bytes:
-    """The same for a pickled document, pickled."""
+    """`_config` of a pickled document, pickled."""
     return pickle.dumps(_config(pickle.loads(document)))

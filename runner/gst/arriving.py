@@ -94,19 +94,20 @@ class ArrivingFrames:
         now      s
         arrived  when the kernel received it, s; None: now
         """
+        arrived = now if arrived is None else arrived
         with self._lock:
             ahead = 0 if self._newest is None else (packet.number - self._newest.number - 1) % (2 * HALF)
             if ahead >= (HALF if retransmitted else 2 * HALF - MISORDER):
                 self._add_older(packet, retransmitted)
                 return False
             if ahead < DROPOUT:
-                self._add_newer(packet, now, now if arrived is None else arrived, retransmitted, whole=not ahead)
+                self._add_newer(packet, now, arrived, retransmitted, whole=not ahead)
                 self._note_missing(packet.number, ahead)
                 return True
             expected, self._restarted = self._restarted, (packet.number + 1) % (2 * HALF)
             if packet.number != expected:
                 return False
-            self._add_newer(packet, now, now if arrived is None else arrived, retransmitted, whole=False)
+            self._add_newer(packet, now, arrived, retransmitted, whole=False)
             return True
 
     def is_late(self, now: float) -> bool:

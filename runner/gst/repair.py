@@ -105,9 +105,10 @@ class RepairBuffer:
 
     def _arrived(self, buffer: PassingBuffer, now: float) -> float:
         """When the kernel received a packet, s, where the DTS states it: see `runner.gst.packet_times`."""
-        if buffer.dts is None:
+        dts = buffer.dts
+        if dts is None:
             return now
-        arrived = (self._buffer.get_base_time() + buffer.dts) / Gst.SECOND  # a pipeline's clock is the monotonic one
+        arrived = (self._buffer.get_base_time() + dts) / Gst.SECOND  # a pipeline's clock is the monotonic one
         return arrived if now - LONGEST_S < arrived < now else now
 
     def _on_packet(self, _pad: Gst.Pad, buffer: PassingBuffer) -> bool:

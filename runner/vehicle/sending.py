@@ -1,8 +1,8 @@
 """How late the vehicle itself sent what has arrived: a busy machine must not be mistaken for a busy link. Pure.
 
-A frame that the payloader had not output yet, longer after its capture than usual, was delayed by the vehicle. Where
-that is certain only within a longer time than normal, the machine was too busy to look, and the frame counts as sent at
-the end of it. Otherwise a queue in front of the link is never underestimated.
+If a payloader has not output a frame yet, longer after its capture than usual, the vehicle delays it. Only what is
+certain counts, so that a queue in front of the link is never underestimated, with one exception: if the machine was too
+busy to look in time, a frame counts as sent when it was seen.
 """
 
 from __future__ import annotations

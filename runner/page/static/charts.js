@@ -5,7 +5,7 @@ import { listen, store } from "./store.js";
 import { colourOf, themed } from "./colours.js";
 import { byId, displayName, factor, make } from "./format.js";
 
-const SETTLE_MS = 3000; // from the first picture: loading keeps the controls busy for most of a second, not when they are first needed
+const SETTLE_MS = 3000; // after the first picture: while the charts load, controls do not answer for most of a second
 const AT_LATEST_MS = 5000; // if no picture is live by then
 const LEAST_PX = 70; // Plotly cannot place the axes in a lower chart; the rest is clipped
 const BETWEEN_MS = 60; // from one chart to the next, to avoid long tasks
