@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -29,6 +30,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def pytest_collection_finish() -> None:
     gc.freeze()  # what has been imported stays: it need not be searched for garbage again and again
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_warning_recorded(warning_message: warnings.WarningMessage) -> None:
+    """Workers of pytest-xdist pass a warning on by its module, and GLib's claim one that does not exist (gobject)."""
+    if warning_message.category.__module__ == "gobject":
+        warning_message.category = RuntimeWarning
+        warning_message.message = RuntimeWarning(f"GLib: {warning_message.message}")
 
 
 @pytest.fixture(autouse=True)
