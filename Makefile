@@ -17,7 +17,7 @@ NODE_READY := node_modules/.ready
 # Tests start hundreds of processes; without cached bytecode each would compile the project again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test timed untimed golden units check fast coverage lint javascript setup bench deadspot uplink-given soak ros1 ros2 clean
+.PHONY: demo test timed untimed compiled golden units check fast coverage lint javascript setup bench deadspot uplink-given soak ros1 ros2 clean
 
 demo: $(READY)
 	$(BIN)/tod-runner demo
@@ -33,13 +33,18 @@ timed: $(TEST_READY)
 	$(BIN)/pytest tests/integration -m "timed and not soak" -n $$(($$(nproc) + 1)) --dist loadfile --no-loadscope-reorder --durations=30
 
 untimed: $(TEST_READY)
-	scripts/background $(MAKE) --no-print-directory -j 1 lint javascript golden units
+	scripts/background $(MAKE) --no-print-directory -j 2 --output-sync=line compiled lint javascript golden units
+
+# Workers of pytest start at the same time, and each would compile all tests. They report what cannot be imported.
+compiled: $(TEST_READY)
+	@$(BIN)/pytest --collect-only -qq > /dev/null || true
 
 golden: $(TEST_READY)
 	$(BIN)/python tests/golden
 
+# Some wait, hence one worker more than cores.
 units: $(TEST_READY)
-	$(BIN)/pytest -m "not timed and not alone and not soak" -n auto --dist loadfile --durations=30
+	$(BIN)/pytest -m "not timed and not alone and not soak" -n $$(($$(nproc) + 1)) --dist loadfile --durations=30
 
 check: $(TEST_READY) $(NODE_READY)
 	$(MAKE) --no-print-directory -j 2 --output-sync=line fast lint javascript

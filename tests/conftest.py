@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import gc
+import os
+import tempfile
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,6 +16,9 @@ from hypothesis import settings
 
 from runner.configuration import config
 from runner.configuration.origin import Composed
+
+# GStreamer lists its plugins once, not for each new cache, and again whenever one of them changes.
+REGISTRY = Path(tempfile.gettempdir()) / f"gstreamer-registry-of-tests-{os.getuid()}.bin"
 
 # A busy machine may take longer than 0.2 s for an example. The same examples in each run; `make soak` draws others.
 settings.register_profile("same", deadline=None, derandomize=True)
@@ -44,6 +49,7 @@ def pytest_warning_recorded(warning_message: warnings.WarningMessage) -> None:
 def clean_environment(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> None:
     monkeypatch.delenv("TOD_CONF", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(shared_cache(tmp_path_factory)))
+    monkeypatch.setenv("GST_REGISTRY", str(REGISTRY))
 
 
 @pytest.fixture

@@ -271,6 +271,7 @@ def test_writer_reports_the_error_of_gstreamer(tmp_path: Path) -> None:
         write_clip(tmp_path / "no" / "such.mp4", iter([bytes(32 * 32 * 3 // 2)] * 9), 32, 32, Fraction(10))
 
 
+@pytest.mark.soak  # 4 s of encoding, and the world rarely changes
 @pytest.mark.gst
 def test_side_view_needs_more_bits(tmp_path: Path) -> None:
     """The same encoder at the same quantizer; half left and half right against ahead, a whole default drive."""

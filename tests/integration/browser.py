@@ -61,6 +61,10 @@ def opened(browser, url, width=1280, height=800, refused=False, script="", **con
 _wrong = WeakKeyDictionary()  # by browser context: errors, and addresses of other hosts
 
 
+# Both wait for the page's worker, which a test may have stopped.
+STATE = "Promise.all([tod.measure(), tod.birdseye()])"
+
+
 @contextmanager
 def checked(page, refused=False):
     """The page must have stayed free of errors; see `opened`."""
@@ -69,7 +73,7 @@ def checked(page, refused=False):
         yield
     finally:  # pytest prints it of a test that fails
         with suppress(sync_api.Error):
-            print(page.evaluate("Promise.all([tod.measure(), tod.birdseye()])"))
+            print(page.evaluate(f"Promise.race([{STATE}, new Promise((end) => setTimeout(end, 1000))])"))
     expected = ["WebSocket connection", "net::ERR_" if refused else NETWORK_CHANGED]
     expected += ["'globalThis.boot' as it is undefined"] * any(NETWORK_CHANGED in text for text in wrong)
     unexpected = [text for text in wrong if not any(each in text for each in expected)]

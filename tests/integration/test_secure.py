@@ -681,7 +681,7 @@ def test_a_demo_with_keys_streams_and_shows_no_secret(keys, tmp_path, graph):
     page = ("page.serve=true", "page.host=0.0.0.0", f"page.port={free_port()}")
     ports = (f"media.port={free_port()}", f"control.port={free_port()}", f"graph.first_port={free_port()}")
     words = (*WORDS, *page, *ports, f"graph={graph}", f"keys={keys}", f"log={drive}")
-    with process("demo", *words, "duration_s=6", env={MARK: mark}) as demo:
+    with process("demo", *words, "duration_s=4", env={MARK: mark}) as demo:
         until(lambda: (drive / "operator.jsonl").exists() and len(marked_processes(mark)) == 4)
         shown = [
             Path(f"/proc/{pid}", name).read_bytes() for pid in marked_processes(mark) for name in ("cmdline", "environ")
