@@ -33,7 +33,7 @@ timed: $(TEST_READY)
 	$(BIN)/pytest tests/integration -m "timed and not soak" -n $$(($$(nproc) + 1)) --dist loadfile --no-loadscope-reorder --durations=30
 
 untimed: $(TEST_READY)
-	scripts/background $(MAKE) --no-print-directory -j 2 --output-sync=line compiled lint javascript golden units
+	scripts/background $(MAKE) --no-print-directory -j 1 compiled lint javascript golden units
 
 # Workers of pytest start at the same time, and each would compile all tests. They report what cannot be imported.
 compiled: $(TEST_READY)

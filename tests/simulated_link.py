@@ -163,6 +163,7 @@ def drive(
     filled: float = 1.0,
     flows: type[Tcp] = Tcp,
     predicted: bool = True,
+    floors: float = 0,
 ) -> Drive:
     """A drive under a limit (prediction or total), kbit/s; every camera sends an equal part of the cap.
 
@@ -176,11 +177,12 @@ def drive(
     watched  whether the vehicle looks every LOOK_S which frames it has sent
     filled  share of their bitrate that the encoders use
     predicted  whether the limit is a prediction; otherwise only the measurement limits the total
+    floors  what the cap needs for the floors of all cameras, kbit/s
     """
     rng, order, uplink = random.Random(seed), itertools.count(), UplinkMemory()
     begin, end = tcp_s or (seconds, seconds)
     link_queue, tcp = Queue(link, queued_s), flows(end, 2 * link.one_way_s)
-    done, cap, sending = Drive(tcp=tcp.delivered), _first_cap(limit(0.0), start, predicted), SendingTimes()
+    done, cap, sending = Drive(tcp=tcp.delivered), _first_cap(limit(0.0), start, predicted, floors), SendingTimes()
     events: list[tuple[float, int, str, Any]] = [
         (0.001 * number, next(order), "frame", number) for number in range(cameras)
     ]
@@ -250,8 +252,9 @@ def drive(
     return done
 
 
-def _first_cap(limit: float, start: Fraction, predicted: bool) -> LinkCap:
-    return start_cap(UNCAPPED._replace(alone=not predicted, predicted=predicted), None, 0.0, Fraction(limit), start)
+def _first_cap(limit: float, start: Fraction, predicted: bool, floors: float) -> LinkCap:
+    cap = UNCAPPED._replace(alone=not predicted, predicted=predicted, floors=Fraction(floors))
+    return start_cap(cap, None, 0.0, Fraction(limit), start)
 
 
 def _look(sending: SendingTimes, camera: int, captured: float, t: float) -> float:

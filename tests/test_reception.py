@@ -398,6 +398,18 @@ def test_floors_come_first_in_mode_s_too() -> None:
     assert drive.sent("rear")[0] < 300
 
 
+def test_a_cut_ends_at_the_floors_unless_they_are_too_much_for_the_link() -> None:
+    drive = Drive("vehicle=delivery_robot", "modes=safe", "cameras.front.floor_kbps=500", "cameras.mast.floor_kbps=100")
+    drive.accept("bitrate_predicted", kbps=3000, valid_s=1000)
+    measured(drive, 0.1, 300, "filling", 200)
+    assert (drive.total, drive["front"].kbps, drive["mast"].kbps) == (600, 500, 100)
+    for n in range(20):
+        measured(drive, 0.2 + n / 25, 550, "filling", 300 + n)
+    assert drive.total == 600, "competing traffic fills the queue, and the floors arrive"
+    measured(drive, 1.2, 300, "filling", 400)
+    assert drive.total < 300
+
+
 SHED = ("cameras.front.floor_kbps=600", "cameras.rear.floor_kbps=300", "cameras.rear.shed=1")
 
 

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
 from itertools import pairwise
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -329,6 +330,28 @@ def test_cameras_without_predictions_hold_their_share_against_short_flows() -> N
     assert done.kbps(15, 60) >= 500
     assert done.lowest(15, 60) >= 300
     assert sum(size for t, size in done.tcp if 15 <= t < 60) * 8 / 1000 / 45 >= 1500
+
+
+def test_competing_flows_take_no_camera_below_its_floor() -> None:
+    link, limit = Link(steps((0, 4000)), one_way_s=0.05, queue_s=0.1), steps((0, 4000))
+    others: dict[str, Any] = {"fps": 15, "tcp_s": (5, 60), "flows": ShortFlows, "filled": 0.9, "predicted": False}
+    lowest = {
+        floors: min(drive(link, limit, 60, floors=floors, seed=seed, **others).lowest(10, 60) for seed in range(1, 6))
+        for floors in (0, 500)
+    }
+    assert lowest[0] < 200
+    assert lowest[500] == 500
+
+
+@pytest.mark.parametrize("queue_s", [0.3, 0.03])
+@pytest.mark.parametrize("kbps", [60, 150, 220])
+def test_a_link_too_narrow_for_the_floors_gets_less(kbps: float, queue_s: float) -> None:
+    """A short queue drops packets until less is sent."""
+    link = Link(steps((0, 4000), (10, kbps), (30, 4000)), one_way_s=0.05, queue_s=queue_s)
+    done = drive(link, steps((0, 4000)), 45, fps=15, floors=300)
+    assert done.first(10, lambda cap: cap < kbps) < 2.5
+    assert done.wait_ms(0.95, since=14) <= 100
+    assert done.kbps(40, 45) >= 1500, "half of a prediction that proved too high is trusted"
 
 
 @pytest.mark.parametrize("kbps", [100, 250, 600, 850, 1200, 1300])

@@ -148,6 +148,8 @@ class LinkCap(NamedTuple):
     alone       whether nothing else limits the total
     predicted   whether the limit is a prediction, not what an operator has set
     reserve     kbit/s of the cap that are left to other traffic
+    floors      kbit/s that the cap needs for the floors of all cameras; cuts end there unless the link is narrower
+    below       whether it proved to be, since the cap was last above them
     trust       how far the limit is trusted
     most        the most that arrived
     began       t of the first measurement
@@ -174,6 +176,8 @@ class LinkCap(NamedTuple):
     alone: bool = False
     predicted: bool = False
     reserve: Kbps = Fraction(0)
+    floors: Kbps = Fraction(0)
+    below: bool = False
     trust: Trust = UNDOUBTED
     most: Most = NOTHING
     began: float = float("inf")
@@ -361,6 +365,17 @@ def _is_narrow(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> bool:
     return any(held_s >= least_s and link.kbps < share * sent for least_s, share in NARROW)
 
 
+def _is_below_floors(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> bool:
+    """Whether the link carries less than the floors although no more is sent, so that others are not the reason."""
+    if _in_force(cap, limit) > cap.floors:
+        return False
+    assert link.kbps is not None
+    drops = (link.loss or 0) > LOSSY  # the queue of the link itself may be short
+    held_s, sent = t - (cap.changed if drops else max(cap.changed, cap.short)), _sent(cap, limit)
+    is_proof = any(held_s >= least_s and link.kbps < share * sent for least_s, share in NARROW)
+    return cap.below or (is_proof and (drops or not _is_short(link)))
+
+
 def _note_proof(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:
     """Count a proof that the link is narrow; many show that it is contested instead, and refute the earlier ones.
 
@@ -442,6 +457,8 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps, kn
     target = max(target, _yielded(cap, t) * most * (CONTESTED + (1 - CONTESTED) * burst if _is_contested(cap) else 1))
     if cap.provisional:  # not all cameras may have started, so a low rate proves little
         target = max(target, DEEPEST * _in_force(cap, limit))
+    if not (below := _is_below_floors(cap, link, t, limit)):
+        target = max(target, cap.floors)
     settled, seen = t - cap.changed >= SETTLE_S + _rtt_s(link), _limit_seen(cap, link, t, full)
     if target >= _in_force(cap, limit) or not (settled or (link.queue_ms or 0) > cap.queue_ms):
         return _raise_known(_lower_known(cap, max(carried, known * seen / full), link, t, seen), link, t, full)
@@ -453,6 +470,7 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps, kn
         changed=t,
         most=cap.most._replace(kbps=most),
         provisional=False,
+        below=below,
     )
 
 
@@ -541,7 +559,8 @@ def _handle_stall(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> Li
         if t - cap.idle < SILENCE_S + _rtt_s(link):
             return cap
         arrived = min(_in_force(cap, limit), cap.before or limit)
-        return cap._replace(kbps=_short(arrived * DEEPEST), stall=Stall(t, 0), changed=t, provisional=False)
+        kbps = max(arrived * DEEPEST, min(arrived, Fraction(0) if cap.below else cap.floors))
+        return cap._replace(kbps=_short(kbps), stall=Stall(t, 0), changed=t, provisional=False)
     return _halve(cap, cap.stall, t, limit)
 
 

@@ -8,11 +8,11 @@ Memory is frozen and keyed by rule; only rules that need history use it.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from fractions import Fraction
 from functools import cache
-from math import isfinite
+from math import ceil, isfinite
 from typing import Any
 
 from runner.core import allocation, scaling
@@ -33,7 +33,7 @@ from runner.core.link_cap import (
     start_cap,
     update_cap,
 )
-from runner.core.model import Kbps, Mode, Vehicle, exact, plain
+from runner.core.model import Camera, Kbps, Mode, Vehicle, exact, plain
 from runner.core.state import State
 from runner.errors import RunError
 
@@ -384,7 +384,8 @@ def cap_by_link(
             cap = end_probe(cap)
         cap = follow(cap, limit, state.mode is Mode.AUTOMATIC and not alone)
         cap = start_cap(cap, link, state.operator_since, limit, start)
-        cap = update_cap(cap._replace(reserve=reserve_kbps), link, state.t, limit, least_trust, state.position)
+        cap = cap._replace(reserve=reserve_kbps, floors=_capped_floors(cameras, reserve_kbps))
+        cap = update_cap(cap, link, state.t, limit, least_trust, state.position)
         cap = raise_cap(cap, least)  # with less, some cameras would not be sent, and so not measured
     memory = {**memory, "cap_by_link": cap}
     carried = believed_limit(cap, limit, least_trust)
@@ -395,6 +396,12 @@ def cap_by_link(
     lowered = _lower_total(draft, video_kbps(cameras, carried), why)
     # A new size restarts the encoder, so sizes at the start are chosen for the time after it.
     return lowered.replaced(sized_for=lowered.uncapped) if cap.provisional else lowered, memory
+
+
+def _capped_floors(cameras: Sequence[Camera], reserve: Kbps) -> Kbps:
+    """The cap, in tenths of a kbit/s, that leaves the floors of all cameras that are never given up; 0: no floors."""
+    floors = sum((camera.floor_kbps for camera in cameras if camera.shed is None), allocation.ZERO)
+    return Fraction(ceil(10 * (reserve + wire_kbps(cameras, floors))), 10) if floors else floors
 
 
 def _why_capped(cap: LinkCap) -> str:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import signal
 import time
 from collections import Counter
+from itertools import pairwise
 from statistics import median
 
 import pytest
 
 from rig import NOISE, SMALL_ROBOT, Operator, free_port, process, run
 from runner.core.events import LinkMeasured, OperatorConnected
+from runner.core.link_cap import SILENCE_S
 from runner.core.uplink import LinkState
 from runner.drive.read import read_drive
 from runner.records import DecisionMade, LinkSample, ReceptionReported
@@ -86,9 +88,24 @@ def test_a_replay_measures_the_link_again_bit_for_bit(drive):
 
 def test_a_side_that_is_held_up_is_not_mistaken_for_a_full_link(broker, tmp_path):
     """Its whole process stands still again and again, and then sends or handles all frames of that time at once."""
+    for attempt in range(3):
+        lines = held_up(broker, tmp_path / str(attempt))
+        reports = [line for line in lines if isinstance(line, ReceptionReported)]
+        if max(after.t - before.t for before, after in pairwise(reports)) < SILENCE_S:
+            break  # otherwise a busy machine has held it up for so long that the total is halved
+    sent_late = {int(line.t) for line in reports if line.late_s and max(line.late_s) > PAUSE_S / 2}
+    read_late = {int(line.t) for line in reports if any(unit.ago_s > PAUSE_S / 2 for unit in line.report.units)}
+    assert min(len(sent_late), len(read_late)) >= PAUSES / 2
+    states = Counter(line.state for line in lines if isinstance(line, LinkMeasured))
+    assert states[LinkState.FILLING] + states[LinkState.STALLED] <= 0.02 * states.total()
+    assert not [line for line in lines if isinstance(line, DecisionMade) and line.total_kbps < 4000]
+
+
+def held_up(broker, log):
+    """What the vehicle logged while each side stood still."""
     ports = (f"media.port={free_port()}", f"control.port={broker.port}")
     with (
-        process("vehicle", *ROBOT, "source=test", *ports, f"log={tmp_path}") as vehicle,
+        process("vehicle", *ROBOT, "source=test", *ports, f"log={log}") as vehicle,
         process("operator", *ROBOT, "source=test", *ports) as operator,
     ):
         onlooker = Operator(broker)
@@ -102,15 +119,7 @@ def test_a_side_that_is_held_up_is_not_mistaken_for_a_full_link(broker, tmp_path
             time.sleep(1 - PAUSE_S)
         vehicle.send_signal(signal.SIGINT)
         vehicle.wait(timeout=20)
-    lines = read_drive(tmp_path).sides["vehicle"]
-    reports = [line for line in lines.of(ReceptionReported) if line.t > begin]
-    sent_late = {int(line.t) for line in reports if line.late_s and max(line.late_s) > PAUSE_S / 2}
-    read_late = {int(line.t) for line in reports if any(unit.ago_s > PAUSE_S / 2 for unit in line.report.units)}
-    assert min(len(sent_late), len(read_late)) >= PAUSES / 2
-    states = Counter(link.state for link in lines.of(LinkMeasured) if link.t > begin)
-    assert states[LinkState.FILLING] + states[LinkState.STALLED] <= 0.02 * states.total()
-    cuts = [line for line in lines.of(DecisionMade) if line.t > begin and line.total_kbps < 4000]
-    assert not cuts
+    return [line for line in read_drive(log).sides["vehicle"].lines if line.t > begin]
 
 
 def test_an_operator_may_not_state_what_the_link_carries(broker):
