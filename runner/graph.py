@@ -134,11 +134,6 @@ class Plan:
         return f"{launch(self._teed('operator', self.operator[:-1]))} ! {sink}{self._file_branch}"
 
     @property
-    def decoder(self) -> str:
-        """The same without its sink, and without a file."""
-        return launch(self.operator[:-1])
-
-    @property
     def video_elements(self) -> tuple[Element, ...]:
         """Elements between the stream and its file; none without a file."""
         if not self.video:

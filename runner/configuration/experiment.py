@@ -14,7 +14,7 @@ from runner.pqos.settings import find_file, within
 from runner.schema import event_problem
 
 if TYPE_CHECKING:  # a side that drives loads no evaluation tool
-    from runner.link.limit import Limit, Reverse, TcpFlows
+    from runner.link.limit import Limit, OneWay, TcpFlows
     from runner.pqos.track import Track
 
 RateAtTime = Callable[[float], Kbps]  # rate in force at a time of the drive (s), kbit/s
@@ -99,9 +99,9 @@ def _recorded(data: Mapping[str, Any], loop: bool, bases: Sequence[Path]) -> Rat
     return trace(find_file(data, "file", bases), loop, None)
 
 
-def _reverse(data: Mapping[str, Any], loop: bool, bases: Sequence[Path]) -> Reverse:
+def _reverse(data: Mapping[str, Any], loop: bool, bases: Sequence[Path]) -> OneWay:
     """The reverse direction: its rate is a file's, or constant."""
-    from runner.link.limit import Reverse
+    from runner.link.limit import OneWay
 
     kbps, file = data.get("kbps"), data.get("file")
     if (kbps is None) == (file is None):
@@ -110,7 +110,7 @@ def _reverse(data: Mapping[str, Any], loop: bool, bases: Sequence[Path]) -> Reve
     with within("reverse"):
         rates = _recorded(data, loop, bases) if file else lambda _: constant
         delay_at = _delays(data, loop, bases)
-    return Reverse(lambda t: float(rates(t)), **_path(data), delay_at=delay_at)
+    return OneWay(lambda t: float(rates(t)), **_path(data), delay_at=delay_at)
 
 
 def _delays(data: Mapping[str, Any], loop: bool, bases: Sequence[Path]) -> Callable[[float], float] | None:

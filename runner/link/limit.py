@@ -20,8 +20,16 @@ class Rates(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Reverse:
-    """The direction from operator to vehicle, as in `Limit`."""
+class OneWay:
+    """Effect of the link on all traffic in one direction.
+
+    kbps_at   rate in force t seconds after the start of the drive; 0: nothing passes
+    queue_ms  packets that would wait longer are dropped
+    delay_ms  in addition to the wait
+    delay_at  further delay t seconds after the start of the drive, ms; packets stay in order. None: none
+    loss      share of packets lost after the queue; with a relay, of UDP packets
+    burst     mean number of packets lost in a row
+    """
 
     kbps_at: Callable[[float], float]
     queue_ms: float
@@ -29,6 +37,15 @@ class Reverse:
     loss: float = 0.0
     burst: float = 1.0
     delay_at: Callable[[float], float] | None = None
+
+    def changing_delay_ms(self, t: float) -> float | None:
+        """None: it does not change over time."""
+        return self.delay_ms + self.delay_at(t) if self.delay_at else None
+
+    def settings(self, kbps: float | None) -> dict[str, float | None]:
+        """For a forwarding process (`runner.link.direction`), at this rate."""
+        own = {"queue_ms": self.queue_ms, "delay_ms": self.delay_ms, "loss": self.loss, "burst": self.burst}
+        return {"kbps": kbps, **own}
 
 
 @dataclass(frozen=True)
@@ -48,49 +65,27 @@ class TcpFlows:
 
 
 @dataclass(frozen=True)
-class Limit:
-    """Effect of the link on all traffic from the vehicle to the operator.
+class Limit(OneWay):
+    """Effect of the link from the vehicle to the operator.
 
-    kbps_at   rate in force t seconds after the start of the drive; 0: nothing passes
-    queue_ms  packets that would wait longer are dropped
-    delay_ms  one way, in addition to the wait
-    delay_at  further delay t seconds after the start of the drive, ms; packets stay in order. None: none
-    loss      share of packets lost after the queue; with a relay, of UDP packets
-    burst     mean number of packets lost in a row
-    reverse   effect on traffic from the operator to the vehicle; None: none
-    tcp       competing traffic from vehicle to operator; None: none
+    reverse  effect on traffic from the operator to the vehicle; None: none
+    tcp      competing traffic from vehicle to operator; None: none
     """
 
-    kbps_at: Callable[[float], float]
-    queue_ms: float
-    delay_ms: float
-    loss: float = 0.0
-    burst: float = 1.0
-    delay_at: Callable[[float], float] | None = None
-    reverse: Reverse | None = None
+    reverse: OneWay | None = None
     tcp: TcpFlows | None = None
 
     def rates(self, t: float) -> Rates:
         """The rates to set; before the start, those at the start."""
-        at, back = max(0.0, t), self.reverse
-        return Rates(
-            float(self.kbps_at(at)), float(back.kbps_at(at)) if back else None, _delay_ms(self, at), _delay_ms(back, at)
-        )
+        at, up, down = max(0.0, t), self.changing_delay_ms, self.reverse
+        if down is None:
+            return Rates(float(self.kbps_at(at)), None, up(at))
+        return Rates(float(self.kbps_at(at)), float(down.kbps_at(at)), up(at), down.changing_delay_ms(at))
 
-    def settings(self) -> dict[str, Any]:
-        """Both directions at the start, for a forwarding process (`runner.link.direction`)."""
+    def both(self) -> dict[str, Any]:
+        """The settings of both directions at the start."""
         rates = self.rates(0)
-        back = None if self.reverse is None else _direction(self.reverse, rates.down)
-        return {"up": _direction(self, rates.up), "down": back}
-
-
-def _delay_ms(one: Limit | Reverse | None, t: float) -> float | None:
-    """None: it does not change over time."""
-    return one.delay_ms + one.delay_at(t) if one and one.delay_at else None
-
-
-def _direction(one: Limit | Reverse, kbps: float | None) -> dict[str, float | None]:
-    return {"kbps": kbps, "queue_ms": one.queue_ms, "delay_ms": one.delay_ms, "loss": one.loss, "burst": one.burst}
+        return {"up": self.settings(rates.up), "down": self.reverse and self.reverse.settings(rates.down)}
 
 
 @dataclass(frozen=True, slots=True)

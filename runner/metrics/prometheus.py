@@ -64,11 +64,7 @@ METRICS: dict[type, tuple[tuple[_Metric, ...], tuple[_Metric, ...]]] = {
     ),
     Telemetry: (
         (
-            _Metric(
-                "predicted_kbps",
-                "Newest prediction of the bitrate",
-                lambda t: t.predicted_kbps,
-            ),
+            _Metric("predicted_kbps", "Newest prediction of the bitrate", lambda t: t.predicted_kbps),
             _Metric("refused_requests_total", "Requests refused", lambda t: t.refused),
             _Metric("loop_errors_total", "Exceptions that the control loop survived", lambda t: t.errors),
             _Metric("speed_factor", "Advised share of full speed", lambda t: t.speed_factor),

@@ -11,7 +11,7 @@ from rig import free_port, needs_root, process, until
 from runner.configuration.config import configuration
 from runner.core.model import Endpoint
 from runner.link import limited_link
-from runner.link.limit import Limit, Reverse
+from runner.link.limit import Limit, OneWay
 from runner.mqtt.broker import private_broker
 from runner.plans import compile_plans
 
@@ -49,7 +49,7 @@ def test_after_a_cut_everything_is_back_within_5_s(cut_s):
     def kbps(t):
         return 20_000 if passing[-1] else 0
 
-    wide = Limit(kbps, queue_ms=200, delay_ms=0, reverse=Reverse(kbps, queue_ms=200, delay_ms=0))
+    wide = Limit(kbps, queue_ms=200, delay_ms=0, reverse=OneWay(kbps, queue_ms=200, delay_ms=0))
     with (
         limited_link("netns", wide, media, Endpoint("127.0.0.1", free_port()), lambda line: None) as link,
         private_broker(link.broker),

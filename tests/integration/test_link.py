@@ -21,7 +21,7 @@ from runner.core.commands import Command
 from runner.core.model import Endpoint
 from runner.errors import RunError
 from runner.link import Limit, limited_link
-from runner.link.limit import Rates, Reverse, TcpFlows
+from runner.link.limit import OneWay, Rates, TcpFlows
 from runner.mqtt.broker import private_broker
 from runner.plans import compile_plans
 
@@ -423,7 +423,7 @@ out.sendto(b"!" * 1000, (sys.argv[1], int(sys.argv[2])))
 @needs_root
 def test_both_directions_of_a_namespace_lose_and_delay_any_packet():
     """As the relay does with UDP. Half of the packets pass one way, and half of those come back."""
-    lossy = replace(WIDE, delay_ms=50, loss=0.5, reverse=Reverse(lambda t: 5000, 200, 150, loss=0.5))
+    lossy = replace(WIDE, delay_ms=50, loss=0.5, reverse=OneWay(lambda t: 5000, 200, 150, loss=0.5))
     with limited_link("netns", lossy, *_ends(), print) as link, socket.socket(type=socket.SOCK_DGRAM) as echo:
         echo.bind((link.broker.host, 0))
         echo.settimeout(20)

@@ -152,7 +152,7 @@ def luma_of(path: Path) -> list[np.ndarray]:
 
 def received(plan, count: int) -> list[np.ndarray]:
     """The first pictures received over RTSP."""
-    return pulled(f"{plan.decoder} ! videoconvert ! video/x-raw,format=I420", count)
+    return pulled(plan.receiver_into("videoconvert ! video/x-raw,format=I420"), count)
 
 
 def pulled(line: str, count: int) -> list[np.ndarray]:

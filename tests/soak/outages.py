@@ -28,7 +28,7 @@ import keyed
 from rig import Operator, clock_ahead, free_port, set_clock, until
 from runner.core.model import Endpoint
 from runner.link import limited_link
-from runner.link.limit import Limit, Reverse
+from runner.link.limit import Limit, OneWay
 from runner.security.authority import VALID, Authority
 
 BACK_S, LONG_BACK_S, LONG_S = 3.0, 5.0, 20.0  # limits after the end of a fault, and of one at least LONG_S long
@@ -301,7 +301,7 @@ def _drive(directory: Path, mark: str, rng: random.Random) -> Iterator[_Drive]:
     def kbps(t: float) -> float:
         return 20_000 if passing[-1] else 0
 
-    wide = Limit(kbps, queue_ms=200, delay_ms=10, reverse=Reverse(kbps, queue_ms=200, delay_ms=10))
+    wide = Limit(kbps, queue_ms=200, delay_ms=10, reverse=OneWay(kbps, queue_ms=200, delay_ms=10))
     trace = directory / "predicted.csv"
     trace.write_text("t_s,kbps\n" + "".join(f"{t},{kbps}\n" for t, kbps in enumerate(PREDICTED)))
     clocks = {side: directory / side for side in ("vehicle", "operator")}
