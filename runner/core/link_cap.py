@@ -47,6 +47,8 @@ EASED_S, EASED = 2.0, Fraction(4, 5)
 # never more than TRIED of it: then the link itself is narrower. Otherwise the encoders may have used less than the cap.
 NARROW = ((0.0, Fraction(1, 2)), (1.0, Fraction(4, 5)))
 TRIED_S, TRIED = 2.0, Fraction(19, 20)
+# Likewise while only the floors are sent; without losses, encoders that use less are the more likely reason.
+NARROW_FLOORS = ((0.0, Fraction(1, 2)), (1.0, Fraction(2, 3)), (3.0, Fraction(4, 5)))
 # A shorter queue, ms, may be jitter of the radio link or of a busy machine, unless packets are lost: a real overload
 # soon makes it longer.
 JITTER_MS = 40
@@ -372,7 +374,8 @@ def _is_below_floors(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) ->
     assert link.kbps is not None
     drops = (link.loss or 0) > LOSSY  # the queue of the link itself may be short
     held_s, sent = t - (cap.changed if drops else max(cap.changed, cap.short)), _sent(cap, limit)
-    is_proof = any(held_s >= least_s and link.kbps < share * sent for least_s, share in NARROW)
+    tiers = NARROW if drops else NARROW_FLOORS
+    is_proof = any(held_s >= least_s and link.kbps < share * sent for least_s, share in tiers)
     return cap.below or (is_proof and (drops or not _is_short(link)))
 
 
