@@ -111,4 +111,4 @@ $(NODE_READY): package.json package-lock.json | $(TEST_READY)
 	touch $@
 
 clean:
-	rm -rf $(VENV) $(ROS2) node_modules build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(ROS2) node_modules build *.egg-info .pytest_cache .ruff_cache .hypothesis

@@ -39,6 +39,7 @@ FAULTS = [
         "bisect_right(model.b_min, bitrate)",
         "test_scaling",
     ),
+    Fault("core/link_cap.py", "target = max(target, cap.floors)", "target = max(target, cap.reserve)", "test_uplink"),
     Fault("configuration/overrides.py", "if str(override.value) not in known:", "if False:", "test_config"),
     Fault(
         "configuration/interpolation.py",
