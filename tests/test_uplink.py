@@ -427,6 +427,34 @@ def test_a_limit_that_follows_the_link_is_not_doubted_and_recovery_is_fast(late_
         assert done.first(end, lambda cap: cap >= 0.8 * RIGHT) <= 2.5
 
 
+@pytest.mark.parametrize("seed", range(1, 9))
+@pytest.mark.parametrize("share", [1, 1.5])
+def test_what_arrives_in_an_outage_that_was_predicted_says_nothing_about_the_link_after_it(
+    share: float, seed: int
+) -> None:
+    """Its rate varies; one cut in it used to leave a third of the link unused for seconds."""
+    link = Link(steps((0, 4300), (8, 60), (8.3, 300), (8.6, 20), (9, 3800)))
+    predicted = steps((0, 4300), (8, 144), (9, 3800))
+    done = drive(link, lambda t: share * predicted(t), 16, fps=10, seed=seed)
+    assert done.first(9, lambda cap: cap > 3000) < 2.5
+    assert done.wait_ms(0.95, since=10) <= 110
+
+
+def test_a_link_that_is_poor_for_long_is_known_by_what_it_carries() -> None:
+    known = Overuse(1, Fraction(4000), Fraction(4000))
+    cap = LinkCap(kbps=Fraction(4000), overuse=known, predicted=True, measured=99)
+    cap = cap._replace(limit=LastLimit(Fraction(4000), 1, Fraction(0)))
+
+    def under(cap: LinkCap, t: float, limit: float) -> LinkCap:
+        return update_cap(
+            cap, LinkMeasured(t=t, kbps=None, queue_ms=0, loss=0, state=LinkState.CLEAR), t, Fraction(limit)
+        )
+
+    poor = under(cap, 2, 300)._replace(overuse=Overuse(2.5, Fraction(100), Fraction(300)))
+    after = [under(poor, t, 3300).overuse for t in (5, 13)]
+    assert [overuse and overuse.known(Fraction(3300)) for overuse in after] == [3300, 1100]
+
+
 def test_a_stale_position_is_ignored() -> None:
     assert update_trust(DOUBTED, KNOWN_S + 1, HALF, laps(0)).share == 1
     doubts = tuple((float(t), Fraction(1, 2)) for t in (0, 2))

@@ -61,6 +61,9 @@ SEEN_S = 0.4  # beyond the round trip, until a measured rate no longer includes 
 OFTEN, OFTEN_S, BURST_S, CONTESTED = 3, 30.0, 2.0, Fraction(2, 3)
 PROVEN = 2  # then the most that arrived is limited to this multiple of the capacity
 FADED = Fraction(999, 1000)  # factor by which that most decays each second
+# A prediction that falls by this factor announces an outage, and one that rises by it ends it. If it is short, what
+# arrives meanwhile says nothing about the link after it.
+OUTAGE, OUTAGE_S = 10, 10.0
 SILENCE_S = 0.3  # without a report, or with empty reports, for this long the cap is halved
 
 
@@ -78,6 +81,14 @@ class Overuse(NamedTuple):
     def known(self, limit: Kbps) -> Kbps:
         """The capacity under another limit, if both have changed alike."""
         return self.carried * limit / self.limit
+
+
+class Outage(NamedTuple):
+    """An outage that the prediction announces: since when (t), its limit, kbit/s, and the last overuse before it."""
+
+    t: float
+    limit: Kbps
+    overuse: Overuse | None
 
 
 class Lowering(NamedTuple):
@@ -139,6 +150,7 @@ class LinkCap(NamedTuple):
 
     kbps        cap in force; None: no cap below the limit
     overuse     the last one
+    outage      None: the prediction announces none
     queue_ms    wait at the last cut
     steps       careful increases since then
     before      kbit/s that arrived when the link was last clear
@@ -167,6 +179,7 @@ class LinkCap(NamedTuple):
 
     kbps: Kbps | None = None
     overuse: Overuse | None = None
+    outage: Outage | None = None
     queue_ms: float = 0.0
     steps: int = 0
     before: Kbps | None = None
@@ -257,11 +270,20 @@ def _fall_with_limit(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
 
 
 def _adapt_overuse(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
-    """Correct the last overuse if the limit has followed the link since: it was late, and less wrong than it seemed."""
-    known = cap.limit
+    """Correct the last overuse if the limit has followed the link since: it was late, and less wrong than it seemed.
+
+    After an outage the link is expected to carry the same share of the limit as before it.
+    """
+    known, last = cap.limit, cap.overuse
     rose = limit > known.kbps > 0
     cap = cap._replace(limit=LastLimit(limit, t, known.kbps) if rose else known._replace(kbps=limit))
-    last = cap.overuse
+    if cap.predicted and known.kbps >= OUTAGE * limit:
+        return cap._replace(outage=Outage(t, limit, cap.outage.overuse if cap.outage else last))
+    if cap.outage and (t - cap.outage.t > OUTAGE_S or not cap.predicted):
+        cap = cap._replace(outage=None)
+    elif cap.outage and limit >= OUTAGE * cap.outage.limit:
+        before = cap.outage.overuse
+        return cap._replace(overuse=before and _known_now(before, before.known(limit), limit), outage=None)
     if last is None or not last.fell or limit >= last.limit or last.carried >= last.limit or t - last.t > LATE_S:
         return cap
     followed = max(limit, last.carried)
@@ -463,11 +485,14 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps, kn
     if not (below := _is_below_floors(cap, link, t, limit)):
         target = max(target, cap.floors)
     settled, seen = t - cap.changed >= SETTLE_S + _rtt_s(link), _limit_seen(cap, link, t, full)
+    is_over = cap.predicted and full >= OUTAGE * seen
     if target >= _in_force(cap, limit) or not (settled or (link.queue_ms or 0) > cap.queue_ms):
-        return _raise_known(_lower_known(cap, max(carried, known * seen / full), link, t, seen), link, t, full)
+        lowered = cap if is_over else _lower_known(cap, max(carried, known * seen / full), link, t, seen)
+        return _raise_known(lowered, link, t, full)
+    overuse = _overuse(cap.overuse, t, max(carried, _short(known * seen / full)), seen)
     return cap._replace(
         kbps=_short(target),
-        overuse=_overuse(cap.overuse, t, max(carried, _short(known * seen / full)), seen),
+        overuse=cap.overuse if is_over else overuse,
         queue_ms=link.queue_ms or 0.0,
         steps=0,
         changed=t,
