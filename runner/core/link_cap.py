@@ -485,14 +485,14 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps, kn
     if not (below := _is_below_floors(cap, link, t, limit)):
         target = max(target, cap.floors)
     settled, seen = t - cap.changed >= SETTLE_S + _rtt_s(link), _limit_seen(cap, link, t, full)
-    is_over = cap.predicted and full >= OUTAGE * seen
+    in_outage = cap.predicted and full >= OUTAGE * seen  # measured in one that is over
     if target >= _in_force(cap, limit) or not (settled or (link.queue_ms or 0) > cap.queue_ms):
-        lowered = cap if is_over else _lower_known(cap, max(carried, known * seen / full), link, t, seen)
+        lowered = cap if in_outage else _lower_known(cap, max(carried, known * seen / full), link, t, seen)
         return _raise_known(lowered, link, t, full)
-    overuse = _overuse(cap.overuse, t, max(carried, _short(known * seen / full)), seen)
+    carried = max(carried, _short(known * seen / full))
     return cap._replace(
         kbps=_short(target),
-        overuse=cap.overuse if is_over else overuse,
+        overuse=cap.overuse if in_outage else _overuse(cap.overuse, t, carried, seen),
         queue_ms=link.queue_ms or 0.0,
         steps=0,
         changed=t,
