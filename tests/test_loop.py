@@ -434,11 +434,16 @@ def test_no_speed_is_advised_while_nobody_sees_the_pictures() -> None:
         until(
             lambda: [state.attention for state in watched.of(VehicleState)][-1:] == [attention.get("attention", UNSET)]
         )
-        before = len(watched.of(SpeedAdvice))
         for _ in range(20):
-            numbers = {"at": time.monotonic(), "as_of": watched.loop._now(), "packets": 0, "lost": 0, "run": 1}
-            watched.loop.take(QueuedReport("driver", ReceptionReport(units=(), latency_ms=400, **numbers)))
-            time.sleep(0.03)
+            before, longest_s = len(watched.of(SpeedAdvice)), 0.0
+            for _ in range(20):
+                at = time.monotonic()
+                numbers = {"at": at, "as_of": watched.loop._now(), "packets": 0, "lost": 0, "run": 1}
+                watched.loop.take(QueuedReport("driver", ReceptionReport(units=(), latency_ms=400, **numbers)))
+                time.sleep(0.03)
+                longest_s = max(longest_s, time.monotonic() - at)
+            if longest_s < 0.1:
+                break  # otherwise a busy machine held up the reports, and no speed is advised without them
         return {advice.speed_factor for advice in watched.of(SpeedAdvice)[before + 2 :]}
 
     with watched.running():
