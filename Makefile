@@ -35,7 +35,7 @@ timed: $(TEST_READY)
 untimed: $(TEST_READY)
 	scripts/background $(MAKE) --no-print-directory -j 1 compiled lint javascript golden units
 
-# Workers of pytest start at the same time, and each would compile all tests. They report what cannot be imported.
+# Workers of pytest start at the same time, and each would compile all tests. What cannot be imported fails there.
 compiled: $(TEST_READY)
 	@$(BIN)/pytest --collect-only -qq > /dev/null || true
 

@@ -150,7 +150,7 @@ class LinkCap(NamedTuple):
 
     kbps        cap in force; None: no cap below the limit
     overuse     the last one
-    outage      None: the prediction announces none
+    outage      that the prediction announces; None: none
     queue_ms    wait at the last cut
     steps       careful increases since then
     before      kbit/s that arrived when the link was last clear

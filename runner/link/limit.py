@@ -82,7 +82,7 @@ class Limit(OneWay):
             return Rates(float(self.kbps_at(at)), None, up(at))
         return Rates(float(self.kbps_at(at)), float(down.kbps_at(at)), up(at), down.changing_delay_ms(at))
 
-    def both(self) -> dict[str, Any]:
+    def directions(self) -> dict[str, Any]:
         """The settings of both directions at the start."""
         rates = self.rates(0)
         return {"up": self.settings(rates.up), "down": self.reverse and self.reverse.settings(rates.down)}

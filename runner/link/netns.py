@@ -55,7 +55,7 @@ def namespaced(limit: Limit, media: Endpoint, control: Endpoint, dials: bool = F
         machine, vehicle = map(str, network.hosts())
         devices = (name, f"{name}-far")
         inside = (ip, "netns", "exec", name)
-        settings = {"devices": devices, "host": machine, **limit.both()}
+        settings = {"devices": devices, "host": machine, **limit.directions()}
         try:
             with _child("tunnel", settings) as tunnel:
                 port = tunnel.answer()["port"]

@@ -25,7 +25,7 @@ def relayed(limit: Limit, media: Endpoint, control: Endpoint, dials: bool = Fals
     for what, given in (("tcp", limit.tcp), ("media that the vehicle dials", dials)):
         if given:
             raise RunError(f"link=relay: {what} is not supported, choose link=netns")
-    settings = {"media": [media.host, media.port], "control": [control.host, control.port], **limit.both()}
+    settings = {"media": [media.host, media.port], "control": [control.host, control.port], **limit.directions()}
     command = (sys.executable, "-m", "runner.link.relay", json.dumps(settings))
     relay = Child("relay", command, children.environment())
     try:
