@@ -265,9 +265,16 @@ def test_a_standard_output_closed_from_the_start(words: list[str]) -> None:
     assert (done.returncode, done.stderr) == (0, b"")
 
 
-@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&-", "<&- >&- 2>&-"])
 @pytest.mark.parametrize(
-    ("words", "status"), [("print source=test", 0), ("print fps_max=0", 2), ("replay source=test", 0)]
+    ("closed", "words", "status"),
+    [
+        (">&-", "print source=test", 0),
+        ("2>&-", "print fps_max=0", 2),
+        ("<&-", "replay source=test", 0),
+        ("<&- >&- 2>&-", "print source=test", 0),
+        ("<&- >&- 2>&-", "print fps_max=0", 2),
+        ("<&- >&- 2>&-", "replay source=test", 0),
+    ],
 )
 def test_standard_streams_that_are_not_open(closed: str, words: str, status: int) -> None:
     command = f"'{sys.executable}' -m runner {words} {closed}"

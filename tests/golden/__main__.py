@@ -26,7 +26,7 @@ import random
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import lru_cache
 from itertools import product
@@ -62,7 +62,7 @@ def main(words: list[str]) -> int:
         # Rendered clips of the user's cache would show up in the printed lines.
         os.environ |= {"XDG_CACHE_HOME": empty}
         os.environ.pop("TOD_CONF", None)
-        with ProcessPoolExecutor(os.cpu_count(), initializer=gc.freeze) as pool:
+        with ProcessPoolExecutor(os.cpu_count(), initializer=_prepare) as pool:
             for section in sections:
                 texts = SECTIONS[section](pool)
                 different += _write(section, texts) if update else _compare(section, texts)
@@ -224,21 +224,25 @@ def _outputs(pool: ProcessPoolExecutor, words: list[list[str]]) -> Texts:
 def _here(words: list[str], directory: str = ".") -> str:
     """Status and output of a verb in a directory, in this process: starting Python would take longer."""
     from runner.__main__ import main
-    from runner.configuration import config
 
-    config.compose = lambda overrides, user=None: _composed(tuple(overrides), user)
     out, err = (io.TextIOWrapper(io.BytesIO(), "utf-8", write_through=True) for _ in range(2))
     with contextlib.chdir(directory), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         status = main(words)
     return _shown(status, *(stream.buffer.getvalue().decode() for stream in (out, err)))  # type: ignore[attr-defined]
 
 
-@lru_cache(maxsize=8)
-def _composed(overrides: tuple[str, ...], user: Path | None = None) -> Any:
-    """Composing takes longest, and text and JSON of a plan share one composition."""
-    from runner.configuration.compose import compose
+def _prepare() -> None:
+    """In each process of the pool: composing takes longest, and text and JSON of a plan share one configuration."""
+    from runner.configuration import config
 
-    return compose(overrides, user)
+    compose = config.configuration
+    shared = lru_cache(maxsize=8)(compose)
+
+    def configuration(overrides: Sequence[str] = (), user: Path | None = None, **options: Any) -> config.Configuration:
+        return compose(overrides, user, **options) if options else shared(tuple(overrides), user)
+
+    config.configuration = configuration
+    gc.freeze()
 
 
 def _problems(mutation: mutated.Mutation) -> str:

@@ -39,7 +39,8 @@ def small_robot(*cameras: str) -> tuple[str, ...]:
     absent = [f"~cameras.{name}" for name in ROBOT_SIZES if name not in cameras]
     sizes = [(f"cameras.{name}", *ROBOT_SIZES[name]) for name in cameras]
     small = [word for key, width, height in sizes for word in (f"{key}.width_px={width}", f"{key}.height_px={height}")]
-    return ("vehicle=delivery_robot", *absent, *small)
+    native = ["cameras.front.native={width_px: 320, height_px: 240, top_px: 30}"] if "front" in cameras else []
+    return ("vehicle=delivery_robot", *absent, *small, *native)
 
 
 SMALL_ROBOT = small_robot(*ROBOT_SIZES)

@@ -21,7 +21,7 @@ from runner.mqtt.broker import private_broker
 DOCUMENTS = [CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").glob("*.md"))]
 PROGRAMS = ("tod-runner", "mosquitto_", "t=$(", "ffplay", "make", "pip")
 # `make test` runs this; test_api.py installs the wheel; a player needs a screen, and test_lines.py plays without one
-NOT_RUN = ("make", "pip", "ffplay")
+NOT_RUN = ("make", "pip", "ffplay", "tod-runner demo log=drive ")  # `place` runs the last
 # `make soak` runs these; test_live.py drives over each graph.
 LONG = ("tod-runner demo experiment=", "tod-runner demo graph=", "tod-runner model vehicle=")
 FEWER = [f"~cameras.top_{side}" for side in ("front", "left", "right", "rear")]
@@ -40,8 +40,8 @@ SHORT = {  # by verb: words that make it shorter
 }
 STANDS_FOR = {
     "CLIP.mp4": "clip.mp4",
-    "DRIVE...": "kept other",
-    "DRIVE": "kept",
+    "DRIVE...": "drive other",
+    "DRIVE": "drive",
     "/tmp/rec": "robot",
     "newer/": "models/",
     "source=v4l2": "source=test",
@@ -94,12 +94,8 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     cameras.mkdir(parents=True)
     text = (CHECKOUT / "conf" / "cameras" / "rear_center.yaml").read_text()
     (cameras / "rear_center.yaml").write_text(text.replace("fps: 40", "fps: 0").replace("height_px", "heigth_px"))
-    assert (
-        run(
-            "demo", *SHORT["demo"], *FEWER, *SMALL, LOOP, *ports(), f"log={directory / 'kept'}", "log.video=true"
-        ).returncode
-        == 0
-    )
+    words = ("log=drive", "log.video=true", *SHORT["demo"], *FEWER, *SMALL, LOOP, *ports())
+    assert run("demo", *words, cwd=directory).returncode == 0
     write_drive(directory / "other", seconds=20, congested=0.5)  # such a drive shows what the link carries
     shutil.copytree(directory / "other", directory / "drives" / "monday")
     return directory
@@ -124,7 +120,7 @@ def adapted(line: str, words: tuple[str, ...] = ()) -> list[str]:
     if "source=synthetic" in rest:
         own.append(LOOP)
     elif verb != "model" and not any(word.startswith("source=") for word in rest):
-        own.append("source=test")  # a drive is rendered once, for `kept`
+        own.append("source=test")  # a drive is rendered once, for `place`
     if not robot:
         own += FEWER
         small = SMALL if verb != "model" or "source=synthetic" in rest else []
