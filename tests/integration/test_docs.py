@@ -40,8 +40,8 @@ SHORT = {  # by verb: words that make it shorter
 }
 STANDS_FOR = {
     "CLIP.mp4": "clip.mp4",
-    "DRIVE...": "drive other",
-    "DRIVE": "drive",
+    "DRIVE...": "kept other",
+    "DRIVE": "kept",
     "/tmp/rec": "robot",
     "newer/": "models/",
     "source=v4l2": "source=test",
@@ -96,6 +96,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (cameras / "rear_center.yaml").write_text(text.replace("fps: 40", "fps: 0").replace("height_px", "heigth_px"))
     words = ("log=drive", "log.video=true", *SHORT["demo"], *FEWER, *SMALL, LOOP, *ports())
     assert run("demo", *words, cwd=directory).returncode == 0
+    shutil.copytree(directory / "drive", directory / "kept")
     write_drive(directory / "other", seconds=20, congested=0.5)  # such a drive shows what the link carries
     shutil.copytree(directory / "other", directory / "drives" / "monday")
     return directory
