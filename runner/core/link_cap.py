@@ -83,7 +83,7 @@ class Overuse(NamedTuple):
         return self.carried * limit / self.limit
 
 
-class Outage(NamedTuple):
+class PredictedOutage(NamedTuple):
     """An outage that the prediction announces: since when (t), its limit, kbit/s, and the last overuse before it."""
 
     t: float
@@ -179,7 +179,7 @@ class LinkCap(NamedTuple):
 
     kbps: Kbps | None = None
     overuse: Overuse | None = None
-    outage: Outage | None = None
+    outage: PredictedOutage | None = None
     queue_ms: float = 0.0
     steps: int = 0
     before: Kbps | None = None
@@ -278,7 +278,7 @@ def _adapt_overuse(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
     rose = limit > known.kbps > 0
     cap = cap._replace(limit=LastLimit(limit, t, known.kbps) if rose else known._replace(kbps=limit))
     if cap.predicted and known.kbps >= OUTAGE * limit:
-        return cap._replace(outage=Outage(t, limit, cap.outage.overuse if cap.outage else last))
+        return cap._replace(outage=PredictedOutage(t, limit, cap.outage.overuse if cap.outage else last))
     if cap.outage and (t - cap.outage.t > OUTAGE_S or not cap.predicted):
         cap = cap._replace(outage=None)
     elif cap.outage and limit >= OUTAGE * cap.outage.limit:
