@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from importlib import import_module
 
-from runner.errors import RunError, UserError
+from runner.errors import ArgumentError, RunError, UserError, reason
 from runner.system import signals
 
 # All other modules are imported once signals are handled: an interrupted import would print a traceback.
@@ -90,7 +90,7 @@ def _status(words: list[str]) -> int:  # noqa: PLR0911
         return 0
     except OSError as error:  # a full disk, a file without read permission
         where = f"{error.filename}: " if error.filename else ""
-        _complain(f"{where}{(error.strerror or str(error)).lower()}")
+        _complain(f"{where}{reason(error)}")
         return 1
 
 
@@ -111,7 +111,7 @@ def _run(words: list[str]) -> int:
     if name not in VERBS:
         from runner.core.model import suggest
 
-        raise UserError("command line", "", name, f"unknown verb{suggest(name, VERBS, len(VERBS))}")
+        raise ArgumentError("", name, f"unknown verb{suggest(name, VERBS, len(VERBS))}")
     verb = VERBS[name]
     module = import_module(verb.module)
     if any(word in ("-h", "--help") for word in rest):
@@ -123,7 +123,7 @@ def _run(words: list[str]) -> int:
         return int(module.words(*rest[1:]))
     arguments = Arguments.parse(name, rest)
     if arguments.conf is not None and not arguments.conf.is_dir():
-        raise UserError("command line", "conf", str(arguments.conf), "no such directory")
+        raise ArgumentError("conf", str(arguments.conf), "no such directory")
     status: int = module.run(arguments)
     with suppress(BrokenPipeError):
         sys.stdout.flush()

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from copyreg import __newobj__  # type: ignore[attr-defined]
 from dataclasses import dataclass
 from typing import Any
@@ -37,6 +38,17 @@ class UserError(Exception):
         return __newobj__, (type(self), *self.args), self.__dict__
 
 
+class ArgumentError(UserError):
+    """An argument of the command line is wrong.
+
+    found  its value as written, or another object such as a path; None if it was not given
+    """
+
+    def __init__(self, name: str, found: object, rule: str) -> None:
+        shown = found if found is None or isinstance(found, str) else repr(str(found))
+        super().__init__("command line", name, shown, rule)
+
+
 class ConfigError(UserError):
     """The configuration is wrong: all problems at once."""
 
@@ -52,6 +64,20 @@ class RunError(Exception):
 
     def __init__(self, text: str) -> None:
         super().__init__(printable(text))
+
+
+def reason(error: OSError) -> str:
+    """Why a call of the operating system failed."""
+    return (error.strerror or str(error)).lower()
+
+
+@contextmanager
+def os_errors_as(reported: Callable[[str], BaseException]) -> Iterator[None]:
+    """Raise an error of the operating system as another one, made from its reason."""
+    try:
+        yield
+    except OSError as error:
+        raise reported(reason(error)) from None
 
 
 class MissingBindings(ImportError):

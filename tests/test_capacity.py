@@ -85,7 +85,7 @@ def test_drives_that_yield_no_map_are_reported(tod: Command, tmp_path: Path) -> 
     good = write_drive(tmp_path / "good", seconds=5, change=roomy)
     output = f"output={tmp_path / 'map.csv'}"
     for words, status, expected in (
-        ((output,), 2, "command line: must name a drive: a directory that log= wrote"),
+        ((output,), 2, "command line: DRIVE: must be given: a directory that log= wrote"),
         ((str(good),), 2, "command line: output: must be given: the map's file"),
         ((str(good), output, "percentile=101"), 2, "command line: percentile: 101: must be at most 100"),
         ((str(good), output, "cell_m=0"), 2, "command line: cell_m: 0: must be at least 1"),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from runner.configuration.config import configuration
+from runner.verbs import CONVERSION
 
 LIST = """\
 camera_topics_namespace: /sensor/camera
@@ -113,7 +114,10 @@ NEEDED = "sizes and frame rates must be given: bag=BAG with pictures of each cam
             (*SIZE, "vehicle=a b"),
             "vehicle: 'a b': must be letters, digits, _ and -, and no number, true, false or null",
         ),
-        ((*SIZE, "mode=single"), "mode=single: convert reads no configuration; see --help"),
+        (
+            (*SIZE, "mode=single"),
+            f"mode=single: unknown argument; expected one of {', '.join(CONVERSION)}, conf",
+        ),
     ],
 )
 def test_invalid_conversions(convert, words, problem):

@@ -111,14 +111,20 @@ def test_a_full_disk_leaves_nothing_behind(tmp_path: Path, there: bool) -> None:
     assert len(list(tmp_path.rglob("*"))) == (2 if there else 0)
 
 
-@pytest.mark.parametrize("words", [[], ["a", "b"], ["a", "vehicle=tum_q7"]])
+@pytest.mark.parametrize(
+    ("words", "rule"),
+    [
+        ([], "must be one directory: init DIR"),
+        (["a", "b"], "a b: must be one directory: init DIR"),
+        (["a", "vehicle=tum_q7"], "vehicle=tum_q7: unknown argument; expected one of files, conf"),
+    ],
+)
 def test_one_directory_is_named(
-    tod: Command, words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tod: Command, words: list[str], rule: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     status, out, err = tod("init", *words)
-    assert (status, out) == (2, "")
-    assert "must be one directory" in err
+    assert (status, out, err) == (2, "", f"command line: {rule}\n")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -376,7 +376,7 @@ def test_one_command_makes_what_a_vehicle_and_an_operator_need(tmp_path, capsys)
         (("output={}", "vehicle=broker"), "command line: vehicle: 'broker': must be 1 to 64 letters"),
         (("output={}", "host=10.0.0.2"), "command line: host: 10.0.0.2: must come with the name of a vehicle"),
         (("output={}", "revoke=x"), "command line: revoke: 'x': must be one of (none yet)"),
-        (("output={}", "modes=paper"), "command line: modes=paper: keys reads no configuration"),
+        (("output={}", "modes=paper"), "command line: modes=paper: unknown argument; expected one of output, "),
     ],
 )
 def test_mistakes_are_named(tmp_path, capsys, words, message):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ from runner import schema
 from runner.configuration.files import LAYOUT
 from runner.configuration.yaml_file import label, load_file
 from runner.core.model import Place, Vehicle, overlapping, suggest
-from runner.errors import ConfigError, Problem, UserError
+from runner.errors import ConfigError, Problem, UserError, os_errors_as
 
 WITHOUT_KEYS = "operator"  # name of an operator without keys
 MAX_NAMED = 5  # unknown cameras in an answer
@@ -87,11 +88,9 @@ class Layouts:
         self._vehicles = vehicles
 
     def _read(self) -> Mapping[str, Mapping[str, Place]]:
-        try:
+        with os_errors_as(partial(UserError, str(self.path), "", None)):
             if self.path is None or not self.path.exists():
                 return {}
-        except OSError as error:
-            raise UserError(str(self.path), "", None, (error.strerror or str(error)).lower()) from None
         if problems := list(layout_problems(self.path)):
             raise ConfigError(problems)
         return {name: _places(cameras) for name, cameras in load_file(self.path)["vehicles"].items()}

@@ -19,7 +19,7 @@ from typing import Any
 
 from runner.core.events import Event, describe, to_json
 from runner.core.step import Run
-from runner.errors import RunError, UserError
+from runner.errors import ArgumentError, RunError, UserError, reason
 from runner.records import (
     Began,
     DecisionMade,
@@ -188,7 +188,7 @@ class _File:
         except OSError as error:
             with suppress(OSError):
                 os.ftruncate(self._fd, self._size)
-            return _reason(error)
+            return reason(error)
         self._size += len(data)
         return None
 
@@ -197,7 +197,7 @@ class _File:
         try:
             os.fdatasync(self._fd)
         except OSError as error:
-            return None if error.errno == errno.EINVAL else _reason(error)  # some file systems cannot
+            return None if error.errno == errno.EINVAL else reason(error)  # some file systems cannot
         return None
 
     def close(self, keep: bool) -> str | None:
@@ -206,7 +206,7 @@ class _File:
         try:
             os.close(self._fd)
         except OSError as error:
-            why = why or _reason(error)
+            why = why or reason(error)
         if keep:
             return why
         self.path.unlink(missing_ok=True)
@@ -214,10 +214,6 @@ class _File:
             with suppress(OSError):  # it holds other files by now
                 self.path.parent.rmdir()
         return None
-
-
-def _reason(error: OSError) -> str:
-    return (error.strerror or str(error)).lower()
 
 
 class _Writer:
@@ -303,7 +299,7 @@ def check_free(directory: Path, side: str) -> None:
         if os.path.lexists(path) and not (path.is_file() and path.stat().st_size == 0):
             raise _refused(directory, f"already contains a drive ({FILES[side]}), choose another directory")
     except OSError as error:
-        raise _refused(directory, _reason(error)) from None
+        raise _refused(directory, reason(error)) from None
 
 
 def new_drive(parent: Path) -> Path:
@@ -333,7 +329,7 @@ def _create(directory: Path, side: str) -> int:
             directory, f"another process is about to write {FILES[side]}, choose another directory"
         ) from None
     except OSError as error:
-        raise _refused(directory, _reason(error)) from None
+        raise _refused(directory, reason(error)) from None
 
 
 def _remove_abandoned(path: Path) -> None:
@@ -353,7 +349,7 @@ def _remove_abandoned(path: Path) -> None:
 
 
 def _refused(directory: Path, rule: str) -> UserError:
-    return UserError("command line", "log", repr(str(directory)), rule)
+    return ArgumentError("log", directory, rule)
 
 
 def log_run(log: Log, event: Event, before: Run, after: Run) -> None:

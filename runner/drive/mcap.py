@@ -12,7 +12,7 @@ from msgspec import UNSET
 from runner.drive.captures import SECOND_NS, ReadVideo
 from runner.drive.exported import NOTE_TOPIC, POSITION_TOPIC, cameras_of, write_all
 from runner.drive.read import Drive
-from runner.errors import RunError
+from runner.errors import RunError, reason
 from runner.records import Json, Note, Position, line_to_json
 from runner.schema import referred
 
@@ -77,7 +77,7 @@ class _Out:
 
     def check(self) -> None:
         if self._failed:
-            raise RunError(f"the MCAP file cannot be written: {self._failed.strerror or self._failed}")
+            raise RunError(f"the MCAP file cannot be written: {reason(self._failed)}")
 
 
 class _Channels:

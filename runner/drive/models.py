@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from runner.drive.statistics import Model, rate_curves
-from runner.errors import UserError
+from runner.errors import ArgumentError, UserError
 
 
 def find_models(
@@ -22,7 +22,7 @@ def find_models(
     raises     UserError if the directory does not exist, or a file is not a model
     """
     if directory is not None and not directory.is_dir():
-        raise UserError("command line", "models", repr(str(directory)), "no such directory")
+        raise ArgumentError("models", directory, "no such directory")
     found: dict[str, Model] = {}
     cameras = config.get("cameras") or {}
     for name, camera in cameras.items():

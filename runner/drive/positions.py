@@ -13,7 +13,7 @@ from runner.bag.pictures import SECOND_NS
 from runner.core.events import PositionReported
 from runner.core.model import ModelError
 from runner.drive.read import Drive, read_drive
-from runner.errors import UserError
+from runner.errors import ArgumentError, UserError
 
 ARGUMENTS = ("positions", "topic")  # of the command line
 
@@ -42,7 +42,7 @@ class RecordedPositions:
     def no_overlap(self, drive: str) -> UserError:
         """The error that no position falls into a drive; `drive` describes it with its times."""
         rule = f"no position falls into {drive}; both must have been recorded by the same clock"
-        return UserError("command line", ARGUMENTS[0], f"{self.where}: {self.span}", rule)
+        return ArgumentError(ARGUMENTS[0], f"{self.where}: {self.span}", rule)
 
 
 def time_span(began_s: float, ended_s: float) -> str:
@@ -69,16 +69,16 @@ def given_positions(values: Mapping[str, str]) -> RecordedPositions:
     """
     path, topic = (values.get(key) for key in ARGUMENTS)
     if path is None:
-        raise UserError("command line", ARGUMENTS[0], None, "must be given with topic: the bag that has it")
+        raise ArgumentError(ARGUMENTS[0], None, "must be given with topic: the bag that has it")
     try:
         with Bag(Path(path)) as bag:
             found = bag.find(POSITIONS, topic, "positions")
             fixes, where = sorted(bag.positions(found)), bag.names(found)
     except ModelError as error:
         key = "topic" if error.key == "topic" and topic is not None else ARGUMENTS[0]
-        raise UserError("command line", key, str(error.found), error.rule) from None
+        raise ArgumentError(key, str(error.found), error.rule) from None
     if not fixes:
-        raise UserError("command line", ARGUMENTS[0], where, "has no position with a fix")
+        raise ArgumentError(ARGUMENTS[0], where, "has no position with a fix")
     return RecordedPositions(where, fixes)
 
 

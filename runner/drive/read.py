@@ -12,7 +12,7 @@ from typing import Any, TextIO, TypeVar
 
 from runner.core.events import Event, parse
 from runner.drive.log import FILES, FORMAT
-from runner.errors import UserError
+from runner.errors import UserError, os_errors_as
 from runner.records import (
     KINDS,
     Began,
@@ -102,11 +102,8 @@ def read_drive(directory: Path) -> Drive:
 
 
 def _side(side: str, path: Path, warnings: list[str]) -> Side:
-    try:
-        with path.open(encoding="utf-8", errors="replace") as file:
-            lines = [line for _, line in read_lines(text_lines(file), str(path), warnings)]
-    except OSError as error:
-        raise UserError(str(path), "", None, (error.strerror or str(error)).lower()) from None
+    with os_errors_as(partial(UserError, str(path), "", None)), path.open(encoding="utf-8", errors="replace") as file:
+        lines = [line for _, line in read_lines(text_lines(file), str(path), warnings)]
     began = check_began(lines[0] if lines else None, str(path))
     if began.side != side:
         raise UserError(f"{path}: line 1", "side", repr(began.side), f"must be {side}")

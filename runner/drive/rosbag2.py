@@ -13,7 +13,7 @@ import numpy as np
 from runner.drive.captures import SECOND_NS, ReadVideo
 from runner.drive.exported import NOTE_TOPIC, POSITION_TOPIC, VIDEO_TOPICS, cameras_of, write_all
 from runner.drive.read import Drive
-from runner.errors import RunError
+from runner.errors import RunError, os_errors_as
 from runner.records import Json, Note, Position, line_to_json
 
 if TYPE_CHECKING:
@@ -45,14 +45,14 @@ def write_rosbag2(
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     _check_names(cameras_of(drive))
-    try:
+    with (
+        os_errors_as(lambda why: RunError(f"the bag cannot be written: {why}")),
         # Older ROS 2 distributions reject newer versions of the metadata.
-        with Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as writer:
-            for name, side in drive.sides.items():
-                writer.set_custom_data(f"{name} began", json.dumps(line_to_json(side.began), ensure_ascii=False))
-            return write_all(drive, _Topics(writer), read_video, on_warning, on_progress)
-    except OSError as error:
-        raise RunError(f"the bag cannot be written: {error.strerror or error}") from None
+        Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as writer,
+    ):
+        for name, side in drive.sides.items():
+            writer.set_custom_data(f"{name} began", json.dumps(line_to_json(side.began), ensure_ascii=False))
+        return write_all(drive, _Topics(writer), read_video, on_warning, on_progress)
 
 
 class _Topics:

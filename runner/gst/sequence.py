@@ -8,7 +8,7 @@ from pathlib import Path
 
 from gi.repository import GLib, Gst, GstPbutils
 
-from runner.errors import UserError
+from runner.errors import ArgumentError
 from runner.gst.caps import structure
 from runner.system.files import file_problem
 
@@ -41,20 +41,20 @@ def discover(path: Path, where: str) -> Form:
     raises  UserError if it is not a readable video
     """
     if not path.is_file():
-        raise UserError("command line", where, repr(str(path)), file_problem(path))
+        raise ArgumentError(where, path, file_problem(path))
     if path.stat().st_size == 0:
-        raise UserError("command line", where, repr(str(path)), "the file is empty")
+        raise ArgumentError(where, path, "the file is empty")
     discoverer = GstPbutils.Discoverer.new(TIMEOUT_S * Gst.SECOND)
     try:
         info = discoverer.discover_uri(path.resolve().as_uri())
     except GLib.Error as error:
-        raise UserError("command line", where, repr(str(path)), f"cannot be read as video: {error.message}") from None
+        raise ArgumentError(where, path, f"cannot be read as video: {error.message}") from None
     streams = info.get_video_streams()
     if not streams:
-        raise UserError("command line", where, repr(str(path)), "has no video")
+        raise ArgumentError(where, path, "has no video")
     stream = streams[0]
     if stream.get_framerate_num() <= 0:
-        raise UserError("command line", where, repr(str(path)), "has no frame rate")
+        raise ArgumentError(where, path, "has no frame rate")
     caps = stream.get_caps()
     return Form(
         width=stream.get_width(),

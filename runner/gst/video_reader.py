@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from gi.repository import Gst
 
-from runner.errors import RunError
+from runner.errors import RunError, os_errors_as
 from runner.gst.caps import structure
 from runner.gst.stream_times import RestoredTimes, stream_times
 from runner.system.files import file_problem
@@ -43,10 +43,8 @@ def read_video(path: Path) -> Iterator[Unit]:
     """
     if not path.is_file():
         raise RunError(f"{path}: {file_problem(path)}")
-    try:
+    with os_errors_as(lambda why: RunError(f"{path}: {why}")):
         times = RestoredTimes(stream_times(path))
-    except OSError as error:
-        raise RunError(f"{path}: {(error.strerror or str(error)).lower()}") from None
     pipeline = Gst.parse_launch("filesrc name=file ! tsdemux name=demux  appsink name=out sync=false max-buffers=8")
     pipeline.get_by_name("file").set_property("location", str(path))
     pipeline.get_by_name("demux").connect("pad-added", _on_stream, pipeline.get_by_name("out"))

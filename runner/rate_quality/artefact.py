@@ -12,7 +12,7 @@ from statistics import fmean
 from typing import Any
 
 from runner.core.model import Camera, plain
-from runner.errors import UserError
+from runner.errors import UserError, reason
 from runner.rate_quality.cache import digest
 from runner.rate_quality.choice import Choice
 from runner.rate_quality.curves import Crossing, Ladder, Point
@@ -132,7 +132,7 @@ def read_model(path: Path) -> dict[str, Any]:
     try:
         document = schema.read_json(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise wrong((error.strerror or str(error)).lower()) from None
+        raise wrong(reason(error)) from None
     except ValueError as error:
         raise wrong(f"is not a model file: {error}") from None
     if isinstance(document, dict) and document.get("version", FORMAT_VERSION) != FORMAT_VERSION:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import TYPE_CHECKING
 
 from runner.clips import cache_directory
 from runner.core.model import Camera, ModelError, Progress, Vehicle
-from runner.errors import RunError, UserError
+from runner.errors import ArgumentError, RunError, os_errors_as
 from runner.graph import compile_graph
 from runner.lanes import Lane, cut, fragment
 from runner.rate_quality import plans
@@ -67,23 +68,20 @@ def _check_output(output: Path, models: Iterable[str], inputs: Iterable[Path]) -
 
     raises  UserError
     """
-    try:
+    wrong = partial(ArgumentError, "output", output)
+    with os_errors_as(lambda why: wrong(f"cannot be written to: {why}")):
         output.mkdir(parents=True, exist_ok=True)
-        with TemporaryFile(dir=output):
-            pass
-    except OSError as error:
-        rule = f"cannot be written to: {(error.strerror or str(error)).lower()}"
-        raise UserError("command line", "output", repr(str(output)), rule) from None
+        TemporaryFile(dir=output).close()
     read = {path.resolve() for path in inputs}
     for model in models:
         paths = [output / f"{model}{end}" for end in FILES]
         replaceable = paths[0].is_file() and MARK in paths[0].read_text(encoding="utf-8", errors="replace")
         for path in filter(Path.exists, paths):
             if path.resolve() in read:
-                raise UserError("command line", "output", repr(str(path)), "is an input; choose another directory")
+                raise ArgumentError("output", path, "is an input; choose another directory")
             if not replaceable:
                 rule = "exists and was not written by tod-runner model; choose another directory"
-                raise UserError("command line", "output", repr(str(path)), rule)
+                raise ArgumentError("output", path, rule)
 
 
 def _metric(study: Study, name: str) -> Metric:
@@ -111,7 +109,7 @@ def _sweep(
     try:
         check_size(study, camera)
     except ModelError as error:
-        raise UserError("command line", error.key, str(error.found), error.rule) from None
+        raise ArgumentError(error.key, str(error.found), error.rule) from None
     plan = compile_graph(camera, vehicle.media)
     roi = camera.in_source
     before, after = cut(plan)
@@ -143,14 +141,13 @@ def _read_mask(path: Path, name: str, camera: Camera) -> Mask:
     where = f"masks.{name}"
     picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
     if picture is None:
-        rule = "cannot be read as a picture" if path.is_file() else file_problem(path)
-        raise UserError("command line", where, repr(str(path)), rule)
+        raise ArgumentError(where, path, "cannot be read as a picture" if path.is_file() else file_problem(path))
     if picture.shape != (camera.height, camera.width):
         found = f"{picture.shape[1]}x{picture.shape[0]}"
-        raise UserError("command line", where, found, f"must be {camera.width}x{camera.height}, as the full image is")
+        raise ArgumentError(where, found, f"must be {camera.width}x{camera.height}, as the full image is")
     mask: Mask = picture > 127
     if not mask.any():
-        raise UserError("command line", where, repr(str(path)), "is all black: no pixel would count")
+        raise ArgumentError(where, path, "is all black: no pixel would count")
     return mask
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from runner.core.model import Camera, Recording
-from runner.errors import RunError, UserError
+from runner.errors import ArgumentError, RunError, os_errors_as, reason
 from runner.redact import redacted
 from runner.system.files import put_in_place, unfinished
 
@@ -55,8 +55,7 @@ def make_directory(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        rule = "must be a directory" if path.exists() else (error.strerror or "").lower()
-        raise UserError("command line", "output", repr(str(path)), rule) from None
+        raise ArgumentError("output", path, "must be a directory" if path.exists() else reason(error)) from None
 
 
 def claim_files(directory: Path, cameras: Iterable[str]) -> dict[str, Path]:
@@ -68,8 +67,7 @@ def claim_files(directory: Path, cameras: Iterable[str]) -> dict[str, Path]:
     outputs = [directory / INDEX, *(final(directory, name) for name in cameras)]
     taken = [path.name for path in (*outputs, *(part(directory, name) for name in cameras)) if path.exists()]
     if taken:
-        rule = f"{', '.join(taken)} already exist; choose another directory"
-        raise UserError("command line", "output", repr(str(directory)), rule)
+        raise ArgumentError("output", directory, f"{', '.join(taken)} already exist; choose another directory")
     claimed: dict[str, Path] = {}
     try:
         for name in cameras:
@@ -77,7 +75,7 @@ def claim_files(directory: Path, cameras: Iterable[str]) -> dict[str, Path]:
             claimed[name] = part(directory, name)
     except OSError as error:
         remove_empty(claimed.values())
-        raise UserError("command line", "output", repr(str(directory)), (error.strerror or "").lower()) from None
+        raise ArgumentError("output", directory, reason(error)) from None
     return claimed
 
 
@@ -96,12 +94,10 @@ def keep(directory: Path, camera: str) -> Path:
     raises  RunError if that name was taken in the meantime, or the disk fails
     """
     incomplete, path = part(directory, camera), final(directory, camera)
-    try:
+    with os_errors_as(lambda why: RunError(f"{incomplete} cannot become {path.name}: {why}")):
         if path.exists():
             raise RunError(f"{path} was created in the meantime; the recording is {incomplete}")
         put_in_place(incomplete, path)
-    except OSError as error:
-        raise RunError(f"{incomplete} cannot become {path.name}: {error.strerror}") from None
     return path
 
 
@@ -118,8 +114,9 @@ def write_index(directory: Path, document: Mapping[str, Any]) -> None:
     raises  RunError
     """
     text = json.dumps(redacted(document), indent=2, ensure_ascii=False)
-    try:
-        with unfinished(directory / INDEX) as new:
-            new.write_text(text + "\n", encoding="utf-8")
-    except OSError as error:
-        raise RunError(f"{directory / INDEX} cannot be written: {error.strerror}; the videos are complete") from None
+    path = directory / INDEX
+    with (
+        os_errors_as(lambda why: RunError(f"{path} cannot be written: {why}; the videos are complete")),
+        unfinished(path) as new,
+    ):
+        new.write_text(text + "\n", encoding="utf-8")

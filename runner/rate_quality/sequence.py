@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from runner.core.model import BagTopic, Camera, ModelError
-from runner.errors import RunError, UserError
+from runner.errors import ArgumentError, RunError
 from runner.lanes import BAG, FRAMES, LaneSet
 from runner.rate_quality.cache import Cache, digest, file_digest
 from runner.rate_quality.recordings import INDEX
@@ -88,7 +88,7 @@ def survey(footage: Footage, cache: Cache, on_note: Callable[[str], None]) -> Se
     sequence = Sequence(path=str(path.resolve()), sha256=sha256, topic=topic, **properties, **known)
     if sequence.frames < FEWEST_FRAMES:
         found = f"{path}: {sequence.frames} frames"
-        raise UserError("command line", ARGUMENT, found, f"is too short, at least {FEWEST_FRAMES} are needed")
+        raise ArgumentError(ARGUMENT, found, f"is too short, at least {FEWEST_FRAMES} are needed")
     return sequence
 
 
@@ -106,7 +106,7 @@ def _bag_form(footage: BagTopic) -> dict[str, Any]:
         with Bag(Path(footage.path)) as bag:
             form = bag.form(footage.topic)
     except ModelError as error:
-        raise UserError("command line", ARGUMENT, str(error.found), error.rule) from None
+        raise ArgumentError(ARGUMENT, str(error.found), error.rule) from None
     size = {"width": form.width, "height": form.height, "fps": form.fps}
     return {**size, "codec": form.format, "lossless": form.format != "jpeg"}
 
@@ -130,7 +130,7 @@ def _analyse(footage: Footage, fps: Fraction) -> dict[str, Any]:
     try:
         run_lanes(LaneSet(line, fps, (), bag), lambda _, luma: found.add(luma), lambda *_: None, lambda _: None)
     except RunError as error:
-        raise UserError("command line", "sequence", _named(footage), f"cannot be decoded to its end: {error}") from None
+        raise ArgumentError("sequence", _named(footage), f"cannot be decoded to its end: {error}") from None
     means = {"si_mean": found.si_mean, "ti_mean": found.ti_mean}
     return {"frames": len(found.si), "si": found.si_max, "ti": found.ti_max, **means}
 

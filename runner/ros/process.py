@@ -16,7 +16,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from runner.core.model import RosQos, RosSettings
-from runner.errors import RunError, UserError
+from runner.errors import ArgumentError, RunError, UserError
 from runner.ros.node.port import MAX_MESSAGE_BYTES, shared_memory
 from runner.security.exposure import is_loopback
 from runner.system import children
@@ -52,7 +52,7 @@ def check_discovery(settings: RosSettings, insecure: bool) -> None:
     enforced = os.environ.get("ROS_SECURITY_ENABLE") == "true" and os.environ.get("ROS_SECURITY_STRATEGY") == "Enforce"
     if settings.discovery not in LOCAL and not enforced and not insecure:
         rule = "admits any node on the network: set up SROS 2 (ROS_SECURITY_ENABLE=true ROS_SECURITY_STRATEGY=Enforce)"
-        raise UserError("command line", "ros.discovery", settings.discovery, f"{rule}, or give insecure=true")
+        raise ArgumentError("ros.discovery", settings.discovery, f"{rule}, or give insecure=true")
 
 
 def _check_master(insecure: bool) -> None:

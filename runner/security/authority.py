@@ -25,7 +25,7 @@ from pathlib import Path
 import msgspec
 
 from runner.core.roles import VIEWERS, Role
-from runner.errors import RunError, UserError
+from runner.errors import ArgumentError, RunError, reason
 from runner.security import keyring
 from runner.security.broker_files import ACCESS, PASSWORDS, access_list, broker_settings
 from runner.security.certificates import (
@@ -84,7 +84,7 @@ class Authority:
         own = self._own
         if not own.exists() and self.directory.is_dir() and any(self.directory.iterdir()):
             rule = "must be a directory of `tod-runner keys`, or a new one: it contains other files"
-            raise UserError("command line", "output", str(self.directory), rule)
+            raise ArgumentError("output", str(self.directory), rule)
         with _os_errors_reported():
             own.mkdir(parents=True, exist_ok=True)
             self.directory.chmod(0o700)
@@ -108,10 +108,10 @@ class Authority:
         """
         if not NAME.fullmatch(name) or (name in RESERVED) is not (role is Role.BROKER):
             rule = f"must be 1 to 64 letters, digits, _ and -, and none of {', '.join(RESERVED)}"
-            raise UserError("command line", role, repr(name), rule)
+            raise ArgumentError(role, repr(name), rule)
         present = next((issued for issued in self.holders() if issued.name == name), None)
         if present and present.role is not role:
-            raise UserError("command line", role, repr(name), f"is taken: {name} is a {present.role}")
+            raise ArgumentError(role, repr(name), f"is taken: {name} is a {present.role}")
         if present and self._in_use(present) and (not hosts or set(hosts) == set(present.hosts)):
             return False
         self._renew(name, role, tuple(hosts) or (present.hosts if present else ()))
@@ -170,7 +170,7 @@ class Authority:
     def _known(self, name: str, argument: str) -> Issued:
         active = {issued.name: issued for issued in self.holders() if not issued.revoked}
         if name not in active:
-            raise UserError("command line", argument, repr(name), f"must be one of {', '.join(active) or '(none yet)'}")
+            raise ArgumentError(argument, repr(name), f"must be one of {', '.join(active) or '(none yet)'}")
         return active[name]
 
     def _revoked(self, name: str) -> list[Issued]:
@@ -196,7 +196,7 @@ class Authority:
         if not all(map(is_host, hosts)):
             rule = "must be addresses or names without a port, in ASCII: an international one begins with xn--"
             argument = "broker" if role is Role.BROKER else "host"
-            raise UserError("command line", argument, ", ".join(hosts), rule)
+            raise ArgumentError(argument, ", ".join(hosts), rule)
         pair = new_certificate(self._pair, name, role, hosts, serial, self.now(), VALID)
         if any(issued.name == name for issued in self.holders()):
             self._renew_media_secret(role)
@@ -319,4 +319,4 @@ def _os_errors_reported() -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise RunError(f"{error.filename}: {(error.strerror or str(error)).lower()}") from None
+        raise RunError(f"{error.filename}: {reason(error)}") from None

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from runner.core.model import Vehicle
 from runner.core.roles import VIEWERS, Role
-from runner.errors import UserError
+from runner.errors import ArgumentError, UserError
 from runner.security.keyring import HOLDER, MEDIA_SECRET, PASSPHRASE, PEOPLE, TOKEN, Keyring
 
 
@@ -29,7 +29,7 @@ def keyring_of(vehicle: Vehicle, *needed: str) -> Keyring | None:
     if exposed and not vehicle.insecure:
         found = "is not a loopback address" if len(exposed) == 1 else "are not loopback addresses"
         rule = f"{found}: give keys=DIR, created by `tod-runner keys`, or insecure=true"
-        raise UserError("command line", "keys", None, f"{' and '.join(exposed)} {rule}")
+        raise ArgumentError("keys", None, f"{' and '.join(exposed)} {rule}")
     return None
 
 
@@ -40,7 +40,7 @@ def _check_server_name(vehicle: Vehicle) -> None:
     """
     if ":" in vehicle.media.host and any(camera.graph.transport == "rtsp" for camera in vehicle.cameras.values()):
         rule = "an IPv6 address does not work for RTSP with keys: give a name that stands for it, as in /etc/hosts"
-        raise UserError("command line", "media.host", vehicle.media.host, rule)
+        raise ArgumentError("media.host", vehicle.media.host, rule)
 
 
 class KeysOfAll(NamedTuple):
@@ -104,7 +104,7 @@ def page_keyring(vehicle: Vehicle) -> Keyring | None:
         rule = (
             "is not a loopback address: give keys=DIR, created by `tod-runner keys`; browsers play video by HTTPS only"
         )
-        raise UserError("command line", "page.host", vehicle.page.host, rule)
+        raise ArgumentError("page.host", vehicle.page.host, rule)
     keyring = Keyring.of(Path(vehicle.keys), TOKEN)
     if not keyring.holder.hosts:
         rule = "does not name the addresses of the page: tod-runner keys output=DIR"

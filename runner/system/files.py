@@ -7,12 +7,13 @@ import os
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from shutil import rmtree
 from typing import TextIO
 
-from runner.errors import RunError, UserError
+from runner.errors import ArgumentError, RunError, UserError, os_errors_as, reason
 from runner.system.signals import urgent
 
 MAX_LINKS = 40  # as the kernel follows
@@ -92,7 +93,7 @@ def whole_file(path: Path, argument: str = "output", *, partly: bool = False) ->
     except BrokenPipeError:
         raise
     except OSError as error:
-        raise RunError(f"{path}: cannot be written: {(error.strerror or str(error)).lower()}") from None
+        raise RunError(f"{path}: cannot be written: {reason(error)}") from None
     if user_error:
         raise user_error
 
@@ -109,12 +110,10 @@ def _descriptor(path: Path) -> int | None:
 
 
 def _opened(part: Path, path: Path, argument: str, descriptor: int | None) -> TextIO:
-    try:
+    with os_errors_as(partial(ArgumentError, argument, path)):
         if descriptor is not None:
             return os.fdopen(os.dup(descriptor), "w", encoding="utf-8")
         return part.open("w", encoding="utf-8")
-    except OSError as error:
-        raise UserError("command line", argument, repr(str(path)), (error.strerror or "").lower()) from None
 
 
 def file_problem(path: Path) -> str:
@@ -127,13 +126,11 @@ def read_file(path: Path, most_bytes: int) -> bytes:
 
     raises  ValueError with the rule that it breaks
     """
-    try:
+    with os_errors_as(ValueError):
         if not path.is_file():
             raise ValueError(file_problem(path))
         with path.open("rb") as file:
             content = file.read(most_bytes + 1)
-    except OSError as error:
-        raise ValueError((error.strerror or str(error)).lower()) from None
     if len(content) > most_bytes:
         raise ValueError(f"must be at most {most_bytes // 1000} kB long")
     return content
@@ -144,10 +141,8 @@ def exposure(path: Path) -> str | None:
 
     raises  ValueError with the reason why it has no mode, such as: no such file
     """
-    try:
+    with os_errors_as(ValueError):
         mode = path.stat().st_mode
-    except OSError as error:
-        raise ValueError((error.strerror or str(error)).lower()) from None
     if mode & (stat.S_IRWXG | stat.S_IRWXO):
         return f"others may read it (mode {stat.S_IMODE(mode):o}); chmod 600"
     return None
@@ -158,12 +153,10 @@ def write_whole(path: Path, content: bytes) -> None:
 
     raises  RunError
     """
-    try:
+    with os_errors_as(lambda why: RunError(f"{path}: cannot be written: {why}")):
         path.parent.mkdir(parents=True, exist_ok=True)
         with unfinished(path) as part:
             part.write_bytes(content)
-    except OSError as error:
-        raise RunError(f"{path}: cannot be written: {(error.strerror or str(error)).lower()}") from None
 
 
 def plotly_script(extra: str) -> Path:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 
 from runner.core.model import Endpoint
-from runner.errors import RunError
+from runner.errors import RunError, os_errors_as
 
 
 def ip_address_of(host: str) -> str:
@@ -16,11 +16,8 @@ def ip_address_of(host: str) -> str:
 
 def check_port_free(endpoint: Endpoint) -> None:
     """raises RunError if another process already listens there, or the address is not one of this machine"""
-    try:
+    with os_errors_as(lambda why: RunError(f"cannot listen on {endpoint}: {why}; choose another port")):
         address = ip_address_of(endpoint.host)
         with socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind((address, endpoint.port))
-    except OSError as error:
-        what = error.strerror.lower() if error.strerror else str(error)
-        raise RunError(f"cannot listen on {endpoint}: {what}; choose another port") from None

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from runner.configuration.files import GROUPS
 from runner.core.model import suggest
-from runner.errors import UserError
+from runner.errors import ArgumentError, UserError
 from runner.schema import schema_document
 
 DRIVE = "DRIVE"  # stands for the directory of a drive in the usage
@@ -174,7 +174,8 @@ class Arguments:
         """Parse the words. A path given to an argument may contain any character, since Hydra never sees it.
 
         raises  UserError for a flag other than -m, for a name that only another verb takes or that is misspelt, for an
-                argument without a value, and for a word that is not UTF-8
+                override of a verb that reads no configuration, for an argument without a value, for a missing drive,
+                and for a word that is not UTF-8
         """
         for word in words:
             _check_utf8("command line", "", word)
@@ -187,7 +188,7 @@ class Arguments:
             key, equals, value = word.partition("=")
             if equals and key in own:
                 if not value:  # from an unset variable of the shell
-                    raise UserError("command line", key, "''", "must not be empty")
+                    raise ArgumentError(key, "''", "must not be empty")
                 values[key] = value
             elif word.startswith("-"):
                 raise unknown_flag(word)
@@ -195,11 +196,15 @@ class Arguments:
                 plain.append(word)
             elif not equals and not word.startswith("~"):
                 if not VERBS[verb].takes:
-                    raise UserError("command line", "", word, "must be NAME=VALUE")
+                    raise ArgumentError("", word, "must be NAME=VALUE")
                 plain.append(word)
+            elif not VERBS[verb].composes:
+                raise ArgumentError("", word, f"unknown argument; expected one of {', '.join(own)}")
             else:
                 _check_name(verb, key)
                 overrides.append(word)
+        if VERBS[verb].takes == DRIVE and not plain:
+            raise ArgumentError(DRIVE, None, "must be given: a directory that log= wrote")
         conf = values.pop("conf", None) or os.environ.get("TOD_CONF")
         _check_utf8("environment", "TOD_CONF", conf or "")
         return Arguments(verb, overrides, Path(conf) if conf else None, values, tuple(plain), sweeps)
@@ -230,7 +235,7 @@ class Arguments:
         options = among or VERBS[self.verb].choices[key]
         value = self.values.get(key, options[0])
         if value not in options:
-            raise UserError("command line", key, repr(value), f"must be one of {', '.join(options)}")
+            raise ArgumentError(key, repr(value), f"must be one of {', '.join(options)}")
         return value
 
     def number(self, key: str) -> float | None:
@@ -243,12 +248,18 @@ class Arguments:
         except ValueError:
             number = -1.0
         if not 0 <= number < float("inf"):
-            raise UserError("command line", key, repr(text), "must be a number of 0 or more")
+            raise ArgumentError(key, repr(text), "must be a number of 0 or more")
         return number
 
     def path(self, key: str) -> Path | None:
         """A file or directory; None if not given."""
         return Path(self.values[key]) if key in self.values else None
+
+    def given_path(self, key: str, meaning: str) -> Path:
+        """A file or directory that must be given."""
+        if key not in self.values:
+            raise ArgumentError(key, None, f"must be given: {meaning}")
+        return Path(self.values[key])
 
     def drive(self) -> Path | None:
         """Where to log a drive: the directory of log=, or a new one below that of drives=; None: nowhere."""
@@ -256,8 +267,7 @@ class Arguments:
 
         parent, log = self.path("drives"), self.path("log")
         if parent and log:
-            rule = "names a directory for each drive, so log= must not be given"
-            raise UserError("command line", "drives", repr(str(parent)), rule)
+            raise ArgumentError("drives", parent, "names a directory for each drive, so log= must not be given")
         return new_drive(parent) if parent else log
 
 
@@ -266,9 +276,9 @@ def unknown_flag(word: str) -> UserError:
     name = word.partition("=")[0]
     if name == "-m":
         sweeping = ", ".join(verb for verb, spec in VERBS.items() if spec.sweeps)
-        return UserError("command line", "", word, f"must follow one of {sweeping}")
+        return ArgumentError("", word, f"must follow one of {sweeping}")
     rule = next((instead for names, instead in HYDRA_FLAGS.items() if name in names), "write NAME=VALUE, or --help")
-    return UserError("command line", "", word, f"flags are not supported; {rule}")
+    return ArgumentError("", word, f"flags are not supported; {rule}")
 
 
 def _check_utf8(where: str, key: str, text: str) -> None:
@@ -285,8 +295,6 @@ def _check_name(verb: str, key: str) -> None:
 
     raises  UserError; names that resemble no known one are left to the schema of the configuration
     """
-    if VERBS[verb].takes == DRIVE:  # these verbs read no configuration
-        return
     name = key.lstrip("+~/").partition("@")[0].partition(".")[0]
     own = (*VERBS[verb].arguments, "conf")
     configured = [*GROUPS, *schema_document("composed")["properties"]]
@@ -296,11 +304,10 @@ def _check_name(verb: str, key: str) -> None:
         return
     takers = [other for other, spec in VERBS.items() if name in spec.arguments]
     if takers:
-        rule = f"is an argument of {', '.join(takers)}; {verb} has {', '.join(own)}"
-        raise UserError("command line", name, None, rule)
+        raise ArgumentError(name, None, f"is an argument of {', '.join(takers)}; {verb} has {', '.join(own)}")
     hint = suggest(name, (*own, *configured))
     if "did you mean" in hint:
-        raise UserError("command line", name, None, f"unknown name{hint}")
+        raise ArgumentError(name, None, f"unknown name{hint}")
 
 
 def study_word(word: str) -> str:

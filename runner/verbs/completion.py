@@ -23,7 +23,7 @@ import yaml
 
 from runner.configuration.files import GROUPS, conf_directories, find_file, options
 from runner.configuration.yaml_file import MAX_BYTES
-from runner.errors import UserError
+from runner.errors import ArgumentError
 from runner.schema import referred, schema_document
 from runner.system.files import read_file
 from runner.verbs import VERBS, Arguments
@@ -55,7 +55,7 @@ WORDS = {"doctor": tuple(VERBS), "completion": tuple(SCRIPTS)}  # by verb, its p
 def run(arguments: Arguments) -> int:
     if len(arguments.words) != 1 or arguments.words[0] not in SCRIPTS:
         found = " ".join(arguments.words)
-        raise UserError("command line", "", found or None, f"must be one of {', '.join(SCRIPTS)}")
+        raise ArgumentError("", found or None, f"must be one of {', '.join(SCRIPTS)}")
     print(SCRIPTS[arguments.words[0]])
     return 0
 

@@ -33,7 +33,7 @@ from runner.configuration.camera_list import (
 )
 from runner.configuration.overrides import COMMAND_LINE, choosable
 from runner.core.model import ModelError, exact
-from runner.errors import ConfigError, Problem, UserError
+from runner.errors import ArgumentError, ConfigError, Problem
 from runner.system.files import write_whole
 from runner.verbs import Arguments
 
@@ -46,7 +46,7 @@ def run(arguments: Arguments) -> int:
     name = arguments.values.get("vehicle", file.stem)
     if not (NAME.fullmatch(name) and choosable(name)):
         rule = "must be letters, digits, _ and -, and no number, true, false or null"
-        raise UserError(COMMAND_LINE, "vehicle", repr(name), rule)
+        raise ArgumentError("vehicle", repr(name), rule)
     bag = arguments.path("bag")
     sizes = _sizes_of_bag(cameras, bag) if bag else [_size(arguments)] * len(cameras)
     kinds = {camera.name: f"{name}_{camera.name}" for camera in cameras}
@@ -66,16 +66,10 @@ def run(arguments: Arguments) -> int:
 
 def _paths(arguments: Arguments) -> tuple[Path, Path]:
     """The camera list, and the output directory."""
-    if arguments.overrides:
-        rule = "convert reads no configuration; see --help"
-        raise UserError(COMMAND_LINE, "", arguments.overrides[0], rule)
     if len(arguments.words) != 1:
         found = " ".join(arguments.words) or None
-        raise UserError(COMMAND_LINE, "", found, "must name one file: the camera list, sensors-camera.yaml")
-    output = arguments.path("output")
-    if output is None:
-        raise UserError(COMMAND_LINE, "output", None, "must be given: the directory to write the files to")
-    return Path(arguments.words[0]), output
+        raise ArgumentError("", found, "must name one file: the camera list, sensors-camera.yaml")
+    return Path(arguments.words[0]), arguments.given_path("output", "the directory to write the files to")
 
 
 def _size(arguments: Arguments) -> CameraSize:
@@ -83,11 +77,11 @@ def _size(arguments: Arguments) -> CameraSize:
     missing = [f"{key}=" for key in SIZE_KEYS if key not in arguments.values]
     if missing:
         rule = "sizes and frame rates must be given: bag=BAG with pictures of each camera, or width_px= height_px= fps="
-        raise UserError(COMMAND_LINE, "", f"without {' '.join(missing)}" if len(missing) < 3 else None, rule)
+        raise ArgumentError("", f"without {' '.join(missing)}" if len(missing) < 3 else None, rule)
     width, height, fps = (exact(str(arguments.number(key))) for key in SIZE_KEYS)
     for key, value in (("width_px", width), ("height_px", height)):
         if value.denominator != 1:
-            raise UserError(COMMAND_LINE, key, repr(arguments.values[key]), "must be a whole number")
+            raise ArgumentError(key, repr(arguments.values[key]), "must be a whole number")
     return CameraSize(int(width), int(height), fps)
 
 
@@ -104,7 +98,7 @@ def _sizes_of_bag(cameras: Sequence[ListedCamera], path: Path) -> list[CameraSiz
                 except ModelError as error:
                     problems.append(Problem(COMMAND_LINE, "bag", str(error.found), error.rule))
     except ModelError as error:
-        raise UserError(COMMAND_LINE, "bag", str(error.found), error.rule) from None
+        raise ArgumentError("bag", str(error.found), error.rule) from None
     if problems:
         raise ConfigError(problems)
     return sizes

@@ -34,6 +34,7 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from functools import partial
 from itertools import count
 from pathlib import Path
 from types import ModuleType
@@ -44,7 +45,7 @@ from runner.configuration.experiment import LinkSettings
 from runner.configuration.files import conf_directories
 from runner.core.model import Vehicle
 from runner.drive.log import FILES, WITHOUT_LOG, Log, check_free
-from runner.errors import UserError
+from runner.errors import ArgumentError, os_errors_as
 from runner.link import LimitedLink, check_possible, limited_link
 from runner.mqtt.broker import private_broker
 from runner.plans import render_missing
@@ -129,7 +130,7 @@ def _prepare_demo(arguments: Arguments, apply: ModuleType) -> _Demo:
         check_report(output, models)
         _check_empty("output", output)
     elif models:
-        raise UserError("command line", "models", repr(str(models)), "is for the report: give output=OUT")
+        raise ArgumentError("models", models, "is for the report: give output=OUT")
     runs = [
         _prepare_run(arguments, name, words, config, link, apply)
         for name, words in (experiment.runs or {"": ()}).items()
@@ -157,14 +158,12 @@ def _check_empty(key: str, directory: Path) -> None:
 
     raises  UserError
     """
-    try:
+    wrong = partial(ArgumentError, key, directory)
+    with os_errors_as(wrong):
         found = sorted(path.name for path in directory.iterdir()) if directory.exists() else []
-    except OSError as error:
-        raise UserError("command line", key, repr(str(directory)), (error.strerror or str(error)).lower()) from None
     if found:
         names = f"{', '.join(found[:3])}{', ...' if len(found) > 3 else ''}"
-        rule = f"must be a new or empty directory, but contains {names}"
-        raise UserError("command line", key, repr(str(directory)), rule)
+        raise wrong(f"must be a new or empty directory, but contains {names}")
 
 
 def _prepare_run(
@@ -182,7 +181,7 @@ def _prepare_run(
         config = configuration(own.overrides, own.conf, runnable=False)
         link = config.link()
     if link and directory is None:
-        raise UserError("command line", "link", link.kind, "needs a log to show its effect: give log=DIR or output=OUT")
+        raise ArgumentError("link", link.kind, "needs a log to show its effect: give log=DIR or output=OUT")
     if link:
         check_possible(link.kind)
     config = config.drivable(apply.check_plan)
@@ -192,7 +191,7 @@ def _prepare_run(
     keys = None if vehicle.keys is None and link and link.kind == "netns" else KeysOfAll.of(vehicle)
     if keys and link and link.kind == "relay":
         rule = "rewrites ports in RTSP, which keys encrypt; link=netns passes it unread"
-        raise UserError("command line", "link", link.kind, rule)
+        raise ArgumentError("link", link.kind, rule)
     duration_s = arguments.number("duration_s")
     duration_s = config.experiment().duration_s if duration_s is None else duration_s
     with progress_bar() as progress:

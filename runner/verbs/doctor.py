@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 from runner.configuration.config import configuration
 from runner.core.model import Endpoint, RosSettings, Vehicle, suggest
-from runner.errors import MissingBindings, RunError, UserError
+from runner.errors import ArgumentError, MissingBindings, RunError
 from runner.mqtt.broker import find_mosquitto
 from runner.plans import compile_plans
 from runner.system.extras import EXTRAS, how_to_install
@@ -67,9 +67,9 @@ def run(arguments: Arguments) -> int:
 def _verb(arguments: Arguments) -> str:
     words = arguments.words or ("demo",)
     if len(words) > 1:
-        raise UserError("command line", "", words[1], "must be one verb")
+        raise ArgumentError("", words[1], "must be one verb")
     if words[0] not in VERBS:
-        raise UserError("command line", "", words[0], f"unknown verb{suggest(words[0], VERBS)}")
+        raise ArgumentError("", words[0], f"unknown verb{suggest(words[0], VERBS)}")
     return words[0]
 
 

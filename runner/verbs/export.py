@@ -27,11 +27,12 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from runner.drive.read import Drive, read_drive
-from runner.errors import RunError, UserError
+from runner.errors import ArgumentError, RunError, UserError, os_errors_as
 from runner.records import VideoBegan
 from runner.system import signals
 from runner.system.files import unfinished, unfinished_directory
@@ -46,16 +47,11 @@ def run(arguments: Arguments) -> int:
     form = arguments.choice("format")
     if len(arguments.words) != 1:
         found = " ".join(arguments.words) or None
-        raise UserError("command line", "", found, "must name one drive: a directory that log= wrote")
+        raise ArgumentError("", found, "must name one drive: a directory that log= wrote")
     directory = Path(arguments.words[0])
     output = arguments.path("output") or directory / OUTPUTS[form]
     if os.path.lexists(output):
-        rule = "already exists; remove it, or choose another path with output="
-        raise UserError("command line", "output", repr(str(output)), rule)
-    if arguments.overrides:
-        raise UserError(
-            "command line", "", arguments.overrides[0], "export takes no overrides, only format= and output="
-        )
+        raise ArgumentError("output", output, "already exists; remove it, or choose another path with output=")
     drive = read_drive(directory)
     for warning in drive.warnings:
         print(warning, file=sys.stderr)
@@ -78,11 +74,8 @@ def _write_mcap(drive: Drive, output: Path, *more: Any) -> int:
 def _write_rosbag2(drive: Drive, output: Path, *more: Any) -> int:
     from runner.drive.rosbag2 import write_rosbag2
 
-    try:
-        with unfinished_directory(output) as part:
-            return write_rosbag2(drive, part, *more)
-    except OSError as error:
-        raise UserError("command line", "output", repr(str(output)), (error.strerror or "").lower()) from None
+    with os_errors_as(_output_error(output)), unfinished_directory(output) as part:
+        return write_rosbag2(drive, part, *more)
 
 
 WRITERS = {"mcap": _write_mcap, "rosbag2": _write_rosbag2}
@@ -95,18 +88,15 @@ def _no_video(_path: Path) -> Iterator[Any]:
 @contextmanager
 def _new_file(path: Path) -> Iterator[BinaryIO]:
     """A new file, which appears only when it is complete."""
-    try:
-        with unfinished(path) as part, _opened(part, path) as file:
+    with os_errors_as(lambda why: RunError(f"{path}: {why}")), unfinished(path) as part:
+        with os_errors_as(_output_error(path)):
+            file = part.open("xb")
+        with file:
             yield file
-    except OSError as error:
-        raise RunError(f"{path}: {(error.strerror or str(error)).lower()}") from None
 
 
-def _opened(part: Path, path: Path) -> BinaryIO:
-    try:
-        return part.open("xb")
-    except OSError as error:
-        raise UserError("command line", "output", repr(str(path)), (error.strerror or "").lower()) from None
+def _output_error(path: Path) -> Callable[[str], UserError]:
+    return partial(ArgumentError, "output", path)
 
 
 @contextmanager

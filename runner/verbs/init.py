@@ -23,7 +23,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from runner.configuration.editors import copies
-from runner.errors import ConfigError, Problem, UserError
+from runner.errors import ArgumentError, ConfigError, Problem
 from runner.verbs import Arguments
 
 VEHICLE = "my_vehicle"
@@ -38,9 +38,8 @@ TEMPLATES = {  # by path in the directory, the file in static/
 
 def run(arguments: Arguments) -> int:
     everything = arguments.choice("files") == "all"
-    if len(arguments.words) != 1 or arguments.overrides:
-        found = " ".join([*arguments.words, *arguments.overrides])
-        raise UserError("command line", "", found or None, "must be one directory and no overrides: init DIR")
+    if len(arguments.words) != 1:
+        raise ArgumentError("", " ".join(arguments.words) or None, "must be one directory: init DIR")
     place = Path(arguments.words[0])
     texts = {**(_templates() if everything else {}), **copies()}
     if problems := list(dict.fromkeys(_problems(place, texts))):

@@ -25,7 +25,7 @@ from __future__ import annotations
 from datetime import datetime
 
 from runner.core.roles import PEOPLE, Role
-from runner.errors import UserError
+from runner.errors import ArgumentError
 from runner.security.authority import Authority, Issued
 from runner.verbs import Arguments
 
@@ -33,16 +33,12 @@ ROLES = (Role.VEHICLE, *PEOPLE)
 
 
 def run(arguments: Arguments) -> int:
-    if arguments.overrides:
-        raise UserError("command line", "", arguments.overrides[0], "keys reads no configuration; see --help")
-    output = arguments.path("output")
-    if output is None:
-        raise UserError("command line", "output", None, "must be given: the directory for all keys")
+    output = arguments.given_path("output", "the directory for all keys")
     values = arguments.values
     hosts = tuple(filter(None, values.get("host", "").split(",")))
     named = [role for role in ROLES if role in values]
     if hosts and len([role for role in named if role is not Role.BROKER]) == 0:
-        raise UserError("command line", "host", values["host"], "must come with the name of a vehicle or operator")
+        raise ArgumentError("host", values["host"], "must come with the name of a vehicle or operator")
     authority = Authority(output)
     with authority.opened():
         changed = [values[role] for role in named if authority.issue(values[role], role, _hosts_of(role, named, hosts))]

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING
 
 from runner.configuration.config import configuration
 from runner.core.model import Camera, Vehicle, suggest
-from runner.errors import UserError
+from runner.errors import ArgumentError
 from runner.operator.station import Listener
 from runner.records import Note
 from runner.security.exposure import KeysOfAll, page_keyring
@@ -99,9 +99,9 @@ def run(arguments: Arguments) -> int:
 def _camera(vehicle: Vehicle, name: str | None) -> Camera:
     """raises UserError"""
     if name is None:
-        raise UserError("command line", "camera", None, f"must be given: one of {', '.join(vehicle.cameras)}")
+        raise ArgumentError("camera", None, f"must be given: one of {', '.join(vehicle.cameras)}")
     if name not in vehicle.cameras:
-        raise UserError("command line", "camera", repr(name), f"unknown camera{suggest(name, vehicle.cameras)}")
+        raise ArgumentError("camera", repr(name), f"unknown camera{suggest(name, vehicle.cameras)}")
     return vehicle.cameras[name]
 
 

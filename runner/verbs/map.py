@@ -21,7 +21,7 @@ from pathlib import Path
 from runner.drive.capacity import CapacitySample, Cell, capacity_problem, cells, limited_samples
 from runner.drive.positions import reader
 from runner.drive.series import series
-from runner.errors import RunError, UserError
+from runner.errors import ArgumentError, RunError
 from runner.system.files import whole_file
 from runner.verbs import Arguments
 
@@ -54,20 +54,13 @@ def run(arguments: Arguments) -> int:
 
 def _checked_arguments(arguments: Arguments) -> tuple[Path, float, float]:
     """Output file, percentile, and side of a square in m."""
-    if arguments.overrides:
-        rule = "unknown argument; expected one of output, percentile, cell_m, positions, topic"
-        raise UserError("command line", "", arguments.overrides[0], rule)
-    if not arguments.words:
-        raise UserError("command line", "", None, "must name a drive: a directory that log= wrote")
-    output = arguments.path("output")
-    if output is None:
-        raise UserError("command line", "output", None, "must be given: the map's file")
+    output = arguments.given_path("output", "the map's file")
     percentile, cell_m = arguments.number("percentile"), arguments.number("cell_m")
     percentile, cell_m = PERCENTILE if percentile is None else percentile, CELL_M if cell_m is None else cell_m
     if percentile > 100:
-        raise UserError("command line", "percentile", f"{percentile:g}", "must be at most 100")
+        raise ArgumentError("percentile", f"{percentile:g}", "must be at most 100")
     if cell_m < 1:
-        raise UserError("command line", "cell_m", f"{cell_m:g}", "must be at least 1")
+        raise ArgumentError("cell_m", f"{cell_m:g}", "must be at least 1")
     return output, percentile, cell_m
 
 

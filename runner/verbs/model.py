@@ -33,7 +33,7 @@ from runner.bag import PICTURES, Bag, is_bag
 from runner.configuration.config import configuration
 from runner.configuration.files import conf_directories, options
 from runner.core.model import BagTopic, ModelError, Vehicle, suggest
-from runner.errors import ConfigError, Problem, UserError
+from runner.errors import ArgumentError, ConfigError, Problem
 from runner.system import signals
 from runner.system.extras import require
 from runner.verbs import Arguments, study_word
@@ -49,9 +49,7 @@ NO_CLIPS = (".json", ".yaml", ".png", ".pdf")  # suffixes of other files named a
 def run(arguments: Arguments) -> int:
     streaming()
     require("model")
-    output = arguments.path("output")
-    if output is None:
-        raise UserError("command line", "output", None, "must be given: the directory to write models to")
+    output = arguments.given_path("output", "the directory to write models to")
     vehicle, study, names = _targets(arguments)
     paths = _sequences(arguments, vehicle, names)
     from runner.rate_quality.measure import measure
@@ -68,9 +66,7 @@ def compare(words: Sequence[str]) -> int:
     from runner.rate_quality.compare import compare as differences
 
     if len(words) != 2:
-        raise UserError(
-            "command line", "model compare", f"{len(words)} files", "must be two: A.model.json B.model.json"
-        )
+        raise ArgumentError("model compare", f"{len(words)} files", "must be two: A.model.json B.model.json")
     before, after = (read_model(Path(word)) for word in words)
     print("\n".join(differences(before, after)))
     return 0
@@ -89,7 +85,7 @@ def _targets(arguments: Arguments) -> tuple[Vehicle, Study, list[str]]:
         kinds = options("cameras", conf_directories(arguments.conf))
         if requested not in kinds:
             hint = suggest(requested, [*vehicle.cameras, *kinds])
-            raise UserError("command line", "camera", repr(requested), f"is neither mounted nor a kind of camera{hint}")
+            raise ArgumentError("camera", repr(requested), f"is neither mounted nor a kind of camera{hint}")
         words.append(f"+cameras@cameras.{requested}={requested}")
         config = configuration(words, arguments.conf, runnable=False, check=check_plan)
         study, vehicle = config.study(), config.vehicle()
@@ -101,7 +97,7 @@ def _targets(arguments: Arguments) -> tuple[Vehicle, Study, list[str]]:
     try:
         check_cameras(study, names)
     except ModelError as error:
-        raise UserError("command line", error.key, str(error.found), error.rule) from None
+        raise ArgumentError(error.key, str(error.found), error.rule) from None
     return vehicle, study, names
 
 
@@ -116,7 +112,7 @@ def _sequences(arguments: Arguments, vehicle: Vehicle, names: Sequence[str]) -> 
         return {names[0]: given}
     if not given.is_dir():
         rule = "must be a directory with one clip for each camera, named after it; or name one camera with camera="
-        raise UserError("command line", "sequence", repr(str(given)), rule)
+        raise ArgumentError("sequence", given, rule)
     found: dict[str, Footage] = {}
     problems = []
     for name in names:
@@ -167,6 +163,6 @@ def _clips_of_sources(vehicle: Vehicle, names: Sequence[str]) -> Mapping[str, Fo
         clip = next((e.properties["location"] for e in plan.source if "location" in e.properties), None)
         if clip is None or not plan.loops:
             rule = f"must be given, since the source of {plan.camera.name} plays no clip"
-            raise UserError("command line", "sequence", None, rule)
+            raise ArgumentError("sequence", None, rule)
         found[plan.camera.name] = Path(str(clip))
     return found

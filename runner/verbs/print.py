@@ -32,7 +32,7 @@ from runner.core.decision import Decision
 from runner.core.events import BitratePredicted, Event, ModeSelected, TotalSet
 from runner.core.model import Kbps, Mode, Vehicle, exact, plain
 from runner.core.step import start, step
-from runner.errors import UserError
+from runner.errors import ArgumentError
 from runner.graph import Plan
 from runner.plans import compile_plans
 from runner.records import CameraDecision, to_json
@@ -54,7 +54,7 @@ def run(arguments: Arguments) -> int:
 
 def _print_configuration(arguments: Arguments) -> int:
     if "total_kbps" in arguments.values:
-        raise UserError("command line", "total_kbps", None, "has no effect with format=yaml")
+        raise ArgumentError("total_kbps", None, "has no effect with format=yaml")
     config = configuration(arguments.overrides, arguments.conf)
     config.vehicle()
     _print(config.listing(), [])

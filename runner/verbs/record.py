@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Any
 
 from runner.configuration.config import configuration
 from runner.core.model import Camera, Vehicle, plain
-from runner.errors import RunError, UserError
+from runner.errors import ArgumentError, RunError
 from runner.plans import compile_plans, render_missing
 from runner.rate_quality import recordings
 from runner.system.signals import Stop, stopping
@@ -201,13 +201,13 @@ def _warnings(recorded: Recorded) -> Iterator[str]:
 def _duration(arguments: Arguments) -> float | None:
     duration = arguments.number("duration_s")
     if duration == 0:
-        raise UserError("command line", "duration_s", repr(arguments.values["duration_s"]), "must be above 0")
+        raise ArgumentError("duration_s", repr(arguments.values["duration_s"]), "must be above 0")
     return duration
 
 
 def _directory(arguments: Arguments) -> Path:
     if not arguments.values.get("output"):
-        raise UserError("command line", "output", "missing", "must be given: output=DIR, a directory for the files")
+        raise ArgumentError("output", "missing", "must be given: output=DIR, a directory for the files")
     return Path(arguments.values["output"])
 
 
@@ -219,13 +219,13 @@ def _check_sources(vehicle: Vehicle) -> None:
     subscribed = [camera.name for camera in vehicle.cameras.values() if camera.source.subscribes]
     if subscribed:
         rule = "`record` does not subscribe to topics; record a bag with ROS, and choose source=bag"
-        raise UserError("command line", "source", ", ".join(subscribed), rule)
+        raise ArgumentError("source", ", ".join(subscribed), rule)
     pushed = [
         c.name for c in vehicle.cameras.values() if c.source.stand_in and not (c.source.render or c.source.plays_bags)
     ]
     if pushed:
         rule = "its frames must be pushed by a Python program; choose another source"
-        raise UserError("command line", "source", ", ".join(pushed), rule)
+        raise ArgumentError("source", ", ".join(pushed), rule)
 
 
 @contextmanager

@@ -52,7 +52,7 @@ from runner.core.model import Vehicle
 from runner.core.step import Run, start, step
 from runner.drive.log import FILES, Log, check_free, log_run
 from runner.drive.read import OTHER_KINDS, REPORTS, check_began, is_log, read_line, read_lines, text_lines
-from runner.errors import UserError
+from runner.errors import ArgumentError, UserError, os_errors_as
 from runner.records import Began, ReceptionReported, decision_to_json, line_from_json
 from runner.schema import log_problem
 from runner.system.files import whole_file
@@ -98,7 +98,7 @@ def _sweep(arguments: Arguments) -> int:
     from runner.verbs.sweep import prepare_all
 
     if arguments.path("input") is None:
-        raise UserError("command line", "-m", None, "reads the events once for each run: give input=FILE")
+        raise ArgumentError("-m", None, "reads the events once for each run: give input=FILE")
     with _input(arguments) as (name, text):
         _, began = _begin(text, name)
     positions = _positions(arguments, began)
@@ -131,7 +131,7 @@ def _positions(arguments: Arguments, began: Began | None) -> RecordedPositions |
     recorded = given_positions(arguments.values)
     if began is None:
         rule = "needs a drive as input: events alone do not state when they happened"
-        raise UserError("command line", "positions", recorded.where, rule)
+        raise ArgumentError("positions", recorded.where, rule)
     return recorded
 
 
@@ -310,12 +310,10 @@ def _input(arguments: Arguments) -> Iterator[tuple[str, Iterable[str]]]:
         sys.stdin.reconfigure(encoding="utf-8", errors="replace")  # type: ignore[union-attr]
         yield "standard input", text_lines(sys.stdin)
         return
-    try:
+    with os_errors_as(lambda why: ArgumentError("input", path, why)):
         path = path / FILES["vehicle"] if path.is_dir() else path
         _check_not_input(path, arguments.path("output"))
         file = path.open(encoding="utf-8", errors="replace")
-    except OSError as error:
-        raise UserError("command line", "input", repr(str(path)), (error.strerror or "").lower()) from None
     with file:
         yield str(path), text_lines(file)
 
@@ -323,7 +321,7 @@ def _input(arguments: Arguments) -> Iterator[tuple[str, Iterable[str]]]:
 def _check_not_input(path: Path, output: Path | None) -> None:
     """raises UserError if the input would be overwritten"""
     if output and output.is_file() and path.exists() and output.samefile(path):
-        raise UserError("command line", "output", repr(str(output)), "is the input, choose another file")
+        raise ArgumentError("output", output, "is the input, choose another file")
 
 
 @contextmanager

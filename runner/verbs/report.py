@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from runner.configuration.files import conf_directories
-from runner.errors import UserError
+from runner.errors import ArgumentError
 from runner.system.extras import require
 from runner.verbs import Arguments
 from runner.verbs.screen import progress_bar
@@ -90,12 +90,12 @@ def check_report(output: Path, models: Path | None) -> None:
     """
     above = next((path for path in (output, *output.parents) if path.exists()), Path())
     if not above.is_dir():
-        raise UserError("command line", "output", repr(str(output)), f"must be a directory, but {above} is a file")
+        raise ArgumentError("output", output, f"must be a directory, but {above} is a file")
     if (output / PAGE).exists() and not _is_report(output / PAGE):
         rule = "exists and was not written by tod-runner report; choose another directory"
-        raise UserError("command line", "output", repr(str(output / PAGE)), rule)
+        raise ArgumentError("output", output / PAGE, rule)
     if models and not models.is_dir():
-        raise UserError("command line", "models", repr(str(models)), "no such directory")
+        raise ArgumentError("models", models, "no such directory")
     require("report")
 
 
@@ -107,22 +107,9 @@ def _is_report(page: Path) -> bool:
 
 
 def _paths(arguments: Arguments) -> tuple[list[Path], Path]:
-    if arguments.overrides:
-        rule = f"unknown argument; expected one of {', '.join((*_own(), 'conf'))}"
-        raise UserError("command line", "", arguments.overrides[0], rule)
-    if not arguments.words:
-        raise UserError("command line", "DRIVE", None, "must be given: a directory that log= wrote")
-    output = arguments.path("output")
-    if output is None:
-        raise UserError("command line", "output", None, "must be given: the directory to write the report to")
+    output = arguments.given_path("output", "the directory to write the report to")
     check_report(output, arguments.path("models"))
     return [Path(word) for word in arguments.words], output
-
-
-def _own() -> tuple[str, ...]:
-    from runner.verbs import VERBS
-
-    return VERBS["report"].arguments
 
 
 def _measured(

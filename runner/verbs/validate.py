@@ -43,7 +43,7 @@ from runner.configuration.files import GROUPS, LAYOUT, bases_of, built_on, conf_
 from runner.configuration.overrides import COMMAND_LINE, choosable
 from runner.configuration.yaml_file import label, load_file, load_node
 from runner.core.model import ModelError, suggest
-from runner.errors import ConfigError, MissingBindings, Problem, UserError
+from runner.errors import ArgumentError, ConfigError, MissingBindings, Problem
 from runner.graph import Plan
 from runner.verbs import Arguments
 
@@ -143,15 +143,14 @@ def _directories(arguments: Arguments) -> dict[Path | None, list[Path] | None]:
     for word in arguments.words:
         file = Path(word)
         if not _is_yaml(file.name):
-            raise UserError("command line", "", word, "must be NAME=VALUE, or a file that ends in .yaml or .yml")
+            raise ArgumentError("", word, "must be NAME=VALUE, or a file that ends in .yaml or .yml")
         if not file.is_file():
-            raise UserError("command line", "", word, "no such file")
+            raise ArgumentError("", word, "no such file")
         inside = [arguments.conf] if arguments.conf else [*file.parents, *file.absolute().parents]
         above = [conf for conf in inside if file.resolve().is_relative_to(conf.resolve()) and _has_groups(conf)]
         if not above:
             rule = "is in no configuration directory: none above it has vehicle/, cameras/, ..."
-            rule = f"is not in {arguments.conf}" if arguments.conf else rule
-            raise UserError("command line", "", word, rule)
+            raise ArgumentError("", word, f"is not in {arguments.conf}" if arguments.conf else rule)
         conf = above[0]
         found.setdefault(conf, []).append(conf / file.resolve().relative_to(conf.resolve()))  # type: ignore[union-attr]
     return found

@@ -18,7 +18,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from runner.errors import UserError
+from runner.errors import UserError, reason
 
 Vector = NDArray[np.float64]
 
@@ -87,7 +87,7 @@ def _read(path: Path) -> str:
     try:
         return path.read_text()
     except OSError as error:
-        raise UserError(str(path), "", None, (error.strerror or "cannot be read").lower()) from None
+        raise UserError(str(path), "", None, reason(error)) from None
     except ValueError:
         raise UserError(str(path), "", None, "is not text") from None
 

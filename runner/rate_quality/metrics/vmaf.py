@@ -20,7 +20,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from runner.errors import RunError, UserError
+from runner.errors import RunError, UserError, reason
 from runner.rate_quality.metrics.interface import Luma, Mask, Metric, PictureSize, check
 from runner.system.extras import how_to_install
 
@@ -214,7 +214,7 @@ class VmafMeter:
             self._process = self._start(tool.exe, model, picture_format(size, "yuv420p", fps), stride)
         except OSError as error:
             self._free()
-            raise RunError(f"{tool.exe}: cannot be started: {error.strerror}") from None
+            raise RunError(f"{tool.exe}: cannot be started: {reason(error)}") from None
 
     def _start(self, exe: str, model: str, layout: list[str], stride: int) -> subprocess.Popen[bytes]:
         """The process, and the pipes into it: first for the scored picture, then for its reference."""
