@@ -62,7 +62,7 @@ OFTEN, OFTEN_S, BURST_S, CONTESTED = 3, 30.0, 2.0, Fraction(2, 3)
 PROVEN = 2  # then the most that arrived is limited to this multiple of the capacity
 FADED = Fraction(999, 1000)  # factor by which that most decays each second
 # A prediction that falls by this factor announces an outage, and one that rises by it ends it. If it is short, what
-# arrives meanwhile says nothing about the link after it.
+# arrives meanwhile says nothing about the link after it; nor does less than that share in the first BEGIN_S after it.
 OUTAGE, OUTAGE_S = 10, 10.0
 SILENCE_S = 0.3  # without a report, or with empty reports, for this long the cap is halved
 
@@ -151,6 +151,7 @@ class LinkCap(NamedTuple):
     kbps        cap in force; None: no cap below the limit
     overuse     the last one
     outage      that the prediction announces; None: none
+    resumed     t of the predicted end of the last one
     queue_ms    wait at the last cut
     steps       careful increases since then
     before      kbit/s that arrived when the link was last clear
@@ -180,6 +181,7 @@ class LinkCap(NamedTuple):
     kbps: Kbps | None = None
     overuse: Overuse | None = None
     outage: PredictedOutage | None = None
+    resumed: float = -float("inf")
     queue_ms: float = 0.0
     steps: int = 0
     before: Kbps | None = None
@@ -282,13 +284,27 @@ def _adapt_overuse(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
     if cap.outage and (t - cap.outage.t > OUTAGE_S or not cap.predicted):
         cap = cap._replace(outage=None)
     elif cap.outage and limit >= OUTAGE * cap.outage.limit:
-        before = cap.outage.overuse
-        return cap._replace(overuse=before and _known_now(before, before.known(limit), limit), outage=None)
+        return _end_outage(cap, t, limit, cap.outage.overuse)
     if last is None or not last.fell or limit >= last.limit or last.carried >= last.limit or t - last.t > LATE_S:
         return cap
     followed = max(limit, last.carried)
     trust = relieve(cap.trust, last.t, followed / last.limit)
     return cap._replace(overuse=last._replace(limit=followed), trust=trust)
+
+
+def _end_outage(cap: LinkCap, t: float, limit: Kbps, before: Overuse | None) -> LinkCap:
+    """The cap when the prediction ends an outage: half of what the link carried before it, relative to the limit.
+
+    All of it at once would fill the queue of a link that recovers gradually. While nothing arrives, the cap stays, and
+    the first report restores as much.
+    """
+    carried = min(limit * cap.trust.share, before.known(limit) if before else limit)
+    overuse = before and _known_now(before, before.known(limit), limit)
+    cap = cap._replace(outage=None, resumed=t, overuse=overuse, before=carried)
+    if cap.stall:
+        return cap
+    kbps = _short(max(carried / 2, cap.kbps or Fraction(0)))
+    return cap._replace(kbps=kbps, queue_ms=float("inf"), steps=0, changed=t)  # the queue is the outage's
 
 
 def start_cap(cap: LinkCap, link: LinkMeasured | None, since: float | None, limit: Kbps, share: Fraction) -> LinkCap:
@@ -480,12 +496,13 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps, kn
     if is_proof and not burst:
         most = min(most, PROVEN * carried)
     target = max(target, _yielded(cap, t) * most * (CONTESTED + (1 - CONTESTED) * burst if _is_contested(cap) else 1))
-    if cap.provisional:  # not all cameras may have started, so a low rate proves little
+    settled, seen = t - cap.changed >= SETTLE_S + _rtt_s(link), _limit_seen(cap, link, t, full)
+    lasting = t - cap.resumed < BEGIN_S and full >= OUTAGE * carried  # for longer than predicted
+    in_outage = cap.predicted and (full >= OUTAGE * seen or lasting)
+    if cap.provisional or in_outage:  # not all cameras may have started, so a low rate proves little
         target = max(target, DEEPEST * _in_force(cap, limit))
     if not (below := _is_below_floors(cap, link, t, limit)):
         target = max(target, cap.floors)
-    settled, seen = t - cap.changed >= SETTLE_S + _rtt_s(link), _limit_seen(cap, link, t, full)
-    in_outage = cap.predicted and full >= OUTAGE * seen  # measured in one that is over
     if target >= _in_force(cap, limit) or not (settled or (link.queue_ms or 0) > cap.queue_ms):
         lowered = cap if in_outage else _lower_known(cap, max(carried, known * seen / full), link, t, seen)
         return _raise_known(lowered, link, t, full)
@@ -560,6 +577,8 @@ def _recover(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps
         factor = min(FAST, BEGIN * (link.kbps or 0) / cap.kbps)
     elif last:
         factor = min(FAST, RESERVE * last.known(full) / cap.kbps)
+        if last.t - cap.resumed < BEGIN_S:  # the link may have been recovering
+            factor = max(factor, min(BEGIN, BEGIN * (link.kbps or 0) / cap.kbps))
     if factor < 1 + CAREFUL:
         if not _may_probe(cap, link, t, limit):
             return cap
@@ -611,11 +630,11 @@ def _handle_silence(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> 
 
 
 def _resume(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
-    """After a stall, the first report with an empty queue restores half of the rate before it."""
+    """After a stall, unless it was short, the first report with an empty queue restores half of the rate before it."""
     if cap.stall is None:
         return cap
-    kbps = cap.kbps
-    if kbps is None or not cap.stall.halved or not cap.before:
+    kbps, is_short = cap.kbps, not cap.stall.halved and cap.resumed < cap.stall.t
+    if kbps is None or is_short or not cap.before:
         return cap._replace(stall=None)
     return cap._replace(kbps=max(kbps, min(cap.before, limit) / 2), stall=None, changed=t)
 
