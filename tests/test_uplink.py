@@ -429,7 +429,7 @@ def test_a_limit_that_follows_the_link_is_not_doubted_and_recovery_is_fast(late_
 
 @pytest.mark.parametrize("seed", range(1, 5))
 @pytest.mark.parametrize("share", [1, 1.5])
-@pytest.mark.parametrize(("early_s", "within_s"), [(0, 0.8), (0.5, 2.3)])
+@pytest.mark.parametrize(("early_s", "within_s"), [(0, 0.8), (0.5, 2.3), (1, 2.6)])
 def test_what_arrives_in_an_outage_that_was_predicted_says_nothing_about_the_link_after_it(
     share: float, seed: int, early_s: float, within_s: float
 ) -> None:
