@@ -219,6 +219,11 @@ def places_problem(document: Any) -> str | None:
     return _in_one_line("layout.schema.json#/$defs/places", document)
 
 
+def drive_places_problem(document: Any) -> str | None:
+    """The problems of cameras by place in the Drive view, in one line; None if they are valid."""
+    return _in_one_line("layout.schema.json#/$defs/drive", document)
+
+
 @cache
 def log_kinds() -> tuple[str, ...]:
     return tuple(schema_document("drive")["properties"]["log"]["enum"])

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from helpers import Command, UserConf, vehicle
 
-from runner.configuration.layout import HEADER, NOWHERE, Layouts, own_places, places_problem
+from runner.configuration.layout import HEADER, NOWHERE, Layouts, drive_places_problem, own_places, places_problem
 from runner.core.model import Place, Vehicle
 from runner.errors import ConfigError, RunError, UserError
 
@@ -55,6 +55,50 @@ def test_other_vehicles_stay_as_they_are_and_a_vehicle_can_be_forgotten(tmp_path
     layouts.save(car, None)
     assert layouts.path.read_text() == f"{HEADER}vehicles: {{}}\n"
     assert Layouts(tmp_path).places(car) == own_places(car)
+
+
+DRIVE = {"front": "mast", "left": "front", "row": ["rear"]}
+
+
+def test_places_in_the_drive_view_are_saved_beside_those_in_the_configure_view(tmp_path: Path, robot: Vehicle) -> None:
+    layouts = Layouts(tmp_path, "alice")
+    assert layouts.drive_places(robot) is None
+    layouts.save(robot, SAVED)
+    layouts.save_drive(robot, DRIVE)
+    assert layouts.path and layouts.path.read_text() == (
+        f"{HEADER}{TEXT}drive:\n  delivery_robot:\n    front: mast\n    left: front\n    row: [rear]\n"
+    )
+    for known in (layouts, Layouts(tmp_path, "alice")):
+        assert (known.drive_places(robot), known.places(robot)["rear"]) == (DRIVE, Place(0, 2))
+    layouts.save(robot, None)
+    assert layouts.drive_places(robot) == DRIVE
+    layouts.save_drive(robot, None)
+    assert layouts.drive_places(robot) is None
+    assert layouts.path.read_text() == f"{HEADER}vehicles: {{}}\n"
+
+
+@pytest.mark.parametrize(
+    ("document", "expected"),
+    [
+        (DRIVE, None),
+        ({"front": "rear"}, None),
+        ({}, "front: missing: must be given"),
+        ({"front": 1}, "front: 1: must be text"),
+        ({"front": "mast", "middle": "rear"}, "middle: unknown key"),
+        ({"front": "mast", "row": "rear"}, "row: 'rear': must be a list"),
+        ({"front": "fornt", "row": ["x"]}, "'fornt': unknown camera, did you mean front?; 'x': unknown camera"),
+        ({**DRIVE, "row": ["mast", "front"]}, "must have one place for each camera, but mast, front has several"),
+    ],
+)
+def test_places_in_the_drive_view_are_checked(
+    robot: Vehicle, tmp_path: Path, document: Any, expected: str | None
+) -> None:
+    problem = drive_places_problem(robot, document)
+    assert problem == expected if expected is None else expected in str(problem)
+    if expected:
+        with pytest.raises(UserError):
+            Layouts(tmp_path, "alice").save_drive(robot, document)
+        assert list(tmp_path.iterdir()) == []
 
 
 def test_changes_made_by_the_user_meanwhile_are_kept_or_reported(tmp_path: Path, robot: Vehicle) -> None:
@@ -127,10 +171,14 @@ def test_places_from_a_page_are_checked(robot: Vehicle, tmp_path: Path, document
 
 def test_a_saved_place_of_a_removed_camera_is_reported(tmp_path: Path, robot: Vehicle) -> None:
     (tmp_path / "layout").mkdir()
-    (tmp_path / "layout" / "alice.yaml").write_text("vehicles: {delivery_robot: {fornt: {row: 0, column: 0}}}\n")
-    (note,) = Layouts(tmp_path, "alice").notes(robot)
-    rule = "vehicles.delivery_robot.fornt: is ignored: no such camera, did you mean front?"
-    assert note == f"{tmp_path}/layout/alice.yaml: {rule}"
+    text = "vehicles: {delivery_robot: {fornt: {row: 0, column: 0}}}\ndrive: {delivery_robot: {front: mats}}\n"
+    (tmp_path / "layout" / "alice.yaml").write_text(text)
+    assert [
+        note.removeprefix(f"{tmp_path}/layout/alice.yaml: ") for note in Layouts(tmp_path, "alice").notes(robot)
+    ] == [
+        "vehicles.delivery_robot.fornt: is ignored: no such camera, did you mean front?",
+        "drive.delivery_robot: mats: is ignored: no such camera, did you mean mast?",
+    ]
 
 
 # --- validate ---------------------------------------------------------------------------------------------------------
@@ -153,6 +201,9 @@ vehicles:
   van:
     front: {row: 0, column: 0, row_span: 2}
     rear: {row: 1, column: 0}
+drive:
+  van: {front: a, rear: a}
+  bus: {left: a}
 """
     conf.write("layout/alice.yaml", mistakes).write("layout/empty.yaml", "").write("layout/a,b.yaml", TEXT)
     conf.write("layout/x/y.yaml", TEXT).write("layout/bob.yml", TEXT).write("layout/eve.yaml", "vehicles: [\n")
@@ -160,6 +211,8 @@ vehicles:
     found = [line.replace(str(conf.path), "~") for line in tod("validate", conf.word).problems]
     assert sorted(found) == [
         "~/layout/a,b.yaml: would be ignored: no operator can have this name",
+        "~/layout/alice.yaml: drive.bus.front: missing: must be given",
+        "~/layout/alice.yaml: drive.van: must have one place for each camera, but a has several",
         "~/layout/alice.yaml: vehicles.delivery_robot.mast.column: missing: must be given",
         '~/layout/alice.yaml: vehicles.van.rear: {"row": 1, "column": 0}: overlaps the place of camera front',
         "~/layout/alice.yaml: vehicles: 'my van': must be letters, digits, _ and - only",

@@ -551,6 +551,11 @@ def test_a_layout_is_saved_by_the_page_in_control_and_sent_to_all(tmp_path):
         assert "    rear_center: {row: 0, column: 0, column_span: 2}\n" in file.read_text()
         later = await received(await windows.open("late", "there"), "hello")
         assert later["layout"]["places"]["rear_center"] == PLACE
+        await page.send_json({"id": "4", "drive": {"front": "rear_center"}})
+        await received(page, "reply", id="4", result="applied")
+        assert (await received(watcher, "layout"))["drive"] == {"front": "rear_center"}
+        await page.send_json({"id": "5", "drive": None})
+        await received(page, "reply", id="5", result="applied")
         await monitor.send_json({"id": "3", "layout": None})  # it has its page's control
         await received(monitor, "reply", id="3", result="applied")
         assert (await received(page, "layout"))["places"] == layout["own"]
@@ -568,6 +573,8 @@ def test_a_layout_is_saved_by_the_page_in_control_and_sent_to_all(tmp_path):
         ({"layout": {"rear_center": {**PLACE, "row": -1}}}, "rear_center.row: -1: must be at least 0"),
         ({"layout": "../../x"}, "'../../x': must be a mapping"),
         ({"layout": {}, "operator": "../bob"}, "operator: unknown key, only layout is allowed"),
+        ({"layout": {}, "drive": None}, "drive: unknown key, only layout is allowed"),
+        ({"drive": {"front": "rear_centre"}}, "'rear_centre': unknown camera, did you mean rear_center?"),
         ({"layout": {}, "id": 7}, "id: must be given, as text of at most 64 characters"),
     ],
 )

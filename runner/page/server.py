@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
+from functools import partial
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
@@ -412,9 +413,10 @@ class PageServer(Listener):
             viewer.post("note", note)
 
     def _layout(self) -> dict[str, Any]:
-        """The places of the pictures in the Configure view, and why a layout cannot be saved."""
+        """The places of the pictures in both views, and why a layout cannot be saved."""
         own, places = own_places(self._vehicle), self._layouts.places(self._vehicle)
-        return {"places": _places(places), "own": _places(own), "problem": None if self._layouts.path else NOWHERE}
+        problem, drive = None if self._layouts.path else NOWHERE, self._layouts.drive_places(self._vehicle)
+        return {"places": _places(places), "own": _places(own), "drive": drive, "problem": problem}
 
     def _page_of(self, viewer: PageViewer) -> str:
         return page_of(viewer, self._viewers, self._control)
@@ -493,8 +495,8 @@ class PageServer(Listener):
 
         if problem := self._refusal(viewer, request_id):
             answer("refused", problem)
-        elif "layout" in document:
-            self._save_layout(document, answer)
+        elif kind := next((kind for kind in ("layout", "drive") if kind in document), None):
+            self._save_layout(kind, document, answer)
         else:
             self._send_request(document, answer)
 
@@ -518,24 +520,23 @@ class PageServer(Listener):
         else:
             answer("refused", f"event: {event!r}: must be one of {', '.join(sorted(DRIVER_EVENTS))}")
 
-    def _save_layout(self, document: dict[str, Any], answer: Callable[[str, str], None]) -> None:
-        """Save a layout in its own thread: a hung disk must not stop the video."""
-        if unknown := sorted(document.keys() - {"layout"}):
-            answer("refused", f"{shortened(unknown[0])}: unknown key, only layout is allowed")
+    def _save_layout(self, kind: str, document: dict[str, Any], answer: Callable[[str, str], None]) -> None:
+        """Save the layout of a view in its own thread: a hung disk must not stop the video."""
+        if unknown := sorted(document.keys() - {kind}):
+            answer("refused", f"{shortened(unknown[0])}: unknown key, only {kind} is allowed")
         elif self._is_saving:
             answer("refused", "another layout is being saved")
         else:
             self._is_saving = True
-            writer = threading.Thread(
-                target=self._write_layout, args=(document["layout"], answer), name="layout", daemon=True
-            )
-            writer.start()
+            save = self._layouts.save if kind == "layout" else self._layouts.save_drive
+            work = partial(save, self._vehicle, document[kind])
+            threading.Thread(target=self._write_layout, args=(work, answer), name="layout", daemon=True).start()
 
-    def _write_layout(self, layout: Any, answer: Callable[[str, str], None]) -> None:
+    def _write_layout(self, save: Callable[[], None], answer: Callable[[str, str], None]) -> None:
         """Runs in its own thread."""
         problem = "the layout could not be saved"
         try:
-            self._layouts.save(self._vehicle, layout)
+            save()
             problem = ""
         except ConfigError as error:
             problem = "; ".join(map(str, error.problems))

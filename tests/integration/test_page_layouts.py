@@ -127,8 +127,7 @@ def controlling(page):
 
 def pulled(page, selector, right, down):
     """Drag something by so many px."""
-    box = page.locator(selector).bounding_box()
-    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    x, y = middle(page.locator(selector).bounding_box())
     page.mouse.move(x, y)
     page.mouse.down()
     page.mouse.move(x + right / 2, y + down / 2)
@@ -136,6 +135,10 @@ def pulled(page, selector, right, down):
     assert page.locator(".target").is_visible()
     page.mouse.up()
     assert page.locator(".target").is_hidden()
+
+
+def middle(box):
+    return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
 
 
 def where(page, camera):
@@ -200,6 +203,59 @@ def test_a_layout_is_dragged_moved_by_keys_saved_and_reset(chromium, picture, tm
         assert page.locator("#layout-bar").is_hidden()
         assert edges(page) == large, "cancelled"
         page.click("#edit-layout")
+        page.click("#layout-reset")
+        page.click("#layout-save")
+        page.wait_for_selector("#layout-bar", state="hidden")
+        assert file.read_text() == f"{HEADER}vehicles: {{}}\n"
+        until(lambda: edges(page) == before)
+        assert station.requests == [], "no region was dragged, no camera switched"
+
+
+def test_places_of_the_drive_view_are_dragged_moved_by_keys_saved_and_reset(chromium, picture, tmp_path):
+    file = tmp_path / "layout" / "alice.yaml"
+    with served(picture, Layouts(tmp_path, "alice")) as (server, station), opened(chromium, server.url) as page:
+        controlling(page)
+        page.click("#offer-drive")
+        page.keyboard.press("d")  # the drawer has the button
+        page.wait_for_selector("#edit-drive")
+        before = until(lambda: settled_edges(page))
+        page.click("#edit-drive")
+        assert [where(page, name) for name in CAMERAS] == ["middle", "mirror", "row, number 1"]
+        cell = until(lambda: settled_edges(page))
+        (x, y), (left, top) = (middle(cell[name]) for name in ("front", "mast"))
+        pulled(page, "[data-mover=mast]", x - left, y - top)
+        assert [where(page, name) for name in CAMERAS] == ["row, number 1", "mirror", "middle"], "they swap"
+        page.focus("[data-mover=front]")
+        page.keyboard.press("ArrowLeft")
+        assert where(page, "front") == "left"
+        assert page.evaluate("document.activeElement.dataset.mover") == "front", "the next key moves the same picture"
+        assert page.inner_text("#announcer") == "front: left"
+        assert page.evaluate(
+            "tiles.getBoundingClientRect().bottom <= document.querySelector('#layout-bar').getBoundingClientRect().top"
+        )
+        shot(page, "edit-drive")
+        page.click("#layout-save")
+        page.wait_for_selector("#layout-bar", state="hidden")
+        assert file.read_text() == (
+            f"{HEADER}vehicles: {{}}\ndrive:\n  delivery_robot: {{front: mast, left: front, rear: rear}}\n"
+        )
+        page.keyboard.press("d")
+        large = until(lambda: settled_edges(page))
+        assert large["front"]["x"] < large["mast"]["x"] and large["rear"]["y"] < large["mast"]["y"]
+        assert large["mast"]["width"] > 2 * large["front"]["width"]
+        page.keyboard.press("ArrowLeft")
+        assert page.evaluate("document.querySelector('.tile.selected').dataset.camera") == "front"
+        shot(page, "drive-places")
+        visit_again(page)
+        until(lambda: page.evaluate("window.tod?.control") == "you")
+        until(lambda: edges(page) == large)
+        page.keyboard.press("d")
+        page.click("#edit-drive")
+        page.focus("[data-mover=rear]")
+        page.keyboard.press("Enter")
+        assert [where(page, name) for name in CAMERAS] == ["left", "middle", "mirror"]
+        page.keyboard.press("Escape")
+        page.click("#edit-drive")
         page.click("#layout-reset")
         page.click("#layout-save")
         page.wait_for_selector("#layout-bar", state="hidden")

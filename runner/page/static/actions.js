@@ -2,11 +2,10 @@
 
 import { camera, enlarge, inControl, publish, select, store } from "./store.js";
 import { selectMode, toggleControl } from "./header.js";
-import { focusTile, switchCamera } from "./tiles.js";
+import { driveRoles, focusTile, switchCamera } from "./tiles.js";
 import { scaleTotal } from "./total.js";
 import { sendFull } from "./panel.js";
 import { toggleTheme } from "./theme.js";
-import { rolesOf } from "./arrange.js";
 import { cycleBirdseye } from "./birdseye.js";
 import { toggleGuides } from "./drive.js";
 import { toggleStraight } from "./straighten.js";
@@ -86,12 +85,12 @@ export function selectNumber(number) {
 
 /** @param {"left"|"front"|"right"|"rear"} role */
 function selectRole(role) {
-  selectCamera(rolesOf(store.hello?.cameras ?? [])[role]?.name);
+  selectCamera(driveRoles()[role]?.name);
 }
 
 /** Switch between driving forwards and backwards. */
 function reverse() {
-  const { front, rear } = rolesOf(store.hello?.cameras ?? []);
+  const { front, rear } = driveRoles();
   if (store.view !== "drive") return;
   if (!rear) return publish("toast", { text: "no camera looks backwards", level: "hint" });
   const large = store.enlarged === rear.name;

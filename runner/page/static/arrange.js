@@ -35,12 +35,27 @@ export const isTopView = ({ pose }) => pose !== null && pose.pitch_deg >= DOWN_D
 const looksBackwards = (camera) => camera.pose !== null && !isTopView(camera) && Math.abs(yawOf(camera)) >= BEHIND_DEG;
 
 /**
- * The cameras by their role for a driver. The front camera is the one nearest to straight ahead, otherwise the first that
- * looks forward, otherwise the first. Top views and cameras without a role are the others, in their order.
+ * The cameras by their role for a driver.
+ * @param {Camera[]} cameras
+ * @param {import("./placing.js").Places|null} places that an operator has saved; none without a camera for the front
+ * @returns {Roles}
+ */
+export function rolesOf(cameras, places = null) {
+  const named = (name) => cameras.find((camera) => camera.name === name) ?? null;
+  const front = places && named(places.front);
+  if (!front) return rolesByPose(cameras);
+  const [left, right, rear] = [places.left, places.right, places.rear].map(named);
+  const row = (places.row ?? []).map(named).filter((camera) => camera !== null);
+  return { front, left, right, rear, others: [...row, ...cameras.filter((camera) => ![front, left, right, rear, ...row].includes(camera))] };
+}
+
+/**
+ * The front camera is the one nearest to straight ahead, otherwise the first that looks forward, otherwise the first. Top
+ * views and cameras without a role are the others, in their order.
  * @param {Camera[]} cameras
  * @returns {Roles}
  */
-export function rolesOf(cameras) {
+function rolesByPose(cameras) {
   const level = cameras.filter((camera) => camera.pose && !isTopView(camera));
   const front = nearest(level, 0, AHEAD_DEG) ?? level.find((camera) => Math.abs(yawOf(camera)) < 90) ?? cameras[0] ?? null;
   const rear = nearest(level.filter((camera) => camera !== front && looksBackwards(camera)), 180, 180);
@@ -62,14 +77,17 @@ function nearest(cameras, yaw, within) {
 
 /**
  * The box of each picture, of the band above them, and of the mirror in its middle (of no width without one). No two boxes
- * of pictures overlap. A bird's-eye view replaces the top views, except the main one.
+ * of pictures overlap. A bird's-eye view replaces the top views in the row, except the main one.
  * @param {Camera[]} cameras  @param {number} width  @param {number} height of the area
  * @param {string|null} main camera that is swapped with the front camera
  * @param {{width: number, height: number}|null} birdseye its size, in any unit; null: none
+ * @param {import("./placing.js").Places|null} places that an operator has saved
  * @returns {{band: Box, mirror: Box, pictures: Map<string, Framed>}} pictures of cameras, and BIRDSEYE
  */
-export function arrange(cameras, width, height, main = null, birdseye = null) {
-  const roles = rolesOf(birdseye ? [...cameras.filter((each) => !isTopView(each) || each.name === main), asCamera(birdseye)] : cameras);
+export function arrange(cameras, width, height, main = null, birdseye = null, places = null) {
+  const large = [main, places?.front, places?.left, places?.right, places?.rear];
+  const kept = cameras.filter((each) => !birdseye || !isTopView(each) || large.includes(each.name));
+  const roles = rolesOf(birdseye ? [...kept, asCamera(birdseye)] : kept, places);
   const area = (found) => (roles.front ? found.pictures.get(roles.front.name).width : 0);
   const found = [withStrip(roles, width, height), ...(roles.left || roles.right || !roles.others.length ? [] : [withColumn(roles, width, height)])];
   const best = found.sort((a, b) => area(b) - area(a))[0];

@@ -1,62 +1,81 @@
-/** Edits the layout of the Configure view: tiles are dragged on a grid, or moved by keys; the station saves it. */
+/** Edits the layout of a view: pictures are dragged, or moved by keys; the station saves it. */
 
 import { enlarge, inControl, listen, store } from "./store.js";
-import { completed, moved, resized, sizeOf } from "./editing.js";
-import { GAP } from "./layout.js";
+import { DRIVE } from "./edit_drive.js";
+import { GRID } from "./edit_grid.js";
 import { pending, request, requests, showProblem, whyNoControl } from "./requests.js";
-import { showDraft } from "./tiles.js";
 import { announce, byId, displayName, make, setAttribute, setText } from "./format.js";
 
-const STEPS = { ArrowUp: [-1, 0], ArrowDown: [1, 0], ArrowLeft: [0, -1], ArrowRight: [0, 1] };
+/**
+ * @typedef {object} Editor of the layout of a view; drafts are places as the view's other modules know them
+ * @property {string} kind of the request that saves it
+ * @property {string} help
+ * @property {() => any} initial the places in force
+ * @property {() => any} own the places that apply if none are saved
+ * @property {(draft: any) => any} stated the places as they are saved
+ * @property {(draft: any) => void} show null: the places in force
+ * @property {(draft: any, name: string) => string} text where a picture is
+ * @property {(draft: any, name: string, event: KeyboardEvent) => any} pressed the draft after a key; undefined: the key has no meaning
+ * @property {(draft: any, name: string, mover: HTMLElement, press: PointerEvent) => Drag} drag
+ * @typedef {object} Drag of a picture
+ * @property {(at: PointerEvent|null) => void} over show where it would go; null: nowhere
+ * @property {(at: PointerEvent) => any} drop the draft once it is there
+ */
 
-/** @type {import("./editing.js").Draft|null} null: not editing */
+/** @type {Editor|null} null: not editing */
+let editor = null;
+/** @type {any} */
 let draft = null;
-let isOwn = false; // whether the draft is the vehicle's own layout, unchanged
+let isOwn = false; // whether the draft is what applies if nothing is saved
 /** @type {string|undefined} the request that saves it */
 let saving;
-const target = make("div", { class: "target", hidden: true }); // where the dragged tile would go
+/** @type {HTMLElement|null} the button that began it */
+let opener = null;
 const movers = new Map(); // by camera, the handle that drags its tile
 
-/** Whether the layout is being edited. */
-export const isEditing = () => draft !== null;
+/** Whether a layout is being edited. */
+export const isEditing = () => editor !== null;
 
 const cameras = () => store.hello?.cameras ?? [];
 
 // --- begin and end ----------------------------------------------------------------------------------------------------
 
-function begin() {
+/** @param {Editor} chosen  @param {HTMLElement} button */
+function begin(chosen, button) {
   const why = store.hello?.layout.problem ?? (inControl() ? null : whyNoControl());
   if (why) return showProblem(why);
-  if (draft || !store.hello) return;
+  if (editor || !store.hello) return;
+  [editor, opener] = [chosen, button];
   if (store.enlarged) enlarge(null);
   document.body.dataset.editing = "";
   byId("layout-bar").hidden = false;
+  setText(byId("layout-help"), editor.help);
   for (const { name } of cameras()) addMover(name);
-  setDraft(completed(cameras(), store.hello.layout.places), false);
+  setDraft(editor.initial(), false);
   movers.get(store.selected ?? cameras()[0]?.name)?.focus();
 }
 
 function end() {
-  if (!draft) return;
-  draft = null;
+  if (!editor) return;
+  const { show } = editor;
+  editor = draft = null;
   saving = undefined;
   delete document.body.dataset.editing;
   byId("layout-bar").hidden = true;
   movers.forEach((mover) => mover.remove());
   movers.clear();
-  target.remove();
-  showDraft(null);
-  byId("edit-layout").focus();
+  show(null);
+  opener?.focus();
 }
 
 function save() {
-  if (!draft || pending("layout")) return;
-  saving = request("layout", { layout: isOwn ? null : completed(cameras(), draft) }, "layout");
+  if (!editor || pending("layout")) return;
+  saving = request("layout", { [editor.kind]: isOwn ? null : editor.stated(draft) }, "layout");
   refresh();
 }
 
 function reset() {
-  if (store.hello) setDraft(completed(cameras(), store.hello.layout.own), true);
+  if (editor) setDraft(editor.own(), true);
 }
 
 /** Leave editing once the layout is saved; a refusal keeps the draft. */
@@ -74,99 +93,63 @@ function refresh() {
 // --- the draft --------------------------------------------------------------------------------------------------------
 
 function setDraft(next, own) {
+  if (!editor) return;
   const focused = [...movers.values()].find((mover) => mover === document.activeElement);
   draft = next;
   isOwn = own;
-  showDraft(next);
-  grid()?.append(target);
+  editor.show(draft);
   for (const [name, mover] of movers) describe(name, mover);
   focused?.focus({ preventScroll: true }); // moving its tile drops the focus
 }
 
-/** The element with the tiles. */
-const grid = () => byId("tiles").querySelector(".grid");
-
-function placeText(name) {
-  const { row, column, row_span, column_span } = place(name);
-  return `row ${row + 1}, column ${column + 1}, ${row_span} high, ${column_span} wide`;
-}
+const placeText = (name) => editor?.text(draft, name) ?? "";
 
 function describe(name, mover) {
   setAttribute(mover, "aria-label", `${displayName(name)}: ${placeText(name)}`);
   setText(mover.firstChild, placeText(name));
 }
 
-/** @returns {import("./layout.js").Place} */
-const place = (name) => /** @type {any} */ (draft)[name];
-
-function move(name, row, column) {
-  setDraft(moved(/** @type {any} */ (draft), name, row, column), false);
-  announce(`${displayName(name)}: ${placeText(name)}`);
-}
-
-function resize(name, row_span, column_span) {
-  setDraft(resized(/** @type {any} */ (draft), name, row_span, column_span), false);
+function change(next, name) {
+  setDraft(next, false);
   announce(`${displayName(name)}: ${placeText(name)}`);
 }
 
 // --- keys and pointer -------------------------------------------------------------------------------------------------
 
 function addMover(name) {
-  const grip = make("span", { class: "grip", "aria-hidden": "true" });
-  const mover = make("button", { class: "mover", "data-mover": name, "aria-describedby": "layout-help" }, make("span", { class: "where" }), grip);
+  const mover = make("button", { class: "mover", "data-mover": name, "aria-describedby": "layout-help" }, make("span", { class: "where" }), make("span", { class: "grip", "aria-hidden": "true" }));
   mover.addEventListener("keydown", (event) => onKeyDown(event, name));
-  mover.addEventListener("pointerdown", (event) => drag(event, name, mover, event.target === grip));
+  mover.addEventListener("pointerdown", (event) => drag(event, name, mover));
   document.querySelector(`.tile[data-camera="${name}"]`)?.append(mover);
   movers.set(name, mover);
 }
 
 function onKeyDown(event, name) {
   if (event.key === "Escape") return end();
-  const step = STEPS[event.key];
-  if (!step || event.ctrlKey || event.altKey || event.metaKey) return;
+  const next = event.ctrlKey || event.altKey || event.metaKey ? undefined : editor?.pressed(draft, name, event);
+  if (next === undefined) return;
   event.preventDefault();
   event.stopPropagation(); // otherwise these keys select cameras
-  if (event.repeat) return;
-  const { row, column, row_span, column_span } = place(name);
-  if (event.shiftKey) resize(name, row_span + step[0], column_span + step[1]);
-  else move(name, row + step[0], column + step[1]);
+  if (!event.repeat) change(next, name);
 }
 
-/** Follow the pointer from press to release, then move or resize the tile. */
-function drag(event, name, mover, isGrip) {
-  if (event.button !== 0 || !draft) return;
-  const own = place(name);
-  const box = mover.parentElement.getBoundingClientRect();
-  const across = (box.width + GAP) / own.column_span; // from one column to the next
-  const down = (box.height + GAP) / own.row_span;
-  const { rows, columns } = sizeOf(draft);
-  const placeAt = (at) => {
-    const [x, y] = [(at.clientX - event.clientX) / across, (at.clientY - event.clientY) / down];
-    if (isGrip) return { ...own, row_span: clamped(own.row_span + y, 1, rows + 1 - own.row), column_span: clamped(own.column_span + x, 1, columns + 1 - own.column) };
-    return { ...own, row: clamped(own.row + y, 0, rows), column: clamped(own.column + x, 0, columns) };
-  };
-  const onMove = (at) => {
-    const { row, column, row_span, column_span } = placeAt(at);
-    target.hidden = false;
-    target.style.gridArea = `${row + 1} / ${column + 1} / span ${row_span} / span ${column_span}`;
-  };
+/** Follow the pointer from press to release. */
+function drag(press, name, mover) {
+  if (press.button !== 0 || !editor) return;
+  const { over, drop } = editor.drag(draft, name, mover, press);
   const onRelease = (at) => {
     for (const [kind, listener] of Object.entries(listeners)) mover.removeEventListener(kind, listener);
-    target.hidden = true;
-    if (at.type !== "pointerup" || !draft) return;
-    const { row, column, row_span, column_span } = placeAt(at);
-    if (isGrip) resize(name, row_span, column_span);
-    else move(name, row, column);
+    over(null);
+    if (at.type === "pointerup" && editor) change(drop(at), name);
   };
-  const listeners = { pointermove: onMove, pointerup: onRelease, pointercancel: onRelease };
+  const listeners = { pointermove: over, pointerup: onRelease, pointercancel: onRelease };
   for (const [kind, listener] of Object.entries(listeners)) mover.addEventListener(kind, listener);
-  mover.setPointerCapture(event.pointerId);
+  mover.setPointerCapture(press.pointerId);
 }
 
-const clamped = (value, least, most) => Math.max(least, Math.min(most, Math.round(value)));
-
 export function startEdit() {
-  byId("edit-layout").addEventListener("click", begin);
+  for (const [id, chosen] of /** @type {[string, Editor][]} */ ([["edit-layout", GRID], ["edit-drive", DRIVE]]))
+    byId(id).addEventListener("click", () => begin(chosen, byId(id)));
   byId("layout-save").addEventListener("click", save);
   byId("layout-reset").addEventListener("click", reset);
   byId("layout-cancel").addEventListener("click", end);

@@ -30,8 +30,8 @@ let sampledAt = -Infinity; // page time of the last sample
  * @typedef {{vehicle: string, cameras: Camera[], layout: Layout, selected: string|null, dimensions: import("./guides.js").Dimensions|null, inputs: Inputs, operator: string|null, answer_s: number, late_ms: number}} Hello selected: in another window of this page; operator: this station's by its keys; answer_s: the station
  *   answers a request within this time; late_ms: a picture older than this is late
  * @typedef {{keys: Record<string, string|null>, buttons: Record<string, number|string|null>}} Inputs by action
- * @typedef {{places: Places, own: Places, problem: string|null}} Layout of the Configure view: places in force, the vehicle's own,
- *   and why a layout cannot be saved
+ * @typedef {{places: Places, own: Places, drive: import("./placing.js").Places|null, problem: string|null}} Layout of the Configure
+ *   view: places in force, and the vehicle's own; saved places of the Drive view; and why a layout cannot be saved
  * @typedef {import("./layout.js").Places} Places
  * @typedef {object} Applied the values read back from the elements
  * @property {boolean} [sending]

@@ -36,7 +36,9 @@ let bands = [];
 let camerasKey = ""; // the cameras that the tiles were built for
 let bandsKey = ""; // the bands that they were grouped into
 /** @type {Record<string, import("./layout.js").Place>|null} */
-let draft = null; // the layout that is being edited
+let draft = null; // the layout of the Configure view that is being edited
+/** @type {import("./placing.js").Places|null} */
+let driveDraft = null; // likewise of the Drive view
 const spoken = new Map(); // by camera, alarms that are about to be spoken
 let wasHinted = false; // whether the hint on how to leave an enlarged picture was shown
 
@@ -51,7 +53,7 @@ function build({ cameras, dimensions }) {
   if (key !== camerasKey) {
     camerasKey = key;
     bandsKey = "";
-    draft = null;
+    draft = driveDraft = null;
     sizes.disconnect();
     tiles.clear();
     cameras.forEach(buildTile);
@@ -65,6 +67,16 @@ export function showDraft(places) {
   draft = places;
   groupTiles();
 }
+
+/** Likewise in the Drive view. */
+export function showDriveDraft(places) {
+  driveDraft = places;
+  layOut();
+}
+
+/** The cameras by their role in the Drive view. */
+export const driveRoles = () => rolesOf(store.hello?.cameras ?? [], drivePlaces());
+const drivePlaces = () => driveDraft ?? store.hello?.layout.drive ?? null;
 
 /** Put the tiles into bands. */
 function groupTiles() {
@@ -140,7 +152,7 @@ export function switchCamera(name) {
 // --- layout -----------------------------------------------------------------------------------------------------------
 
 function layOut() {
-  drawFirst(store.enlarged ?? rolesOf(store.hello?.cameras ?? []).front?.name ?? null);
+  drawFirst(store.enlarged ?? driveRoles().front?.name ?? null);
   if (store.view === "drive") return layOutDrive();
   placeBirdseye(undefined);
   for (const [name, { element }] of tiles) {
@@ -172,7 +184,8 @@ function layOutBands() {
 
 /** Place each camera by its direction; the enlarged one swaps places with the front camera. */
 function layOutDrive() {
-  const { band, mirror, pictures } = arrange(store.hello?.cameras ?? [], area.clientWidth, area.clientHeight, store.enlarged, birdseyeSize());
+  const birdseye = driveDraft ? null : birdseyeSize(); // it would hide the top views
+  const { band, mirror, pictures } = arrange(store.hello?.cameras ?? [], area.clientWidth, area.clientHeight, store.enlarged, birdseye, drivePlaces());
   byId("drive").style.height = `${band.height}px`;
   byId("drive").style.setProperty("--mirror", `${mirror.width}px`);
   placeBirdseye(pictures.get(BIRDSEYE));
