@@ -140,10 +140,20 @@ class Broker:
         """Report a refused client. Its address is that of the newest connection, unless the line states it."""
         if connected := CONNECTED.match(line):
             self._newest = connected["address"]
-        elif (refused := REFUSED.match(line)) and LEFT not in line:
-            why = refused["failed"] or refused["tls"] or refused["why"]
-            address = refused["address"] or self._newest
-            self._report(f"the MQTT broker refused a client at {address}: {why}", address)
+        elif refused := refusal(line):
+            address = refused[0] or self._newest
+            self._report(f"the MQTT broker refused a client at {address}: {refused[1]}", address)
+
+
+def refusal(line: str) -> tuple[str | None, str] | None:
+    """The address, if stated, and the reason of a line about a refused client; None: it is about none.
+
+    mosquitto has two wordings for the same reason: it depends on whether the client's first bytes come at once.
+    """
+    refused = REFUSED.match(line)
+    if refused is None or LEFT in line:
+        return None
+    return refused["address"], (refused["failed"] or refused["tls"] or refused["why"]).rstrip(".")
 
 
 @contextmanager
