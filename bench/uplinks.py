@@ -293,15 +293,20 @@ def _recovery_s(over_time: Series, t: Floats, kbps: Floats) -> float:
 
 
 def _wait(camera: CameraSeries, since: float) -> float:
-    """Time until an undamaged picture arrives that was captured since then, s; inf: never."""
+    """Time until an undamaged picture has arrived that was captured since then, at most, s; inf: never.
+
+    A sample counts damaged pictures: of one more than these, one is undamaged.
+    """
     got = camera.received
     if got is None:
         return np.inf
     arrived = got.arrival_t[got.arrival_t - got.arrival_ms / 1000 >= since]
     sample = np.searchsorted(got.t, arrived)  # the one that counts the picture
-    arrived, sample = arrived[sample < len(got.t)], sample[sample < len(got.t)]
-    whole = arrived[got.damaged[sample] == got.damaged[np.maximum(sample - 1, 0)]]
-    return float(whole[0] - since) if len(whole) else np.inf
+    for number in np.unique(sample[sample < len(got.t)]):
+        damaged = got.damaged[number] - got.damaged[max(number - 1, 0)]
+        if (sample == number).sum() > damaged:
+            return float(arrived[sample == number][int(damaged)] - since)
+    return np.inf
 
 
 def _outages(t: Floats, kbps: Floats) -> Iterator[float]:

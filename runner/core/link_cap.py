@@ -280,7 +280,9 @@ def _adapt_overuse(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
     rose = limit > known.kbps > 0
     cap = cap._replace(limit=LastLimit(limit, t, known.kbps) if rose else known._replace(kbps=limit))
     if cap.predicted and known.kbps >= OUTAGE * limit:
-        return cap._replace(outage=PredictedOutage(t, limit, cap.outage.overuse if cap.outage else last))
+        is_late = last is not None and last.fell and t - last.t <= LATE_S  # that overuse already was the outage's
+        before = cap.outage.overuse if cap.outage else None if is_late else last
+        return cap._replace(outage=PredictedOutage(t, limit, before))
     if cap.outage and (t - cap.outage.t > OUTAGE_S or not cap.predicted):
         cap = cap._replace(outage=None)
     elif cap.outage and limit >= OUTAGE * cap.outage.limit:
