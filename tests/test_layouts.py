@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +58,15 @@ def test_other_vehicles_stay_as_they_are_and_a_vehicle_can_be_forgotten(tmp_path
     assert Layouts(tmp_path).places(car) == own_places(car)
 
 
+def check_problem(problem: str | None, expected: str | None, directory: Path, save: Callable[[], None]) -> None:
+    """The problem is the expected one, and places that have one are not saved."""
+    assert problem == expected if expected is None else expected in str(problem)
+    if expected:
+        with pytest.raises(UserError):
+            save()
+        assert list(directory.iterdir()) == []
+
+
 DRIVE = {"front": "mast", "left": "front", "row": ["rear"]}
 
 
@@ -93,12 +103,8 @@ def test_places_in_the_drive_view_are_saved_beside_those_in_the_configure_view(t
 def test_places_in_the_drive_view_are_checked(
     robot: Vehicle, tmp_path: Path, document: Any, expected: str | None
 ) -> None:
-    problem = drive_places_problem(robot, document)
-    assert problem == expected if expected is None else expected in str(problem)
-    if expected:
-        with pytest.raises(UserError):
-            Layouts(tmp_path, "alice").save_drive(robot, document)
-        assert list(tmp_path.iterdir()) == []
+    save = Layouts(tmp_path, "alice").save_drive
+    check_problem(drive_places_problem(robot, document), expected, tmp_path, lambda: save(robot, document))
 
 
 def test_changes_made_by_the_user_meanwhile_are_kept_or_reported(tmp_path: Path, robot: Vehicle) -> None:
@@ -161,12 +167,8 @@ PLACE = {"row": 0, "column": 0}
     ],
 )
 def test_places_from_a_page_are_checked(robot: Vehicle, tmp_path: Path, document: Any, expected: str | None) -> None:
-    problem = places_problem(robot, document)
-    assert problem == expected if expected is None else expected in str(problem)
-    if expected:
-        with pytest.raises(UserError):
-            Layouts(tmp_path, "alice").save(robot, document)
-        assert list(tmp_path.iterdir()) == []
+    save = Layouts(tmp_path, "alice").save
+    check_problem(places_problem(robot, document), expected, tmp_path, lambda: save(robot, document))
 
 
 def test_a_saved_place_of_a_removed_camera_is_reported(tmp_path: Path, robot: Vehicle) -> None:

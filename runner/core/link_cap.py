@@ -300,8 +300,8 @@ def _end_outage(cap: LinkCap, t: float, limit: Kbps, before: Overuse | None) -> 
     All of it at once would fill the queue of a link that recovers gradually. While nothing arrives, the cap stays, and
     the first report restores as much.
     """
-    carried = min(limit * cap.trust.share, before.known(limit) if before else limit)
-    overuse = before and _known_now(before, before.known(limit), limit)
+    known = before.known(limit) if before else limit
+    carried, overuse = min(limit * cap.trust.share, known), before and _known_now(before, known, limit)
     cap = cap._replace(outage=None, resumed=t, overuse=overuse, before=carried)
     if cap.stall:
         return cap
