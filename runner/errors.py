@@ -10,6 +10,8 @@ from typing import Any
 
 from runner.redact import printable
 
+COMMAND_LINE = "command line"  # in place of a file
+
 
 @dataclass(frozen=True, slots=True)
 class Problem:
@@ -46,7 +48,7 @@ class ArgumentError(UserError):
 
     def __init__(self, name: str, found: object, rule: str) -> None:
         shown = found if found is None or isinstance(found, str) else repr(str(found))
-        super().__init__("command line", name, shown, rule)
+        super().__init__(COMMAND_LINE, name, shown, rule)
 
 
 class ConfigError(UserError):

@@ -97,7 +97,7 @@ def test_places_in_the_drive_view_are_saved_beside_those_in_the_configure_view(t
         ({"front": "mast", "middle": "rear"}, "middle: unknown key"),
         ({"front": "mast", "row": "rear"}, "row: 'rear': must be a list"),
         ({"front": "fornt", "row": ["x"]}, "'fornt': unknown camera, did you mean front?; 'x': unknown camera"),
-        ({**DRIVE, "row": ["mast", "front"]}, "must have one place for each camera, but mast, front has several"),
+        ({**DRIVE, "row": ["mast", "front"]}, "must have one place for each camera; has several for mast, front"),
     ],
 )
 def test_places_in_the_drive_view_are_checked(
@@ -214,7 +214,7 @@ drive:
     assert sorted(found) == [
         "~/layout/a,b.yaml: would be ignored: no operator can have this name",
         "~/layout/alice.yaml: drive.bus.front: missing: must be given",
-        "~/layout/alice.yaml: drive.van: must have one place for each camera, but a has several",
+        "~/layout/alice.yaml: drive.van: must have one place for each camera; has several for a",
         "~/layout/alice.yaml: vehicles.delivery_robot.mast.column: missing: must be given",
         '~/layout/alice.yaml: vehicles.van.rear: {"row": 1, "column": 0}: overlaps the place of camera front',
         "~/layout/alice.yaml: vehicles: 'my van': must be letters, digits, _ and - only",

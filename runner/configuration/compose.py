@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any, cast
 from runner import schema
 from runner.configuration.files import GROUPS, bases_of, chosen_by, conf_directories, defaults, find_file, options
 from runner.configuration.origin import PICKED, Composed, Part, nested
-from runner.configuration.overrides import COMMAND_LINE, Override, choice_problems, parse_overrides
+from runner.configuration.overrides import Override, choice_problems, parse_overrides
 from runner.configuration.resolve import resolved
 from runner.configuration.yaml_file import label, load_file, read
 from runner.core.model import suggest
-from runner.errors import ConfigError, Problem
+from runner.errors import COMMAND_LINE, ConfigError, Problem
 from runner.resources import directory
 
 if TYPE_CHECKING:

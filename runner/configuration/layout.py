@@ -165,7 +165,7 @@ def _unknown(vehicle: Vehicle, names: Iterable[str]) -> str | None:
 def _twice(places: DrivePlaces) -> str | None:
     """The cameras with more than one place in the Drive view; None: there are none."""
     twice = [name for name, count in Counter(_cameras(places)).items() if count > 1]
-    return f"must have one place for each camera, but {', '.join(twice)} has several" if twice else None
+    return f"must have one place for each camera; has several for {', '.join(twice)}" if twice else None
 
 
 def _cameras(places: DrivePlaces) -> list[str]:

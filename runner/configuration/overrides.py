@@ -13,13 +13,12 @@ from runner import schema
 from runner.configuration.files import GROUPS, options
 from runner.configuration.yaml_file import label
 from runner.core.model import suggest
-from runner.errors import ConfigError, Problem
+from runner.errors import COMMAND_LINE, ConfigError, Problem
 
 if TYPE_CHECKING:
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.core.override_parser.types import Override as HydraOverride
 
-COMMAND_LINE = "command line"
 OPTIONAL = ("link", "experiment")  # groups that need no choice
 LONGEST_WORD = 4096  # characters of an override, as for a path
 DEEPEST = 32  # brackets of one kind in an override

@@ -412,7 +412,7 @@ def _is_below_floors(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) ->
     if _in_force(cap, limit) > cap.floors:
         return False
     assert link.kbps is not None
-    drops = (link.loss or 0) > LOSSY  # the queue of the link itself may be short
+    drops = _is_lossy(link)  # the queue of the link itself may be short
     held_s, sent = t - (cap.changed if drops else max(cap.changed, cap.short)), _sent(cap, limit)
     tiers = NARROW if drops else NARROW_FLOORS
     is_proof = any(held_s >= least_s and link.kbps < share * sent for least_s, share in tiers)
@@ -439,14 +439,15 @@ def _is_contested(cap: LinkCap) -> bool:
     return cap.alone and len(cap.proofs.times) == OFTEN
 
 
-def _yielded(cap: LinkCap, t: float) -> Fraction:
+def _yielded(cap: LinkCap, link: LinkMeasured, t: float) -> Fraction:
     """The share of the most that arrived, below which the cameras do not yield; less after EASED_S of a long queue.
 
     If the link fell to just that share, the cameras' own queue would never drain. Not on a contested link, whose queue
-    others keep full: some cameras would fall below their floors.
+    others keep full: some cameras would fall below their floors. There it falls by a third over BURST_S instead.
     """
-    has_fallen = t - cap.short >= EASED_S and not _is_contested(cap)
-    return YIELDED * EASED if has_fallen else YIELDED
+    if _is_contested(cap):
+        return YIELDED * (CONTESTED + (1 - CONTESTED) * _burst(cap, link, t))
+    return YIELDED * EASED if t - cap.short >= EASED_S else YIELDED
 
 
 def _burst(cap: LinkCap, link: LinkMeasured, t: float) -> Fraction:
@@ -459,6 +460,17 @@ def _burst(cap: LinkCap, link: LinkMeasured, t: float) -> Fraction:
 
 def _is_short(link: LinkMeasured) -> bool:
     return (link.queue_ms or 0) < JITTER_MS
+
+
+def _is_lossy(link: LinkMeasured) -> bool:
+    """Whether the full queue drops packets, which hides its true length."""
+    return (link.loss or 0) > LOSSY
+
+
+def _drained(link: LinkMeasured, carried: Kbps) -> Kbps:
+    """Low enough to drain the queue of a link that carries this much."""
+    drain = 1 - exact(link.queue_ms or 0) / DRAIN_MS
+    return carried * (DEEPEST if _is_lossy(link) else max(DEEPEST, min(SHALLOWEST, drain)))
 
 
 def _may_be_jitter(cap: LinkCap, link: LinkMeasured) -> bool:
@@ -487,24 +499,20 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps, kn
     known  what the link is known to carry under it, although less arrives
     """
     assert link.kbps is not None
-    drain = 1 - exact(link.queue_ms or 0) / DRAIN_MS
-    lossy = (link.loss or 0) > LOSSY  # the full queue drops packets, which hides its true length
     carried = link.kbps
-    target = carried * (DEEPEST if lossy else max(DEEPEST, min(SHALLOWEST, drain)))
-    is_proof = lossy or _is_narrow(cap, link, t, limit)
+    is_proof = _is_lossy(link) or _is_narrow(cap, link, t, limit)
     if is_proof and cap.alone:
         cap = _note_proof(cap, link, t, limit)
-    most, burst = min(cap.most.kbps, limit), _burst(cap, link, t)
-    if is_proof and not burst:
+    most = min(cap.most.kbps, limit)
+    if is_proof and not _burst(cap, link, t):
         most = min(most, PROVEN * carried)
-    target = max(target, _yielded(cap, t) * most * (CONTESTED + (1 - CONTESTED) * burst if _is_contested(cap) else 1))
-    settled, seen = t - cap.changed >= SETTLE_S + _rtt_s(link), _limit_seen(cap, link, t, full)
-    lasting = t - cap.resumed < BEGIN_S and full >= OUTAGE * carried  # for longer than predicted
-    in_outage = cap.predicted and (full >= OUTAGE * seen or lasting)
+    target = max(_drained(link, carried), _yielded(cap, link, t) * most)
+    in_outage = _is_of_outage(cap, link, t, full)
     if cap.provisional or in_outage:  # not all cameras may have started, so a low rate proves little
         target = max(target, DEEPEST * _in_force(cap, limit))
     if not (below := _is_below_floors(cap, link, t, limit)):
         target = max(target, cap.floors)
+    settled, seen = t - cap.changed >= SETTLE_S + _rtt_s(link), _limit_seen(cap, link, t, full)
     if target >= _in_force(cap, limit) or not (settled or (link.queue_ms or 0) > cap.queue_ms):
         lowered = cap if in_outage else _lower_known(cap, max(carried, known * seen / full), link, t, seen)
         return _raise_known(lowered, link, t, full)
@@ -530,6 +538,12 @@ def _overuse(last: Overuse | None, t: float, carried: Kbps, limit: Kbps) -> Over
 def _limit_seen(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> Kbps:
     """The limit under which a rate was measured: after a rise, for some time the one before."""
     return cap.limit.before if _is_recent(cap.limit.t, link, t) else limit
+
+
+def _is_of_outage(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> bool:
+    """Whether a rate was measured in a predicted outage, or while one lasts for longer than predicted."""
+    lasts = t - cap.resumed < BEGIN_S and limit >= OUTAGE * (link.kbps or 0)
+    return cap.predicted and (lasts or limit >= OUTAGE * _limit_seen(cap, link, t, limit))
 
 
 def _lower_known(cap: LinkCap, carried: Kbps, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:

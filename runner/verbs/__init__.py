@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from runner.configuration.files import GROUPS
 from runner.core.model import suggest
-from runner.errors import ArgumentError, UserError
+from runner.errors import COMMAND_LINE, ArgumentError, UserError
 from runner.schema import schema_document
 
 DRIVE = "DRIVE"  # stands for the directory of a drive in the usage
@@ -178,7 +178,7 @@ class Arguments:
                 and for a word that is not UTF-8
         """
         for word in words:
-            _check_utf8("command line", "", word)
+            _check_utf8(COMMAND_LINE, "", word)
         own = (*VERBS[verb].arguments, "conf")
         sweeps = VERBS[verb].sweeps and "-m" in words
         words = [word for word in words if not (sweeps and word == "-m")]

@@ -31,9 +31,9 @@ from runner.configuration.camera_list import (
     read_camera_list,
     vehicle_text,
 )
-from runner.configuration.overrides import COMMAND_LINE, choosable
+from runner.configuration.overrides import choosable
 from runner.core.model import ModelError, exact
-from runner.errors import ArgumentError, ConfigError, Problem
+from runner.errors import COMMAND_LINE, ArgumentError, ConfigError, Problem
 from runner.system.files import write_whole
 from runner.verbs import Arguments
 

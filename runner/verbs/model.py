@@ -33,7 +33,7 @@ from runner.bag import PICTURES, Bag, is_bag
 from runner.configuration.config import configuration
 from runner.configuration.files import conf_directories, options
 from runner.core.model import BagTopic, ModelError, Vehicle, suggest
-from runner.errors import ArgumentError, ConfigError, Problem
+from runner.errors import COMMAND_LINE, ArgumentError, ConfigError, Problem
 from runner.system import signals
 from runner.system.extras import require
 from runner.verbs import Arguments, study_word
@@ -121,7 +121,7 @@ def _sequences(arguments: Arguments, vehicle: Vehicle, names: Sequence[str]) -> 
             found[name] = clips[0]
         else:
             rule = f"{len(clips)} files are named {name}.*, must be exactly one"
-            problems.append(Problem("command line", "sequence", repr(str(given)), rule))
+            problems.append(Problem(COMMAND_LINE, "sequence", repr(str(given)), rule))
     if problems:
         raise ConfigError(problems)
     return found
@@ -140,7 +140,7 @@ def _topics(path: Path, vehicle: Vehicle, names: Sequence[str]) -> Mapping[str, 
             found[name] = BagTopic(str(path), topic)
         except ModelError as error:
             at = f"cameras.{name}.topic" if error.key == "topic" else "sequence"
-            problems.append(Problem("command line", at, str(error.found), error.rule))
+            problems.append(Problem(COMMAND_LINE, at, str(error.found), error.rule))
     if problems:
         raise ConfigError(problems)
     return found

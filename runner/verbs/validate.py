@@ -40,10 +40,10 @@ from runner.configuration.combinations import Combinations, reaches, words_of
 from runner.configuration.compose import compose
 from runner.configuration.config import Configuration
 from runner.configuration.files import GROUPS, LAYOUT, bases_of, built_on, conf_directories, find_file, options
-from runner.configuration.overrides import COMMAND_LINE, choosable
+from runner.configuration.overrides import choosable
 from runner.configuration.yaml_file import label, load_file, load_node
 from runner.core.model import ModelError, suggest
-from runner.errors import ArgumentError, ConfigError, MissingBindings, Problem
+from runner.errors import COMMAND_LINE, ArgumentError, ConfigError, MissingBindings, Problem
 from runner.graph import Plan
 from runner.verbs import Arguments
 
