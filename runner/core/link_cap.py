@@ -132,11 +132,13 @@ class Most(NamedTuple):
 
 
 class LastLimit(NamedTuple):
-    """The last limit, before doubts, kbit/s; when it last rose (t), and the limit before that."""
+    """The last limit, before doubts, kbit/s; when it last rose (t), and the limit before that; when it last fell."""
 
     kbps: Kbps
     t: float
     before: Kbps
+    fell: float = -float("inf")
+    above: Kbps = Fraction(0)
 
 
 NOTHING, NONE_LOST = Most(Fraction(0), -float("inf")), Losses(0.0, -float("inf"))
@@ -266,9 +268,9 @@ def _fall_with_limit(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
     if last.fell and t - last.t <= LATE_S:
         return cap
     in_force = min(before, cap.kbps)
-    return cap._replace(
-        kbps=_short(min(in_force, max(in_force * limit / before, RESERVE * min(limit, last.known(limit)))))
-    )
+    scaled, known = in_force * limit / before, min(limit, last.known(limit))
+    is_refuted = scaled * FELL > known  # by what has been sent since without overuse
+    return cap._replace(kbps=_short(scaled if is_refuted else min(in_force, RESERVE * known)))
 
 
 def _adapt_overuse(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
@@ -277,8 +279,12 @@ def _adapt_overuse(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
     After an outage the link is expected to carry the same share of the limit as before it.
     """
     known, last = cap.limit, cap.overuse
-    rose = limit > known.kbps > 0
-    cap = cap._replace(limit=LastLimit(limit, t, known.kbps) if rose else known._replace(kbps=limit))
+    if limit > known.kbps > 0:
+        cap = cap._replace(limit=known._replace(kbps=limit, t=t, before=known.kbps))
+    elif limit < known.kbps:
+        cap = cap._replace(limit=known._replace(kbps=limit, fell=t, above=known.kbps))
+    else:
+        cap = cap._replace(limit=known._replace(kbps=limit))
     if cap.predicted and known.kbps >= OUTAGE * limit:
         is_late = last is not None and last.fell and t - last.t <= LATE_S  # that overuse already was the outage's
         before = cap.outage.overuse if cap.outage else None if is_late else last
@@ -561,6 +567,8 @@ def _raise_known(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> Lin
     bursts, and a measurement may include a pause between them.
     """
     last = cap.overuse
+    if cap.predicted and _is_recent(cap.limit.fell, link, t):
+        limit = max(limit, cap.limit.above)
     if last is None or link.kbps is None or link.kbps <= (known := last.known(limit)):
         return cap
     if _is_recent(last.t, link, t):

@@ -656,10 +656,15 @@ def test_both_views_fit_every_screen(chromium, picture, tmp_path, owner):
                     page.evaluate(ALL_AS, status)
                     assert boxes(page)[1] == FITS, (status, view, width, height)
                 page.evaluate(ALL_AS, "live")
-                for tab in ("latency", "charts", "map", "camera") if view == "configure" else ():
+                if view == "drive":
+                    page.click("#drawer")
+                    shot(page, f"{owner}-drawer-{width}")
+                for tab in ("latency", "charts", "map", "camera"):
                     if page.locator(f"#tab-{tab}").is_visible():
                         page.click(f"#tab-{tab}")
-                        assert boxes(page)[1] == FITS, (tab, width, height)
+                        assert boxes(page)[1] == FITS, (tab, view, width, height)
+                if view == "drive":
+                    page.click("#drawer")
                 page.keyboard.press("?")
                 shot(page, f"{owner}-help-{width}")
                 assert boxes(page)[1] == FITS, ("help", width, height)
