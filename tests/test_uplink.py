@@ -455,7 +455,7 @@ def test_the_end_of_a_predicted_outage_releases_no_more_than_half_of_the_rate_at
 def test_a_link_that_is_poor_for_long_is_known_by_what_it_carries() -> None:
     known = Overuse(1, Fraction(4000), Fraction(4000))
     cap = LinkCap(kbps=Fraction(4000), overuse=known, predicted=True, measured=99)
-    cap = cap._replace(limit=LastLimit(Fraction(4000), 1, Fraction(0)))
+    cap = cap._replace(limit=LastLimit(Fraction(4000), rose=1.0))
 
     def under(cap: LinkCap, t: float, limit: float) -> LinkCap:
         return update_cap(
@@ -512,7 +512,7 @@ def capped(carried: float, limit: float, kbps: float, t: float = 10.0, **other: 
     """The cap of a link that proved at t to carry so much of its limit."""
     overuse = Overuse(t, Fraction(carried), Fraction(limit))
     state: dict[str, object] = {"changed": t, "measured": t, "short": t, "began": 0.0, "predicted": True}
-    return LinkCap(kbps=Fraction(kbps), overuse=overuse, limit=LastLimit(Fraction(limit), 0.0, Fraction(0)))._replace(
+    return LinkCap(kbps=Fraction(kbps), overuse=overuse, limit=LastLimit(Fraction(limit), rose=0.0))._replace(
         **{**state, **other}  # type: ignore[arg-type]
     )
 
@@ -557,6 +557,21 @@ def test_a_rate_that_is_measured_under_another_prediction_keeps_their_ratio() ->
     rise = ((10.24, "draining", 3300, 40), (10.36, "draining", 3900, 30))
     clear = [(10.44 + n * 0.04, "clear", 2400, 0) for n in range(20)]
     assert max(reported(cap, 5700, *rise, *clear)) <= 4000
+
+
+def test_a_rate_that_was_measured_before_the_prediction_fell_does_not_raise_the_known_capacity() -> None:
+    """Link and prediction have fallen by a quarter; what arrived before that still shows in the next reports."""
+    cap = capped(4000, 5700, 3680)
+    before = ((10.24, "draining", 4000, 40), (10.36, "draining", 3800, 30))
+    clear = [(10.5 + n * 0.04, "clear", 2700, 0) for n in range(20)]
+    assert max(reported(cap, 4275, *before, *clear)) <= 2760
+
+
+def test_careful_increases_end_when_the_prediction_falls() -> None:
+    known = capped(4000, 5700, 4100)
+    assert reported(known, 4275, (10.6, "clear", 3900, 0)) == [2760], "0.92 of what the link is known to carry"
+    outdated = capped(4000, 5700, 5200)
+    assert reported(outdated, 4275, (10.6, "clear", 5000, 0)) == [3900], "it carries more than was known"
 
 
 def test_a_prediction_that_falls_soon_after_it_proved_too_high_was_not_late() -> None:

@@ -132,19 +132,27 @@ class Most(NamedTuple):
 
 
 class LastLimit(NamedTuple):
-    """The last limit, before doubts, kbit/s; when it last rose (t), and the limit before that; when it last fell."""
+    """The last limit, before doubts, kbit/s; when it last rose and fell, and the limits before that."""
 
-    kbps: Kbps
-    t: float
-    before: Kbps
+    kbps: Kbps = Fraction(0)
+    rose: float = -float("inf")
+    before_rise: Kbps = Fraction(0)
     fell: float = -float("inf")
-    above: Kbps = Fraction(0)
+    before_fall: Kbps = Fraction(0)
+
+    def followed_by(self, limit: Kbps, t: float) -> LastLimit:
+        """The next limit, at time t. Falls in quick succession count as one."""
+        if 0 < self.kbps < limit:
+            return self._replace(kbps=limit, rose=t, before_rise=self.kbps)
+        if limit < self.kbps:
+            highest = max(self.kbps, self.before_fall) if t - self.fell <= SEEN_S else self.kbps
+            return self._replace(kbps=limit, fell=t, before_fall=highest)
+        return self._replace(kbps=limit)
 
 
 NOTHING, NONE_LOST = Most(Fraction(0), -float("inf")), Losses(0.0, -float("inf"))
 NOT_LOWERED = Lowering(-float("inf"), Fraction(0))
 NO_PROOFS = Proofs((), Fraction(0), -float("inf"))
-NO_LIMIT = LastLimit(Fraction(0), -float("inf"), Fraction(0))
 
 
 class LinkCap(NamedTuple):
@@ -204,7 +212,7 @@ class LinkCap(NamedTuple):
     connected: float = -float("inf")
     provisional: bool = False
     losses: Losses = NONE_LOST
-    limit: LastLimit = NO_LIMIT
+    limit: LastLimit = LastLimit()
     short: float = -float("inf")
     lowering: Lowering = NOT_LOWERED
     proofs: Proofs = NO_PROOFS
@@ -260,7 +268,9 @@ def _handle_measurement(
 def _fall_with_limit(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
     """The cap when a prediction falls: a link that carries a constant share of it has fallen, too.
 
-    Not below what it is then known to carry, and not if the link has fallen before, and the prediction follows.
+    The cap falls to what is then known to be carried: careful increases end, too. If it has grown far beyond that, the
+    known capacity is outdated, and the cap keeps its share of the prediction. It does not fall if the link has fallen
+    before, and the prediction follows.
     """
     last, before = cap.overuse, cap.limit.kbps
     if not cap.predicted or cap.kbps is None or last is None or limit >= before:
@@ -268,9 +278,9 @@ def _fall_with_limit(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
     if last.fell and t - last.t <= LATE_S:
         return cap
     in_force = min(before, cap.kbps)
-    scaled, known = in_force * limit / before, min(limit, last.known(limit))
-    is_refuted = scaled * FELL > known  # by what has been sent since without overuse
-    return cap._replace(kbps=_short(scaled if is_refuted else min(in_force, RESERVE * known)))
+    same_share, known = in_force * limit / before, min(limit, last.known(limit))
+    is_outdated = known < FELL * same_share
+    return cap._replace(kbps=_short(same_share if is_outdated else min(in_force, RESERVE * known)))
 
 
 def _adapt_overuse(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
@@ -279,12 +289,7 @@ def _adapt_overuse(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
     After an outage the link is expected to carry the same share of the limit as before it.
     """
     known, last = cap.limit, cap.overuse
-    if limit > known.kbps > 0:
-        cap = cap._replace(limit=known._replace(kbps=limit, t=t, before=known.kbps))
-    elif limit < known.kbps:
-        cap = cap._replace(limit=known._replace(kbps=limit, fell=t, above=known.kbps))
-    else:
-        cap = cap._replace(limit=known._replace(kbps=limit))
+    cap = cap._replace(limit=known.followed_by(limit, t))
     if cap.predicted and known.kbps >= OUTAGE * limit:
         is_late = last is not None and last.fell and t - last.t <= LATE_S  # that overuse already was the outage's
         before = cap.outage.overuse if cap.outage else None if is_late else last
@@ -332,7 +337,7 @@ def start_cap(cap: LinkCap, link: LinkMeasured | None, since: float | None, limi
 def _reset(cap: LinkCap, limit: Kbps) -> LinkCap:
     """A new cap under a limit, which keeps only the places where limits proved too high, and what it is about."""
     trust = Trust(places=tuple(replace(place, near=False) for place in cap.trust.places))
-    known = NO_LIMIT._replace(kbps=limit)
+    known = LastLimit(kbps=limit)
     return LinkCap(trust=trust, connected=cap.connected, measured=cap.measured, predicted=cap.predicted, limit=known)
 
 
@@ -543,7 +548,7 @@ def _overuse(last: Overuse | None, t: float, carried: Kbps, limit: Kbps) -> Over
 
 def _limit_seen(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> Kbps:
     """The limit under which a rate was measured: after a rise, for some time the one before."""
-    return cap.limit.before if _is_recent(cap.limit.t, link, t) else limit
+    return cap.limit.before_rise if _is_recent(cap.limit.rose, link, t) else limit
 
 
 def _is_of_outage(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> bool:
@@ -564,11 +569,12 @@ def _raise_known(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> Lin
     """Raise the known capacity soon after an overuse, while its queue lasts, if more arrives than it.
 
     Likewise soon after a measurement that lowered it, but not above the value before. After a stall units arrive in
-    bursts, and a measurement may include a pause between them.
+    bursts, and a measurement may include a pause between them. Soon after the prediction fell, a rate may have been
+    measured under the one before.
     """
     last = cap.overuse
     if cap.predicted and _is_recent(cap.limit.fell, link, t):
-        limit = max(limit, cap.limit.above)
+        limit = max(limit, cap.limit.before_fall)
     if last is None or link.kbps is None or link.kbps <= (known := last.known(limit)):
         return cap
     if _is_recent(last.t, link, t):
