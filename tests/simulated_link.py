@@ -11,7 +11,8 @@ from fractions import Fraction
 from typing import Any
 
 from runner.core.events import LinkMeasured, PositionReported
-from runner.core.link_cap import UNCAPPED, LinkCap, believed_limit, start_cap, update_cap
+from runner.core.link_cap import believed_limit, start_cap, update_cap
+from runner.core.link_memory import UNCAPPED, LinkCap
 from runner.core.uplink import LinkEstimate, LinkReport, ReceivedUnit, UplinkMemory, estimate
 from runner.records import SentFrame
 from runner.vehicle.sending import SendingTimes

@@ -19,7 +19,8 @@ from simulated_link import Link, ShortFlows, busy, drive, jitter, stalls, steps,
 from soak import reports
 
 from runner.core.events import LinkMeasured, PositionReported
-from runner.core.link_cap import LEAST, LastLimit, LinkCap, Most, Overuse, follow, start_cap, update_cap
+from runner.core.link_cap import follow, start_cap, update_cap
+from runner.core.link_memory import LEAST, LastLimit, LinkCap, Most, Overuse
 from runner.core.trust import (
     KNOWN_S,
     METRES_PER_DEGREE,

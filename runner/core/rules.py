@@ -20,9 +20,6 @@ from runner.core.budget import video_kbps, wire_kbps
 from runner.core.decision import Decision, Draft, Setting
 from runner.core.events import LinkMeasured
 from runner.core.link_cap import (
-    LEAST,
-    UNCAPPED,
-    LinkCap,
     believed_limit,
     end_probe,
     follow,
@@ -33,6 +30,7 @@ from runner.core.link_cap import (
     start_cap,
     update_cap,
 )
+from runner.core.link_memory import LEAST, UNCAPPED, LinkCap
 from runner.core.model import Camera, Kbps, Mode, Vehicle, exact, plain
 from runner.core.state import State
 from runner.errors import RunError

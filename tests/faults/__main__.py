@@ -40,7 +40,7 @@ FAULTS = [
         "test_scaling",
     ),
     Fault("core/link_cap.py", "target = max(target, cap.floors)", "target = max(target, cap.reserve)", "test_uplink"),
-    Fault("core/link_cap.py", "limit >= OUTAGE * (link.kbps or 0)", "limit < 0", "test_uplink"),
+    Fault("core/link_capacity.py", "limit >= OUTAGE * (link.kbps or 0)", "limit < 0", "test_uplink"),
     Fault("configuration/overrides.py", "if str(override.value) not in known:", "if False:", "test_config"),
     Fault(
         "configuration/interpolation.py",
