@@ -15,21 +15,10 @@ from functools import cache
 from math import ceil, isfinite
 from typing import Any
 
-from runner.core import allocation, scaling
+from runner.core import allocation, link_cap, scaling
 from runner.core.budget import video_kbps, wire_kbps
 from runner.core.decision import Decision, Draft, Setting
 from runner.core.events import LinkMeasured
-from runner.core.link_cap import (
-    believed_limit,
-    end_probe,
-    follow,
-    is_fresh,
-    mark_idle,
-    probe,
-    raise_cap,
-    start_cap,
-    update_cap,
-)
 from runner.core.link_memory import LEAST, UNCAPPED, LinkCap
 from runner.core.model import Camera, Kbps, Mode, Vehicle, exact, plain
 from runner.core.state import State
@@ -370,23 +359,25 @@ def cap_by_link(
     cameras = [c for name, c in vehicle.cameras.items() if state.on[name] for _ in range(state.copies.get(name, 1))]
     limit, least = wire_kbps(cameras, draft.total), wire_kbps(cameras, max(LEAST, Fraction(len(cameras))))
     cap, link = memory.get("cap_by_link", UNCAPPED), _of_all_copies(vehicle, state)
-    alone = alone_after_s is not None and _is_stale(state, alone_after_s) and is_fresh(link, state.t)
+    alone = alone_after_s is not None and _is_stale(state, alone_after_s) and link_cap.is_fresh(link, state.t)
     if not cameras or state.operator_lost is not None or (draft.total < max(1, len(cameras)) and not alone):
-        cap = mark_idle(cap, state.t)
+        cap = link_cap.mark_idle(cap, state.t)
     else:
         if alone:
             most = sum((camera.rate_quality.b_full for camera in cameras), allocation.ZERO)
             draft, asked, limit = draft.replaced(measured=True, total=most), limit, wire_kbps(cameras, most)
-            cap = probe(cap, state.t, believed_limit(cap, asked, least_trust), limit)._replace(replaced=state.t)
+            cap = link_cap.probe(cap, state.t, link_cap.believed_limit(cap, asked, least_trust), limit)._replace(
+                replaced=state.t
+            )
         else:
-            cap = end_probe(cap)
-        cap = follow(cap, limit, state.mode is Mode.AUTOMATIC and not alone)
-        cap = start_cap(cap, link, state.operator_since, limit, start)
+            cap = link_cap.end_probe(cap)
+        cap = link_cap.follow(cap, limit, state.mode is Mode.AUTOMATIC and not alone)
+        cap = link_cap.start_cap(cap, link, state.operator_since, limit, start)
         cap = cap._replace(reserve=reserve_kbps, floors=_capped_floors(cameras, reserve_kbps))
-        cap = update_cap(cap, link, state.t, limit, least_trust, state.position)
-        cap = raise_cap(cap, least)  # with less, some cameras would not be sent, and so not measured
+        cap = link_cap.update_cap(cap, link, state.t, limit, least_trust, state.position)
+        cap = link_cap.raise_cap(cap, least)  # with less, some cameras would not be sent, and so not measured
     memory = {**memory, "cap_by_link": cap}
-    carried = believed_limit(cap, limit, least_trust)
+    carried = link_cap.believed_limit(cap, limit, least_trust)
     why = f"{float(cap.trust.share):.0%} of a prediction that proved too high"
     if cap.kbps is not None and cap.kbps - reserve_kbps < carried:
         carried = max(least, cap.kbps - reserve_kbps)

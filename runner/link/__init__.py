@@ -15,6 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict, replace
 
 from runner.core.model import Endpoint, suggest
 from runner.errors import RunError
@@ -97,14 +98,7 @@ class LimitedLink:
 
 def _sample(t: float, kbps: float, counters: LinkCounters) -> LinkSample:
     return LinkSample(
-        t=round(t, 3),
-        kbps=round(kbps, 3),
-        queue_ms=round(counters.queue_ms, 1),
-        bytes=counters.bytes,
-        packets=counters.packets,
-        dropped=counters.dropped,
-        lost=counters.lost,
-        tcp_bytes=counters.tcp,
+        **asdict(replace(counters, queue_ms=round(counters.queue_ms, 1))), t=round(t, 3), kbps=round(kbps, 3)
     )
 
 

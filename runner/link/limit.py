@@ -92,12 +92,12 @@ class Limit(OneWay):
 class LinkCounters:
     """Counters of a link since it was set up.
 
-    queue_ms  wait of a packet that arrives now
-    bytes     forwarded from vehicle to operator
-    packets   of these
-    dropped   packets that found the queue full
-    lost      packets lost after the queue
-    tcp       bytes that competing TCP flows have delivered
+    queue_ms   wait of a packet that arrives now
+    bytes      forwarded from vehicle to operator
+    packets    of these
+    dropped    packets that found the queue full
+    lost       packets lost after the queue
+    tcp_bytes  that competing TCP flows have delivered
     """
 
     queue_ms: float
@@ -105,7 +105,7 @@ class LinkCounters:
     packets: int
     dropped: int
     lost: int = 0
-    tcp: int = 0
+    tcp_bytes: int = 0
 
 
 class Shaper(Protocol):

@@ -86,7 +86,7 @@ async def main() -> None:
     loop = asyncio.get_running_loop()
     for source, direction, sink in ((far, link.up, here), (here, link.down, far)):
         loop.add_reader(source, read, source, direction, sink)
-    await take_rates(link, lambda: {"tcp": Sink.received})
+    await take_rates(link, lambda: {"tcp_bytes": Sink.received})
 
 
 if __name__ == "__main__":
