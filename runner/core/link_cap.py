@@ -132,16 +132,12 @@ def is_fresh(link: LinkMeasured | None, t: float) -> bool:
 
 def probe(cap: LinkCap, t: float, asked: Kbps, limit: Kbps) -> LinkCap:
     """The cap once only the measurement limits the total: it grows from the last total requested."""
+    cap = cap._replace(replaced=t)
     if cap.alone:
         return cap
     kbps = tenths(asked if cap.kbps is None else min(asked, cap.kbps))
     known = tenths(asked if cap.overuse is None else min(asked, cap.overuse.carried))
     return cap._replace(alone=True, kbps=kbps, overuse=Overuse(t, known, limit), steps=0, provisional=False)
-
-
-def end_probe(cap: LinkCap) -> LinkCap:
-    """The cap when the limit applies again; `follow` then relates the known capacity to it."""
-    return cap._replace(alone=False) if cap.alone else cap
 
 
 def follow(cap: LinkCap, limit: Kbps, is_prediction: bool) -> LinkCap:
@@ -150,11 +146,6 @@ def follow(cap: LinkCap, limit: Kbps, is_prediction: bool) -> LinkCap:
         return cap
     last, before = cap.overuse and cap.overuse._replace(limit=limit), cap.limit._replace(kbps=limit)
     return cap._replace(predicted=is_prediction, overuse=last, limit=before)
-
-
-def mark_idle(cap: LinkCap, t: float) -> LinkCap:
-    """The cap at time t when there is nothing to send: silence then, or soon after, is no stall."""
-    return cap._replace(idle=t)
 
 
 def _drained(link: LinkMeasured, carried: Kbps) -> Kbps:

@@ -46,8 +46,8 @@ class PredictedOutage(NamedTuple):
 class Lowering(NamedTuple):
     """When the capacity proved lower while no cut was due (t), and the capacity known before, kbit/s."""
 
-    t: float
-    known: Kbps
+    t: float = -float("inf")
+    known: Kbps = Fraction(0)
 
 
 class Proofs(NamedTuple):
@@ -57,9 +57,9 @@ class Proofs(NamedTuple):
     t     of the last proof; here losses with a short queue are proofs, too
     """
 
-    times: tuple[float, ...]
-    most: Kbps
-    t: float
+    times: tuple[float, ...] = ()
+    most: Kbps = Fraction(0)
+    t: float = -float("inf")
 
 
 class Stall(NamedTuple):
@@ -72,15 +72,15 @@ class Stall(NamedTuple):
 class Losses(NamedTuple):
     """Share of packets lost at the last measurement, and when it last rose (t)."""
 
-    share: float
-    t: float
+    share: float = 0.0
+    t: float = -float("inf")
 
 
 class Most(NamedTuple):
     """The most that arrived recently, kbit/s, and when it last decayed (t)."""
 
-    kbps: Kbps
-    t: float
+    kbps: Kbps = Fraction(0)
+    t: float = -float("inf")
 
 
 class LastLimit(NamedTuple):
@@ -100,11 +100,6 @@ class LastLimit(NamedTuple):
             highest = max(self.kbps, self.before_fall) if t - self.fell <= SEEN_S else self.kbps
             return self._replace(kbps=limit, fell=t, before_fall=highest)
         return self._replace(kbps=limit)
-
-
-NOTHING, NONE_LOST = Most(Fraction(0), -float("inf")), Losses(0.0, -float("inf"))
-NOT_LOWERED = Lowering(-float("inf"), Fraction(0))
-NO_PROOFS = Proofs((), Fraction(0), -float("inf"))
 
 
 class LinkCap(NamedTuple):
@@ -158,16 +153,16 @@ class LinkCap(NamedTuple):
     floors: Kbps = Fraction(0)
     below: bool = False
     trust: Trust = UNDOUBTED
-    most: Most = NOTHING
+    most: Most = Most()
     began: float = float("inf")
     passed: tuple[float, Kbps] = (-float("inf"), Fraction(0))
     connected: float = -float("inf")
     provisional: bool = False
-    losses: Losses = NONE_LOST
+    losses: Losses = Losses()
     limit: LastLimit = LastLimit()
     short: float = -float("inf")
-    lowering: Lowering = NOT_LOWERED
-    proofs: Proofs = NO_PROOFS
+    lowering: Lowering = Lowering()
+    proofs: Proofs = Proofs()
 
     def in_force(self, limit: Kbps) -> Kbps:
         return limit if self.kbps is None else min(self.kbps, limit)

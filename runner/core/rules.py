@@ -361,16 +361,14 @@ def cap_by_link(
     cap, link = memory.get("cap_by_link", UNCAPPED), _of_all_copies(vehicle, state)
     alone = alone_after_s is not None and _is_stale(state, alone_after_s) and link_cap.is_fresh(link, state.t)
     if not cameras or state.operator_lost is not None or (draft.total < max(1, len(cameras)) and not alone):
-        cap = link_cap.mark_idle(cap, state.t)
+        cap = cap._replace(idle=state.t)  # silence now, or soon after, is no stall
     else:
         if alone:
             most = sum((camera.rate_quality.b_full for camera in cameras), allocation.ZERO)
             draft, asked, limit = draft.replaced(measured=True, total=most), limit, wire_kbps(cameras, most)
-            cap = link_cap.probe(cap, state.t, link_cap.believed_limit(cap, asked, least_trust), limit)._replace(
-                replaced=state.t
-            )
+            cap = link_cap.probe(cap, state.t, link_cap.believed_limit(cap, asked, least_trust), limit)
         else:
-            cap = link_cap.end_probe(cap)
+            cap = cap._replace(alone=False)  # `follow` relates the known capacity to the limit
         cap = link_cap.follow(cap, limit, state.mode is Mode.AUTOMATIC and not alone)
         cap = link_cap.start_cap(cap, link, state.operator_since, limit, start)
         cap = cap._replace(reserve=reserve_kbps, floors=_capped_floors(cameras, reserve_kbps))
