@@ -14,6 +14,7 @@ from enum import StrEnum
 from fractions import Fraction
 from functools import lru_cache
 from itertools import islice, pairwise
+from math import inf, nextafter
 from typing import TYPE_CHECKING, Any, Protocol
 
 if TYPE_CHECKING:
@@ -47,6 +48,13 @@ def exact(number: float | str | Fraction) -> Fraction:
 @lru_cache(maxsize=256)  # of the times of an event, which many rules read
 def _exact(number: float) -> Fraction:
     return Fraction(Decimal(str(number)))
+
+
+@lru_cache(maxsize=64)  # of the parameters of rules
+def least_float(bound: Fraction) -> float:
+    """The least float that is not below a bound. To compare floats with it is exact, and faster than with the bound."""
+    nearest = float(bound)
+    return nearest if nearest >= bound else nextafter(nearest, inf)
 
 
 def plain(number: Fraction) -> int | float:

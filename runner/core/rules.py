@@ -8,10 +8,10 @@ Memory is frozen and keyed by rule; only rules that need history use it.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from fractions import Fraction
-from functools import cache
+from functools import cache, lru_cache
 from math import ceil, isfinite
 from typing import Any
 
@@ -20,7 +20,7 @@ from runner.core.budget import video_kbps, wire_kbps
 from runner.core.decision import Decision, Draft, Setting
 from runner.core.events import LinkMeasured
 from runner.core.link_memory import LEAST, UNCAPPED, LinkCap
-from runner.core.model import Camera, Kbps, Mode, Vehicle, exact, plain
+from runner.core.model import Camera, Kbps, Mode, Vehicle, exact, least_float, plain
 from runner.core.state import State
 from runner.errors import RunError
 
@@ -356,7 +356,8 @@ def cap_by_link(
     assert draft.total is not None
     if state.link is None and "cap_by_link" not in memory and (start == 1 or state.operator_since is None):
         return draft, memory  # never measured
-    cameras = [c for name, c in vehicle.cameras.items() if state.on[name] for _ in range(state.copies.get(name, 1))]
+    mounted = vehicle.cameras.items()
+    cameras = tuple(c for name, c in mounted if state.on[name] for _ in range(state.copies.get(name, 1)))
     limit, least = wire_kbps(cameras, draft.total), wire_kbps(cameras, max(LEAST, Fraction(len(cameras))))
     cap, link = memory.get("cap_by_link", UNCAPPED), _of_all_copies(vehicle, state)
     alone = alone_after_s is not None and _is_stale(state, alone_after_s) and link_cap.is_fresh(link, state.t)
@@ -385,7 +386,8 @@ def cap_by_link(
     return lowered.replaced(sized_for=lowered.uncapped) if cap.provisional else lowered, memory
 
 
-def _capped_floors(cameras: Sequence[Camera], reserve: Kbps) -> Kbps:
+@lru_cache(maxsize=64)  # for a few sets of cameras that are on
+def _capped_floors(cameras: tuple[Camera, ...], reserve: Kbps) -> Kbps:
     """The cap, in tenths of a kbit/s, that leaves the floors of all cameras that are never given up; 0: no floors."""
     floors = sum((camera.floor_kbps for camera in cameras if camera.shed is None), allocation.ZERO)
     return Fraction(ceil(10 * (reserve + wire_kbps(cameras, floors))), 10) if floors else floors
@@ -470,14 +472,15 @@ def _hold_back(
     state: State, draft: Draft, past: Mapping[str, _Hold], for_s: Fraction
 ) -> tuple[Draft, Mapping[str, _Hold]]:
     now: dict[str, _Hold] = {}
+    enough_s = least_float(for_s)
     factors: dict[str, Fraction] = {}  # of the cameras whose larger factor is held back
     for name, requested in draft.scaling.items():
         held, since = past.get(name, (requested, None))
-        if requested is held or requested <= held:
+        if requested is held or _is_at_most(requested, held):
             now[name] = (requested, None)
             continue
         since = state.t if since is None else since
-        if state.t - since >= for_s:
+        if state.t - since >= enough_s:
             now[name] = (requested, None)
         else:
             now[name] = (held, since)
@@ -581,6 +584,11 @@ def _setting(state: State, draft: Draft, name: str) -> Setting:
     if draft.notes:
         reason = "; ".join((reason, *draft.notes))
     return Setting(True, sending, draft.demand[name], kbps if sending else 0, kbps, factor, roi, width, height, reason)
+
+
+def _is_at_most(factor: Fraction, bound: Fraction) -> bool:
+    """As `factor <= bound`, which is slower."""
+    return factor.numerator * bound.denominator <= bound.numerator * factor.denominator
 
 
 def _whole(bitrate: Kbps) -> int:
