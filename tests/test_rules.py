@@ -17,7 +17,7 @@ from runner.configuration.rule_lists import call_rule, check_order
 from runner.core import events as core_events
 from runner.core import rules
 from runner.core.events import Attention, BitratePredicted, parse
-from runner.core.model import Mode, ModelError, Roi, Vehicle
+from runner.core.model import Mode, ModelError, Roi, Vehicle, least_float
 from runner.core.rules import decide
 from runner.core.state import State
 from runner.core.step import Run, start, step
@@ -543,3 +543,11 @@ def test_a_rule_that_reads_an_unknown_field_is_refused(monkeypatch: pytest.Monke
     assert str(refused.value).startswith(
         ": 'deaf': my.rules:deaf cannot be imported: ValueError: reads: predicton: unknown; expected fields of State: "
     )
+
+
+@given(st.fractions(0, 10**6, max_denominator=10**6), st.floats(0, 10**6))
+@example(Fraction(1, 10), 0.1)
+@example(Fraction(3, 10), 0.3)
+def test_waiting_times_are_compared_exactly(for_s: Fraction, waited_s: float) -> None:
+    """0.3 as a float is a little less than 3/10, and so it has not lasted for that long."""
+    assert (waited_s >= least_float(for_s)) == (waited_s >= for_s)

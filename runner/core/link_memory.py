@@ -51,7 +51,7 @@ class Lowering(NamedTuple):
 
 
 class Proofs(NamedTuple):
-    """When the link seemed to be narrow in the last 30 s, once per long queue.
+    """When the link seemed to be narrow in the last `link_contention.OFTEN_S`, once per long queue.
 
     most  kbit/s that had arrived before the first proof
     t     of the last proof; here losses with a short queue are proofs, too
