@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 from itertools import chain, product
 from pathlib import Path
 
@@ -13,6 +14,8 @@ from runner.configuration import yaml_file
 from runner.configuration.combinations import SECTIONS, Combinations, words_of
 from runner.configuration.compose import compose
 from runner.configuration.files import GROUPS, options
+from runner.system import spawned
+from runner.verbs import validate
 
 ONE = {  # a single combination
     "vehicle": "delivery_robot",
@@ -41,6 +44,56 @@ def test_what_is_packaged_is_valid() -> None:
     assert first.startswith(f"valid: {files} files, ")
     assert int(first.split()[3]) > count("vehicle") * count("graph") + count("experiment")
     assert all(note.startswith(("not checked: ", "nothing was checked against the GStreamer")) for note in notes)
+
+
+# --- many runs --------------------------------------------------------------------------------------------------------
+
+RUNS = "".join(f"    run{n}: [control.port={2000 + n}]\n" for n in range(validate.RUNS_PER_WORKER))
+EXPERIMENT = """# @package _global_
+defaults: [driving_test, _self_]
+experiment:
+  runs:
+"""
+
+
+@pytest.mark.slow
+def test_worker_processes_report_the_same_as_one_process(
+    tod: Command, conf: UserConf, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    conf.write("experiment/many.yaml", f"{EXPERIMENT}{RUNS}    fast: [control.port=-1]\n    slow: [control.prt=1]\n")
+    conf.write("experiment/broken.yaml", f"{EXPERIMENT}{RUNS}cameras:\n  ghost: {{weight: 2}}\n")
+    started: list[int] = []
+    pool = spawned.process_pool
+    monkeypatch.setattr(spawned, "process_pool", lambda workers: started.append(workers) or pool(workers))
+    found = []
+    for cores in ({0, 1}, {0}):
+        monkeypatch.setattr(os, "sched_getaffinity", lambda _pid, cores=cores: cores)
+        found.append(problems(tod, conf))
+    assert started == [1]
+    assert found[0] == found[1]
+    assert found[0] == [
+        "~/experiment/broken.yaml: cameras.ghost: no camera of that name is mounted; its kind is named in the defaults "
+        "list: /cameras@cameras.ghost: KIND",
+        "~/experiment/many.yaml: experiment.runs.fast: control.port=-1: must be at least 1",
+        "~/experiment/many.yaml: experiment.runs.slow: control.prt=1: unknown key, did you mean port?",
+    ]
+
+
+def die(*_: object) -> None:
+    os._exit(1)
+
+
+@pytest.mark.slow
+def test_a_worker_process_that_dies_is_reported(tod: Command, conf: UserConf, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _pid: {0, 1})
+    monkeypatch.setattr(validate, "_check_run", die)
+    conf.write("experiment/many.yaml", EXPERIMENT + RUNS)
+    result = tod("validate", conf.word)
+    assert result.status == 1
+    assert "a worker process ended without a result: it may have run out of memory" in result.err
+
+
+# --- choices ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow  # composes many configurations

@@ -6,14 +6,13 @@ import gc
 import os
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
-from multiprocessing import active_children
 from typing import ParamSpec, TypeVar
 
 from runner.errors import RunError
 from runner.system.extras import how_to_install
-from runner.system.spawned import WorkerContext
+from runner.system.spawned import ended, process_pool
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -37,16 +36,8 @@ def open_executor(workers: str, scheduler: str | None, parallel: int) -> Iterato
         with _dask(scheduler, parallel) as executor:
             yield executor
         return
-    pool: Executor
-    pool = ThreadPoolExecutor(parallel) if workers == "threads" else ProcessPoolExecutor(parallel, WorkerContext())
-    try:
+    with ended(ThreadPoolExecutor(parallel)) if workers == "threads" else process_pool(parallel) as pool:
         yield pool
-    except BaseException:
-        for worker in active_children():  # tasks may take minutes
-            worker.kill()
-        raise
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
 
 
 @contextmanager

@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import signal
-from multiprocessing import parent_process, resource_tracker
+from collections.abc import Iterator
+from contextlib import contextmanager
+from multiprocessing import active_children, parent_process, resource_tracker
 from multiprocessing.context import SpawnContext, SpawnProcess
+from typing import TYPE_CHECKING
 
 from runner.system.bound import die_with
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
 
 FROM_TERMINAL = (signal.SIGINT, signal.SIGHUP)  # sent to all processes of a terminal
 
@@ -35,3 +41,25 @@ class WorkerContext(SpawnContext):
     """
 
     Process = _Worker
+
+
+@contextmanager
+def process_pool(workers: int) -> Iterator[Executor]:
+    """A pool of worker processes that ends with the block."""
+    from concurrent.futures import ProcessPoolExecutor
+
+    with ended(ProcessPoolExecutor(workers, WorkerContext())) as pool:
+        yield pool
+
+
+@contextmanager
+def ended(pool: Executor) -> Iterator[Executor]:
+    """End a pool with the block. An error, or Ctrl-C, kills its processes, whose tasks may take minutes."""
+    try:
+        yield pool
+    except BaseException:
+        for worker in active_children():
+            worker.kill()
+        raise
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)

@@ -27,12 +27,12 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import product
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from runner import schema
 from runner.configuration.build import PlanCheck
@@ -43,9 +43,12 @@ from runner.configuration.files import GROUPS, LAYOUT, bases_of, built_on, conf_
 from runner.configuration.overrides import choosable
 from runner.configuration.yaml_file import label, load_file, load_node
 from runner.core.model import ModelError, suggest
-from runner.errors import COMMAND_LINE, ArgumentError, ConfigError, MissingBindings, Problem
+from runner.errors import COMMAND_LINE, ArgumentError, ConfigError, MissingBindings, Problem, RunError
 from runner.graph import Plan
 from runner.verbs import Arguments
+
+if TYPE_CHECKING:
+    from concurrent.futures import Future
 
 FOLDERS = (*GROUPS, LAYOUT)  # of checked files
 DATA = ("maps", "traces")  # folders for data that pqos files name; a bandwidth map may be YAML
@@ -59,6 +62,8 @@ READERS: dict[str, ConfigReader] = {  # by group, the reader of its part of the 
     "study": Configuration.study,
     "link": Configuration.link,
 }
+RUNS_PER_WORKER = 10  # a worker starts in the time that they take
+RunResult = tuple[list[Problem], dict[str, None]]  # problems and notes
 ChosenFiles = tuple[tuple[str, str], ...]  # group and file
 
 
@@ -108,10 +113,8 @@ def run(arguments: Arguments) -> int:
             raise ConfigError(found)
         tasks = _Tasks(tuple(arguments.overrides), conf, everything, named)
         checker = _Checker(conf, Combinations(arguments.overrides, conf, tasks.choices))
-        for task in tasks:
-            checker.check(task)
-        if checker.problems:
-            raise ConfigError(checker.problems)
+        if problems := checker.problems(list(tasks)):
+            raise ConfigError(problems)
         files, configurations = files + checked, configurations + len({task.words for task in tasks})
         notes |= checker.notes
     print(f"valid: {_counted(files, 'file')}, {_counted(configurations, 'configuration')}")
@@ -337,7 +340,7 @@ def _runs(experiment: str, overrides: tuple[str, ...], user: Path | None) -> Ite
 
 @dataclass
 class _Checker:
-    """Checks configurations one after the other.
+    """Checks configurations one after the other. If experiments have many runs, worker processes check those meanwhile.
 
     broken  files that are invalid or cannot be composed: combinations with them are not checked
     fine    sections that the schemas accept, by key and identity
@@ -345,7 +348,6 @@ class _Checker:
 
     user: Path | None
     combinations: Combinations
-    problems: list[Problem] = field(default_factory=list)
     notes: dict[str, None] = field(default_factory=dict)
     broken: set[tuple[str, str]] = field(default_factory=set)
     fine: set[tuple[str, int]] = field(default_factory=set)
@@ -353,9 +355,27 @@ class _Checker:
     def __post_init__(self) -> None:
         self._registry = _registry_check(self.notes)
 
-    def check(self, task: ValidationTask) -> None:
-        if self.broken.isdisjoint(task.choices) and not self._is_fine_assembled(task):
-            self._check_composed(task)
+    def problems(self, tasks: Sequence[ValidationTask]) -> list[Problem]:
+        """All problems, in the order of the tasks."""
+        found: dict[ValidationTask, list[Problem]] = {}
+        with _in_workers([task for task in tasks if task.run], self.user) as pending:
+            for task in sorted(tasks, key=pending.__contains__):
+                if self.broken.isdisjoint(task.choices):
+                    found[task] = self._result(pending[task]) if task in pending else self._problems(task)
+        return [problem for task in tasks for problem in found.get(task, ())]
+
+    def _result(self, future: Future[RunResult]) -> list[Problem]:
+        problems, notes = future.result()
+        self.notes |= notes
+        return problems
+
+    def _problems(self, task: ValidationTask) -> list[Problem]:
+        if self._is_fine_assembled(task):
+            return []
+        problems = _composed_problems(task, self.user, self._registry)
+        if problems and len(task.choices) == 1 and not task.run:
+            self.broken |= set(task.choices)
+        return problems
 
     def _is_fine_assembled(self, task: ValidationTask) -> bool:
         """Whether a configuration assembled from sections is valid; an invalid one is composed and checked again."""
@@ -372,16 +392,43 @@ class _Checker:
         self.fine |= sections
         return True
 
-    def _check_composed(self, task: ValidationTask) -> None:
-        try:
-            composed = _composed(task.words, self.user)
-            config = Configuration(composed, self.user, runnable=False, bags=True, check=self._registry)
-            problems = _problems(config, task.readers)
-        except ConfigError as error:
-            problems = error.problems
-        if problems and len(task.choices) == 1:
-            self.broken |= set(task.choices)
-        self.problems += map(task.run.attributed, problems) if task.run else problems
+
+@contextmanager
+def _in_workers(
+    runs: Sequence[ValidationTask], user: Path | None
+) -> Iterator[Mapping[ValidationTask, Future[RunResult]]]:
+    """The runs that worker processes check on other cores; none if starting those takes longer than the checks.
+
+    raises  RunError if a worker process dies
+    """
+    workers = min(len(os.sched_getaffinity(0)) - 1, len(runs) // RUNS_PER_WORKER)
+    if not workers:
+        yield {}
+        return
+    from concurrent.futures import BrokenExecutor
+
+    from runner.system.spawned import process_pool
+
+    try:
+        with process_pool(workers) as pool:
+            yield {run: pool.submit(_check_run, run, user) for run in runs}
+    except BrokenExecutor:
+        raise RunError("a worker process ended without a result: it may have run out of memory") from None
+
+
+def _check_run(run: ValidationTask, user: Path | None) -> RunResult:
+    notes: dict[str, None] = {}
+    return _composed_problems(run, user, _registry_check(notes)), notes
+
+
+def _composed_problems(task: ValidationTask, user: Path | None, check: PlanCheck | None) -> list[Problem]:
+    try:
+        composed = _composed(task.words, user)
+        config = Configuration(composed, user, runnable=False, bags=True, check=check)
+        problems = _problems(config, task.readers)
+    except ConfigError as error:
+        problems = error.problems
+    return [task.run.attributed(problem) for problem in problems] if task.run else problems
 
 
 def _problems(config: Configuration, readers: Iterable[ConfigReader]) -> list[Problem]:
