@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from runner.gst.arriving import NTP_EPOCH_S, ArrivingFrames, MediaClock, Packet, read_packet
+from runner.gst.arriving import NTP_EPOCH_S, RTP_HZ, WINDOW_S, ArrivingFrames, Lateness, MediaClock, Packet, read_packet
 
 pytestmark = pytest.mark.gst
 
@@ -208,3 +208,54 @@ def test_a_media_clock_wraps_around() -> None:
     assert clock.seconds - before == pytest.approx(2)
     clock.tick(0)  # backwards
     assert clock.seconds - before == pytest.approx(1)
+
+
+# --- lateness ---------------------------------------------------------------------------------------------------------
+
+
+class Packets:
+    """Packets that are sent 100 times a second, whose transit takes 50 ms at least."""
+
+    def __init__(self) -> None:
+        self._lateness, self._sent, self.jump = Lateness(), 0, 0
+
+    def late(self, seconds: float, delay: float = 0) -> list[float]:
+        """How late those of some seconds seem that are delayed."""
+        first, self._sent = self._sent, self._sent + round(100 * seconds)
+        sent = range(first, self._sent)
+        return [self._lateness.of((900 * n + self.jump) % 2**32, n / 100 + 0.05 + delay) for n in sent]
+
+
+def test_packets_that_waited_in_an_outage_are_late() -> None:
+    packets = Packets()
+    packets.jump = 2**32 - 90_000  # the timestamp wraps around
+    assert packets.late(3) == pytest.approx([0] * 300, abs=1e-6)
+    for delay in (3, 2, 1):
+        assert packets.late(WINDOW_S / 4, delay) == pytest.approx([delay] * 50, abs=1e-6)
+    assert packets.late(1) == pytest.approx([0] * 100, abs=1e-6)
+
+
+def test_silence_does_not_age_what_is_usual() -> None:
+    packets = Packets()
+    packets.late(1)
+    packets._sent += 1000
+    assert packets.late(0.1, 3) == pytest.approx([3] * 10, abs=1e-6)
+
+
+def test_a_longer_path_becomes_usual() -> None:
+    packets = Packets()
+    packets.late(5)
+    late = packets.late(2 * WINDOW_S + 0.1, 2)
+    assert late[: round(100 * WINDOW_S)] == pytest.approx([2] * 200, abs=1e-6)
+    assert late[-1] == pytest.approx(0, abs=1e-6)
+    packets.late(2 * WINDOW_S + 0.1)
+    assert packets.late(0.1, 1)[-1] == pytest.approx(1, abs=1e-6)
+
+
+@pytest.mark.parametrize("seconds", [-1000, 1000])
+def test_a_sender_that_sets_its_clock_anew_is_not_late(seconds: int) -> None:
+    packets = Packets()
+    packets.late(3)
+    packets.jump = seconds * RTP_HZ
+    assert packets.late(3)[-200:] == pytest.approx([0] * 200, abs=1e-6)
+    assert packets.late(0.1, 1) == pytest.approx([1] * 10, abs=1e-6)

@@ -86,6 +86,10 @@ class PassingBuffer:
         dts = int(_Buffer.from_address(self._address).dts)
         return None if dts == Gst.CLOCK_TIME_NONE else dts
 
+    @dts.setter
+    def dts(self, dts: int) -> None:
+        _Buffer.from_address(self._address).dts = dts
+
     @property
     def size(self) -> int:
         """Bytes."""

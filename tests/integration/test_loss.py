@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import struct
 import subprocess
 import time
 from statistics import median
@@ -175,6 +176,42 @@ def test_a_picture_with_unrecovered_loss_is_healed_by_a_key_frame(graph, monkeyp
             assert side.faults() == []
         finally:
             operator.stop()
+
+
+def test_an_outage_does_not_shift_the_time_base_of_the_jitter_buffer(monkeypatch):
+    """Otherwise lost packets, and the pictures behind them, would be awaited longer by what it is shifted."""
+    from runner.gst import Gst
+    from runner.gst.repair import LONGEST_MS, RepairBuffer
+
+    interval_ms, transit_ms, outage_ms = 20, 50, (3000, 5000)
+    # The link then carries three times what is sent, so that the delay falls slowly.
+    sent_ms = range(0, 9000, interval_ms)
+    arrivals_ms = [max(at, outage_ms[1] + (at - outage_ms[0]) / 3) if at >= outage_ms[0] else at for at in sent_ms]
+    caps = "application/x-rtp,media=video,clock-rate=90000,encoding-name=H264,payload=96"
+    pipeline = Gst.parse_launch(
+        f"appsrc name=source format=time caps={caps} ! rtpjitterbuffer name=buffer ! fakesink name=sink"
+    )
+    left = []
+
+    def note(_pad, info):
+        left.append(info.get_buffer().pts / Gst.MSECOND)
+        return Gst.PadProbeReturn.OK
+
+    monkeypatch.setattr(RepairBuffer, "_arrived", lambda _self, packet, _now: packet.dts / Gst.SECOND)
+    repair = RepairBuffer(pipeline.get_by_name("buffer"), 5)
+    pipeline.get_by_name("sink").get_static_pad("sink").add_probe(Gst.PadProbeType.BUFFER, note)
+    pipeline.set_state(Gst.State.PLAYING)
+    try:
+        for number, (sent, arrived) in enumerate(zip(sent_ms, arrivals_ms, strict=True)):
+            buffer = Gst.Buffer.new_wrapped(struct.pack(">BBHII", 0x80, 0x80 | 96, number, 90 * sent, 1) + bytes(100))
+            buffer.dts = round((arrived + transit_ms) * Gst.MSECOND)
+            pipeline.get_by_name("source").emit("push-buffer", buffer)
+        until(lambda: len(left) == len(sent_ms))
+    finally:
+        pipeline.set_state(Gst.State.NULL)
+    shifted = [pts - sent - transit_ms for pts, sent in zip(left, sent_ms, strict=True)]
+    assert max(shifted) <= LONGEST_MS
+    assert repair  # its probe ends with it
 
 
 def test_a_graph_without_key_frame_requests_gets_none():
