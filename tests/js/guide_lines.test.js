@@ -1,7 +1,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-import { withoutStraight } from "../../runner/page/static/guide_lines.js";
+import { GuideLines, STEERING_STEP_RAD, withoutStraight } from "../../runner/page/static/guide_lines.js";
 
 test("a straight line keeps its ends", () => {
   const points = Array.from({ length: 60 }, (_, i) => ({ x: 3 * i, y: 7 - 2 * i }));
@@ -27,4 +27,53 @@ test("a corner, points that coincide, and short lines are kept", () => {
   assert.deepEqual(withoutStraight([]), []);
   const closed = [{ x: 0, y: 0 }, { x: 9, y: 0 }, { x: 0, y: 0 }];
   assert.deepEqual(withoutStraight(closed), closed);
+});
+
+// --- placed in the canvas -----------------------------------------------------------------------------------------------
+
+const NATIVE = { width: 640, height: 360, left: 0, top: 0 };
+const CAMERA = { native: NATIVE, fov_deg: 90, lens: "pinhole", pose: { x_m: 2, y_m: 0, z_m: 1.5, yaw_deg: 0, pitch_deg: 0, roll_deg: 0 }, calibrated: true };
+const DIMENSIONS = { wheelbase_m: 2.9, track_m: 1.65, width_m: 1.92, front_m: 3.65, rear_m: 0.95 };
+
+/** Draws into a canvas that records how many paths were built, and returns the lines. */
+function drawing() {
+  const paths = { built: 0 };
+  globalThis.Path2D = class { constructor() { paths.built++; } moveTo() {} lineTo() {} };
+  const nothing = Object.fromEntries(["save", "restore", "stroke", "strokeText", "fillText", "transform", "translate"].map((name) => [name, () => {}]));
+  const lines = new GuideLines(CAMERA, DIMENSIONS);
+  lines.shown = true;
+  const draw = ({ region = { x: 0, y: 0, width: 640, height: 360 }, canvas = { width: 640, height: 360 }, rad = 0.1 } = {}) => {
+    const area = { x: 0, y: 0, ...canvas };
+    lines.draw({ ...nothing, canvas, measureText: () => ({ width: 10 }) }, { region, rad, area, css: 1, mirrored: false });
+    return structuredClone(lines.drawn);
+  };
+  return { lines, paths, draw };
+}
+
+test("lines that have not moved are built once", () => {
+  const { paths, draw } = drawing();
+  const first = draw();
+  const built = paths.built;
+  assert.deepEqual(draw({ rad: 0.1 + STEERING_STEP_RAD / 10 }), first);
+  assert.equal(paths.built, built);
+  draw({ rad: 0.2 });
+  assert.equal(paths.built, built + 1); // only the wheels' paths
+});
+
+test("lines follow the region, the size of the canvas, the steering and the optics", () => {
+  const { lines, draw } = drawing();
+  const first = draw();
+  const changes = { region: { x: 160, y: 90, width: 320, height: 180 }, canvas: { width: 1280, height: 720 }, rad: -0.1 };
+  for (const [what, value] of Object.entries(changes)) {
+    assert.notDeepEqual(draw({ [what]: value }), first, what);
+    assert.deepEqual(draw(), first, what);
+  }
+  const doubled = draw({ canvas: changes.canvas });
+  assert.ok(Math.abs(doubled[0].pieces[0][0].x - 2 * first[0].pieces[0][0].x) < 1e-9);
+  lines.setOptics({ ...CAMERA, fov_deg: 60 });
+  assert.notDeepEqual(draw(), first);
+  lines.setOptics(CAMERA);
+  assert.deepEqual(draw(), first);
+  assert.equal(draw({ rad: null }).some(({ kind }) => kind === "path"), false);
+  assert.deepEqual(draw(), first);
 });

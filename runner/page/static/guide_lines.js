@@ -16,6 +16,7 @@ const STRAIGHT_PX = 0.1; // of the canvas: points closer to a straight line are 
 export const STEERING_STEP_RAD = 1e-3; // a smaller change of the steering moves no line by a pixel
 
 /** @typedef {{kind: string, metres: number|null, pieces: import("./projection.js").Point[][]}} Line */
+/** @typedef {{lines: Line[], paths: Map<string, Path2D>}} Placed lines in the canvas, px, and a path for each kind */
 /**
  * @typedef {object} Shown how a picture is shown
  * @property {import("./framing.js").Rectangle} region of the full image that the canvas shows, px
@@ -25,12 +26,17 @@ export const STEERING_STEP_RAD = 1e-3; // a smaller change of the steering moves
  * @property {boolean} mirrored whether the canvas is mirrored
  */
 
+/** @type {Placed} */
+const NOTHING = { lines: [], paths: new Map() };
+
 export class GuideLines {
   shown = false;
   /** @type {Line[]} */
   drawn = []; // for tests: in the canvas, px
   /** @type {{rad: number, lines: Line[]}} */
   paths = { rad: NaN, lines: [] }; // in the full image
+  /** @type {{where: string, rad: number|null, straight: Placed, paths: Placed}} */
+  placed = { where: "", rad: null, straight: NOTHING, paths: NOTHING };
 
   /**
    * @param {import("./projection.js").Optics & {calibrated: boolean}} camera
@@ -48,6 +54,7 @@ export class GuideLines {
     this.toImage = projection(optics);
     this.straight = this.straightLines();
     this.paths = { rad: NaN, lines: [] };
+    this.placed.where = "";
   }
 
   straightLines() {
@@ -60,9 +67,22 @@ export class GuideLines {
 
   /** The path for a steering angle, in the full image. */
   pathsFor(rad) {
-    const rounded = STEERING_STEP_RAD * Math.round(rad / STEERING_STEP_RAD);
-    if (this.paths.rad !== rounded) this.paths = { rad: rounded, lines: pathGuides(this.dimensions, rounded).map((guide) => this.project(guide)) };
+    if (this.paths.rad !== rad) this.paths = { rad, lines: pathGuides(this.dimensions, rad).map((guide) => this.project(guide)) };
     return this.paths.lines;
+  }
+
+  /**
+   * Place the lines in the canvas; those that have not moved since the last picture take no time.
+   * @param {import("./framing.js").Rectangle} region  @param {{width: number, height: number}} canvas  @param {number|null} rad
+   */
+  place(region, { width, height }, rad) {
+    const where = [region.x, region.y, region.width, region.height, width, height].join();
+    const rounded = rad === null ? null : STEERING_STEP_RAD * Math.round(rad / STEERING_STEP_RAD);
+    const moved = where !== this.placed.where;
+    if (!moved && rounded === this.placed.rad) return;
+    const toCanvas = ({ x, y }) => ({ x: ((x - region.x) * width) / region.width, y: ((y - region.y) * height) / region.height });
+    const straight = moved ? placed(this.straight, toCanvas) : this.placed.straight;
+    this.placed = { where, rad: rounded, straight, paths: rounded === null ? NOTHING : placed(this.pathsFor(rounded), toCanvas) };
   }
 
   /**
@@ -74,11 +94,9 @@ export class GuideLines {
     this.drawn = [];
     if (!this.shown || !seen) return;
     const { region, rad, area, css, mirrored } = seen;
-    const { width, height } = context.canvas;
-    const toCanvas = ({ x, y }) => ({ x: ((x - region.x) * width) / region.width, y: ((y - region.y) * height) / region.height });
-    const lines = [...this.straight, ...(rad === null ? [] : this.pathsFor(rad))];
-    this.drawn = lines.map((guide) => ({ ...guide, pieces: guide.pieces.map((piece) => piece.map(toCanvas)) }));
-    const thick = css * Math.min(1.5, Math.max(0.6, width / css / USUAL_PX));
+    this.place(region, context.canvas, rad);
+    this.drawn = [...this.placed.straight.lines, ...this.placed.paths.lines];
+    const thick = css * Math.min(1.5, Math.max(0.6, context.canvas.width / css / USUAL_PX));
     context.save();
     this.strokeAll(context, thick);
     context.restore();
@@ -90,20 +108,29 @@ export class GuideLines {
 
   /** All outlines, and then the lines, so that no outline covers a line; those of one kind at once. */
   strokeAll(context, thick) {
-    const kinds = [...new Set(this.drawn.map(({ kind }) => kind))];
-    const paths = kinds.map((kind) => pathOf(this.drawn.filter((line) => line.kind === kind)));
+    const paths = [...this.placed.straight.paths, ...this.placed.paths.paths];
     context.lineJoin = "round";
     context.strokeStyle = "rgba(0,0,0,0.55)";
-    for (const [i, kind] of kinds.entries()) {
+    for (const [kind, path] of paths) {
       context.lineWidth = thick * (LINE_WIDTHS[kind] + OUTLINE);
-      context.stroke(paths[i]);
+      context.stroke(path);
     }
-    for (const [i, kind] of kinds.entries()) {
+    for (const [kind, path] of paths) {
       context.lineWidth = thick * LINE_WIDTHS[kind];
       context.strokeStyle = COLOURS[kind];
-      context.stroke(paths[i]);
+      context.stroke(path);
     }
   }
+}
+
+/**
+ * @param {Line[]} guides  @param {(point: import("./projection.js").Point) => import("./projection.js").Point} toCanvas
+ * @returns {Placed}
+ */
+function placed(guides, toCanvas) {
+  const lines = guides.map((guide) => ({ ...guide, pieces: guide.pieces.map((piece) => piece.map(toCanvas)) }));
+  const kinds = new Set(lines.map(({ kind }) => kind));
+  return { lines, paths: new Map([...kinds].map((kind) => [kind, pathOf(lines.filter((line) => line.kind === kind))])) };
 }
 
 /** @param {Line[]} lines */
@@ -119,18 +146,24 @@ export function withoutStraight(points) {
   const kept = points.slice(0, 1);
   for (let i = 1, from = 0; i < points.length; i++) {
     const isLast = i === points.length - 1;
-    if (!isLast && points.slice(from + 1, i + 1).every((point) => distanceTo(point, points[from], points[i + 1]) < STRAIGHT_PX)) continue;
+    if (!isLast && areNear(points, from, i + 1)) continue;
     kept.push(points[i]);
     from = i;
   }
   return kept;
 }
 
-/** How far a point is from the line through two others, or from both if these coincide. */
-function distanceTo({ x, y }, a, b) {
+/** Whether the points between two others are near the line through these, or near both if they coincide. */
+function areNear(points, from, to) {
+  const [a, b] = [points[from], points[to]];
   const [across, down] = [b.x - a.x, b.y - a.y];
-  const length = Math.hypot(across, down);
-  return length ? Math.abs((x - a.x) * down - (y - a.y) * across) / length : Math.hypot(x - a.x, y - a.y);
+  const squared = across * across + down * down; // without roots: this runs for each picture while the vehicle steers
+  for (let i = from + 1; i < to; i++) {
+    const [x, y] = [points[i].x - a.x, points[i].y - a.y];
+    const product = x * down - y * across;
+    if (squared ? product * product >= STRAIGHT_PX ** 2 * squared : x * x + y * y >= STRAIGHT_PX ** 2) return false;
+  }
+  return true;
 }
 
 /** Write the distances next to the right ends of their lines, as seen on the screen, where there is room. */
