@@ -1,5 +1,6 @@
 /** The page's side of the worker link: messages from the station come in, requests and canvases go out. */
 
+import { checkRegularly } from "./periodic.js";
 import { dropOldSample, onStationMessage, publish, store } from "./store.js";
 
 const { canShowVideo, early, worker } = globalThis.boot;
@@ -9,7 +10,6 @@ const ANSWERED_MS = 10_000; // limit of a question to the worker
 const questions = new Map();
 let lastQuestion = 0;
 let reportedAt = performance.now(); // when the worker last reported
-let checkedAt = reportedAt;
 /** @type {{connected: boolean}|null} */
 let hung = null; // while the worker hangs: its last connection state
 
@@ -49,21 +49,15 @@ const handlers = {
 export function start() {
   for (const data of early) handlers[data.kind](data);
   worker.onmessage = ({ data }) => handlers[data.kind](data);
-  setInterval(check, CHECK_MS);
-}
-
-function check() {
-  const time = performance.now();
-  const hasStalled = time - checkedAt > 2 * CHECK_MS; // the page itself: the worker's messages are still queued
-  checkedAt = time;
-  if (hasStalled) return;
-  dropOldSample();
-  checkWorker(time);
+  checkRegularly(CHECK_MS, (now) => {
+    dropOldSample();
+    checkWorker(now);
+  });
 }
 
 /** If the worker hangs or has died, its last pictures still look live: mark them as lost. */
-function checkWorker(time) {
-  if (hung || time - reportedAt < HUNG_MS || !Object.keys(store.status).length) return;
+function checkWorker(now) {
+  if (hung || now - reportedAt < HUNG_MS || !Object.keys(store.status).length) return;
   hung = { connected: store.connected };
   Object.assign(store, { hung: true, connected: false });
   publish("socket", false);

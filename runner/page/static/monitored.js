@@ -4,6 +4,7 @@
  */
 
 import { listen, publish, remind, store } from "./store.js";
+import { checkRegularly } from "./periodic.js";
 import { reportProblem } from "./requests.js";
 import { displayName } from "./format.js";
 
@@ -23,7 +24,6 @@ const ownId = String(Math.random());
 
 /** The last report of each open monitor, and when it arrived. @type {Map<string, {status: Record<string, string>, ages: Record<string, Age>, at: number}>} */
 const reports = new Map();
-let checkedAt = performance.now();
 
 /** Each picture in a monitor. */
 export const monitored = () => [...reports.values()].flatMap(({ status, ages }) => picturesOf(status, ages));
@@ -48,12 +48,8 @@ function onReport({ id, status, ages }) {
   for (const camera of Object.keys(now)) if (now[camera] !== before[camera]) publishStatus(id, camera, now[camera]);
 }
 
-function checkMonitors() {
-  const time = performance.now();
-  const hasStalled = time - checkedAt > 2 * REPORT_MS; // this page itself: reports are still queued
-  checkedAt = time;
-  if (hasStalled) return;
-  for (const [id, { status, at }] of reports) if (time - at >= SILENT_MS) onSilent(id, Object.keys(status));
+function checkMonitors(now) {
+  for (const [id, { status, at }] of reports) if (now - at >= SILENT_MS) onSilent(id, Object.keys(status));
 }
 
 /** A monitor has crashed: the driver is alerted once, and its pictures no longer count. */
@@ -79,5 +75,5 @@ export function startMonitored() {
     return;
   }
   channel.onmessage = ({ data }) => onReport(data);
-  setInterval(checkMonitors, REPORT_MS);
+  checkRegularly(REPORT_MS, checkMonitors);
 }

@@ -13,12 +13,12 @@ import { framingText, WHOLE } from "./framing.js";
 import { isStraight } from "./straighten.js";
 import { straightOptics } from "./straight.js";
 import { withKey } from "./hints.js";
+import { ALARMS } from "./alarm.js";
 import { colourOf } from "./colours.js";
 import { announce, boxSize, byId, displayName, factor, latency, make, setAttribute, setText, size, whole } from "./format.js";
 
 export const SHAPES = { live: "●", late: "▲", damaged: "◪", frozen: "■", lost: "✕", off: "○", paused: "❚❚", synchronising: "◌", unsupported: "⊘" };
 const SHORT = { synchronising: "SYNC", unsupported: "NO PICTURE" }; // the overlay has the full word
-const ALARMS = ["late", "damaged", "frozen", "lost", "paused", "unsupported"];
 const SILENT = ["lost", "off", "paused"]; // no frames arrive: the last values are out of date
 export const STALE = [...SILENT, "frozen"]; // the displayed picture is older than when it was drawn
 const THIN = "\u2009"; // space
@@ -335,7 +335,7 @@ function onStatus({ camera: name, status }) {
   if (!part) return;
   refreshStatus(name, part);
   refreshCaption(name, part);
-  if (ALARMS.includes(alertStatus(name, status))) speak(name, `${displayName(name)} ${SHORT[status] ?? status} ${store.refused[name] ?? ""}`.trim());
+  if (alertStatus(name, status) in ALARMS) speak(name, `${displayName(name)} ${SHORT[status] ?? status} ${store.refused[name] ?? ""}`.trim());
 }
 
 /** Have alarms spoken together: a screen reader would drop all but the last of those that come at once. */
