@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import os
+from concurrent.futures import Executor
+from contextlib import AbstractContextManager
 from itertools import chain, product
 from pathlib import Path
 
@@ -60,23 +62,40 @@ experiment:
 def test_worker_processes_report_the_same_as_one_process(
     tod: Command, conf: UserConf, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    conf.write("experiment/many.yaml", f"{EXPERIMENT}{RUNS}    fast: [control.port=-1]\n    slow: [control.prt=1]\n")
-    conf.write("experiment/broken.yaml", f"{EXPERIMENT}{RUNS}cameras:\n  ghost: {{weight: 2}}\n")
-    started: list[int] = []
+    wrong = "    fast: [control.port=-1]\n    slow: [control.prt=1]\n"
+    conf.write("experiment/many.yaml", EXPERIMENT + RUNS + wrong)
+    conf.write("experiment/narrow.yaml", f"{EXPERIMENT}{RUNS}{wrong}cameras:\n  ghost: {{weight: 2}}\n")
+    pools: list[int] = []
     pool = spawned.process_pool
-    monkeypatch.setattr(spawned, "process_pool", lambda workers: started.append(workers) or pool(workers))
-    found = []
-    for cores in ({0, 1}, {0}):
-        monkeypatch.setattr(os, "sched_getaffinity", lambda _pid, cores=cores: cores)
-        found.append(problems(tod, conf))
-    assert started == [1]
-    assert found[0] == found[1]
-    assert found[0] == [
-        "~/experiment/broken.yaml: cameras.ghost: no camera of that name is mounted; its kind is named in the defaults "
-        "list: /cameras@cameras.ghost: KIND",
+
+    def noted(workers: int) -> AbstractContextManager[Executor]:
+        pools.append(workers)
+        return pool(workers)
+
+    monkeypatch.setattr(spawned, "process_pool", noted)
+    expected = [  # nothing of the runs of an experiment that is broken itself
         "~/experiment/many.yaml: experiment.runs.fast: control.port=-1: must be at least 1",
         "~/experiment/many.yaml: experiment.runs.slow: control.prt=1: unknown key, did you mean port?",
+        "~/experiment/narrow.yaml: cameras.ghost: no camera of that name is mounted; its kind is named in the defaults "
+        "list: /cameras@cameras.ghost: KIND",
     ]
+    for cores in ({0, 1}, {0}):
+        monkeypatch.setattr(os, "sched_getaffinity", lambda _pid, cores=cores: cores)
+        assert problems(tod, conf) == expected
+    assert pools == [1]
+
+
+@pytest.mark.slow
+def test_without_shared_memory_one_process_checks_everything(
+    tod: Command, conf: UserConf, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(_workers: int) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _pid: {0, 1})
+    monkeypatch.setattr(spawned, "process_pool", refused)
+    conf.write("experiment/many.yaml", f"{EXPERIMENT}{RUNS}    fast: [control.port=-1]\n")
+    assert problems(tod, conf) == ["~/experiment/many.yaml: experiment.runs.fast: control.port=-1: must be at least 1"]
 
 
 def die(*_: object) -> None:

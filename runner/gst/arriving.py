@@ -21,8 +21,8 @@ CAPTURE_ID = 1  # of the header extension with the capture time
 EXTENDED, SOURCES, MARKER, HALF = 0x10, 0x0F, 0x80, 0x8000  # RFC 3550, section 5.1; half of all sequence numbers
 # Jump of the sequence number, ahead or back, that marks a restarted stream if the next packet follows (RFC 3550, A.1).
 DROPOUT, MISORDER = 3000, 100
-WINDOW_S = 2.0  # the shortest transit time of this long, and of as long before it, is the usual one
-RESTART_S = 10.0  # a longer delay is no delay: the sender's clock was set anew
+WINDOW_S = 5.0  # the usual transit time is the shortest one in this window and the window before it
+RESTART_S = 10.0  # more than this is not delay: the sender's clock was reset
 ONE_BYTE, FIXED_BYTES, WORD_BYTES, NTP_BYTES = b"\xbe\xde", 12, 4, 8  # RFC 8285, section 4.2; RFC 6051
 
 
@@ -185,7 +185,8 @@ class ArrivingFrames:
 class Lateness:
     """How much later than usual the packets of one camera arrive.
 
-    Usual is the shortest transit time of the last packets, between WINDOW_S and twice that; silence does not age it.
+    Usual is the shortest transit time of the last 5 to 10 s. The queue of an outage takes less to drain; silence does
+    not age it.
     """
 
     def __init__(self) -> None:
@@ -193,7 +194,7 @@ class Lateness:
         self._began, self._before, self._shortest = -inf, inf, inf
 
     def of(self, stamp: int, arrived: float) -> float:
-        """Of a packet with an RTP timestamp that arrived at a time, s; 0 at the earliest."""
+        """How late a packet is, s, given its RTP timestamp and its arrival, s; never negative."""
         self._clock.tick(stamp)
         transit = arrived - self._clock.seconds
         if arrived - self._began > WINDOW_S:

@@ -7,7 +7,7 @@ from collections import deque
 
 from gi.repository import GObject, Gst
 
-from runner.gst.arriving import HEADER_BYTES, ArrivingFrames, Lateness, read_packet
+from runner.gst.arriving import HEADER_BYTES, ArrivingFrames, Lateness, Packet, read_packet
 from runner.gst.probes import BufferProbe, PassingBuffer
 from runner.system.recent import RecentValue
 
@@ -30,10 +30,10 @@ class RepairBuffer:
     The buffer itself detects a loss when the next packet arrives. After the last packet of a frame, that is up to 66 ms
     later; so a frame whose end, or all of it, is missing is detected here by a timeout.
 
-    When the buffer gives up a missing packet follows from when packets arrive. If they are suddenly more than 1 s late,
-    it starts anew from the first of them (calculate_skew in rtpjitterbuffer.c). After an outage, that packet has waited
-    for the link: the buffer would wait for lost packets, and hold back the pictures behind them, up to 1 s longer. So
-    no packet may seem to be later than the longest wait.
+    The buffer derives the deadline of a missing packet from arrival times. After a packet that is later than the wait,
+    or suddenly by more than 1 s, its time base starts anew (rtpjitterbuffer.c, calculate_pts and calculate_skew) and
+    returns within seconds. In an outage's queue packets wait for seconds: lost ones would be awaited up to 1 s longer
+    than the wait, and hold back the pictures behind them. So no packet may seem to be later than LONGEST_MS.
 
     reorder_ms  minimum wait
     """
@@ -117,19 +117,20 @@ class RepairBuffer:
         arrived = (self._buffer.get_base_time() + dts) / Gst.SECOND  # a pipeline's clock is the monotonic one
         return arrived if now - LONGEST_S < arrived < now else now
 
-    @staticmethod
-    def _limit_lateness(buffer: PassingBuffer, late: float) -> None:
-        excess_ms = 1000 * late - LONGEST_MS
-        if excess_ms > 0 and buffer.dts is not None:
-            buffer.dts -= round(excess_ms * Gst.MSECOND)
+    def _limit_lateness(self, packet: Packet, buffer: PassingBuffer) -> None:
+        if (dts := buffer.dts) is None:
+            return
+        excess_ms = 1000 * self._lateness.of(packet.stamp, dts / Gst.SECOND) - LONGEST_MS
+        if excess_ms > 0:
+            buffer.dts = max(0, dts - round(excess_ms * Gst.MSECOND))
 
     def _on_packet(self, _pad: Gst.Pad, buffer: PassingBuffer) -> bool:
         now = time.monotonic()
         packet = read_packet(buffer.extract(0, HEADER_BYTES), buffer.size)
         retransmitted = buffer.has_flags(RETRANSMITTED)
         arrived = self._arrived(buffer, now)
-        if not retransmitted:
-            self._limit_lateness(buffer, self._lateness.of(packet.stamp, arrived))
+        if not retransmitted or self._tail_requested:  # the buffer takes that one for an original, see below
+            self._limit_lateness(packet, buffer)
         if not self.frames.add(packet, now, arrived, retransmitted=retransmitted):
             return False
         if self._tail_requested and retransmitted:

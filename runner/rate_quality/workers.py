@@ -12,7 +12,7 @@ from typing import ParamSpec, TypeVar
 
 from runner.errors import RunError
 from runner.system.extras import how_to_install
-from runner.system.spawned import ended, process_pool
+from runner.system.spawned import ending, process_pool
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -36,7 +36,7 @@ def open_executor(workers: str, scheduler: str | None, parallel: int) -> Iterato
         with _dask(scheduler, parallel) as executor:
             yield executor
         return
-    with ended(ThreadPoolExecutor(parallel)) if workers == "threads" else process_pool(parallel) as pool:
+    with ending(ThreadPoolExecutor(parallel)) if workers == "threads" else process_pool(parallel) as pool:
         yield pool
 
 

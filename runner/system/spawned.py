@@ -48,18 +48,20 @@ def process_pool(workers: int) -> Iterator[Executor]:
     """A pool of worker processes that ends with the block."""
     from concurrent.futures import ProcessPoolExecutor
 
-    with ended(ProcessPoolExecutor(workers, WorkerContext())) as pool:
+    with ending(ProcessPoolExecutor(workers, WorkerContext())) as pool:
         yield pool
 
 
 @contextmanager
-def ended(pool: Executor) -> Iterator[Executor]:
+def ending(pool: Executor) -> Iterator[Executor]:
     """End a pool with the block. An error, or Ctrl-C, kills its processes, whose tasks may take minutes."""
+    before = active_children()
     try:
         yield pool
     except BaseException:
         for worker in active_children():
-            worker.kill()
+            if worker not in before:
+                worker.kill()
         raise
     finally:
         pool.shutdown(wait=True, cancel_futures=True)

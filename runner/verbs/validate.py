@@ -27,7 +27,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import product
@@ -48,7 +48,7 @@ from runner.graph import Plan
 from runner.verbs import Arguments
 
 if TYPE_CHECKING:
-    from concurrent.futures import Future
+    from concurrent.futures import Executor, Future
 
 FOLDERS = (*GROUPS, LAYOUT)  # of checked files
 DATA = ("maps", "traces")  # folders for data that pqos files name; a bandwidth map may be YAML
@@ -62,7 +62,8 @@ READERS: dict[str, ConfigReader] = {  # by group, the reader of its part of the 
     "study": Configuration.study,
     "link": Configuration.link,
 }
-RUNS_PER_WORKER = 10  # a worker starts in the time that they take
+RUNS_PER_WORKER = 10  # starting a worker takes as long as checking so many runs
+MOST_WORKERS = 8  # each takes 130 MB
 RunResult = tuple[list[Problem], dict[str, None]]  # problems and notes
 ChosenFiles = tuple[tuple[str, str], ...]  # group and file
 
@@ -113,12 +114,12 @@ def run(arguments: Arguments) -> int:
             raise ConfigError(found)
         tasks = _Tasks(tuple(arguments.overrides), conf, everything, named)
         checker = _Checker(conf, Combinations(arguments.overrides, conf, tasks.choices))
-        if problems := checker.problems(list(tasks)):
+        if problems := checker.check_all(list(tasks)):
             raise ConfigError(problems)
         files, configurations = files + checked, configurations + len({task.words for task in tasks})
         notes |= checker.notes
     print(f"valid: {_counted(files, 'file')}, {_counted(configurations, 'configuration')}")
-    print("\n".join(notes), end="\n" if notes else "")
+    print("\n".join(sorted(notes)), end="\n" if notes else "")  # workers find theirs in any order
     return 0
 
 
@@ -355,24 +356,24 @@ class _Checker:
     def __post_init__(self) -> None:
         self._registry = _registry_check(self.notes)
 
-    def problems(self, tasks: Sequence[ValidationTask]) -> list[Problem]:
+    def check_all(self, tasks: Sequence[ValidationTask]) -> list[Problem]:
         """All problems, in the order of the tasks."""
         found: dict[ValidationTask, list[Problem]] = {}
         with _in_workers([task for task in tasks if task.run], self.user) as pending:
             for task in sorted(tasks, key=pending.__contains__):
                 if self.broken.isdisjoint(task.choices):
-                    found[task] = self._result(pending[task]) if task in pending else self._problems(task)
+                    found[task] = self._collect(pending[task]) if task in pending else self._check(task)
         return [problem for task in tasks for problem in found.get(task, ())]
 
-    def _result(self, future: Future[RunResult]) -> list[Problem]:
+    def _collect(self, future: Future[RunResult]) -> list[Problem]:
         problems, notes = future.result()
         self.notes |= notes
         return problems
 
-    def _problems(self, task: ValidationTask) -> list[Problem]:
+    def _check(self, task: ValidationTask) -> list[Problem]:
         if self._is_fine_assembled(task):
             return []
-        problems = _composed_problems(task, self.user, self._registry)
+        problems = _check_composed(task, self.user, self._registry)
         if problems and len(task.choices) == 1 and not task.run:
             self.broken |= set(task.choices)
         return problems
@@ -401,27 +402,34 @@ def _in_workers(
 
     raises  RunError if a worker process dies
     """
-    workers = min(len(os.sched_getaffinity(0)) - 1, len(runs) // RUNS_PER_WORKER)
-    if not workers:
-        yield {}
-        return
     from concurrent.futures import BrokenExecutor
 
-    from runner.system.spawned import process_pool
-
     try:
-        with process_pool(workers) as pool:
-            yield {run: pool.submit(_check_run, run, user) for run in runs}
+        with ExitStack() as stack:
+            pool = _open_pool(len(runs), stack)
+            yield {run: pool.submit(_check_run, run, user) for run in runs} if pool else {}
     except BrokenExecutor:
         raise RunError("a worker process ended without a result: it may have run out of memory") from None
 
 
+def _open_pool(runs: int, stack: ExitStack) -> Executor | None:
+    workers = min(len(os.sched_getaffinity(0)) - 1, runs // RUNS_PER_WORKER, MOST_WORKERS)
+    if not workers:
+        return None
+    from runner.system.spawned import process_pool
+
+    try:
+        return stack.enter_context(process_pool(workers))
+    except OSError:  # no shared memory for its queue, as in some containers
+        return None
+
+
 def _check_run(run: ValidationTask, user: Path | None) -> RunResult:
     notes: dict[str, None] = {}
-    return _composed_problems(run, user, _registry_check(notes)), notes
+    return _check_composed(run, user, _registry_check(notes)), notes
 
 
-def _composed_problems(task: ValidationTask, user: Path | None, check: PlanCheck | None) -> list[Problem]:
+def _check_composed(task: ValidationTask, user: Path | None, check: PlanCheck | None) -> list[Problem]:
     try:
         composed = _composed(task.words, user)
         config = Configuration(composed, user, runnable=False, bags=True, check=check)

@@ -1,7 +1,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-import { GuideLines, STEERING_STEP_RAD, withoutStraight } from "../../runner/page/static/guide_lines.js";
+import { COLOURS, GuideLines, STEERING_STEP_RAD, withoutStraight } from "../../runner/page/static/guide_lines.js";
 
 test("a straight line keeps its ends", () => {
   const points = Array.from({ length: 60 }, (_, i) => ({ x: 3 * i, y: 7 - 2 * i }));
@@ -35,17 +35,24 @@ const NATIVE = { width: 640, height: 360, left: 0, top: 0 };
 const CAMERA = { native: NATIVE, fov_deg: 90, lens: "pinhole", pose: { x_m: 2, y_m: 0, z_m: 1.5, yaw_deg: 0, pitch_deg: 0, roll_deg: 0 }, calibrated: true };
 const DIMENSIONS = { wheelbase_m: 2.9, track_m: 1.65, width_m: 1.92, front_m: 3.65, rear_m: 0.95 };
 
-/** Draws into a canvas that records how many paths were built, and returns the lines. */
+/** Draws into a canvas that records how many paths were built, and returns the lines and what was stroked, in order. */
 function drawing() {
   const paths = { built: 0 };
-  globalThis.Path2D = class { constructor() { paths.built++; } moveTo() {} lineTo() {} };
-  const nothing = Object.fromEntries(["save", "restore", "stroke", "strokeText", "fillText", "transform", "translate"].map((name) => [name, () => {}]));
+  globalThis.Path2D = class {
+    points = [];
+    constructor() { paths.built++; }
+    moveTo(x, y) { this.points.push([x, y]); }
+    lineTo(x, y) { this.points.push([x, y]); }
+  };
+  const nothing = Object.fromEntries(["save", "restore", "strokeText", "fillText", "transform", "translate"].map((name) => [name, () => {}]));
   const lines = new GuideLines(CAMERA, DIMENSIONS);
   lines.shown = true;
   const draw = ({ region = { x: 0, y: 0, width: 640, height: 360 }, canvas = { width: 640, height: 360 }, rad = 0.1 } = {}) => {
     const area = { x: 0, y: 0, ...canvas };
-    lines.draw({ ...nothing, canvas, measureText: () => ({ width: 10 }) }, { region, rad, area, css: 1, mirrored: false });
-    return structuredClone(lines.drawn);
+    const stroked = [];
+    const context = { ...nothing, canvas, measureText: () => ({ width: 10 }), stroke({ points }) { stroked.push([this.strokeStyle, this.lineWidth, points]); } };
+    lines.draw(context, { region, rad, area, css: 1, mirrored: false });
+    return structuredClone({ lines: lines.drawn, stroked });
   };
   return { lines, paths, draw };
 }
@@ -65,15 +72,28 @@ test("lines follow the region, the size of the canvas, the steering and the opti
   const first = draw();
   const changes = { region: { x: 160, y: 90, width: 320, height: 180 }, canvas: { width: 1280, height: 720 }, rad: -0.1 };
   for (const [what, value] of Object.entries(changes)) {
-    assert.notDeepEqual(draw({ [what]: value }), first, what);
+    const changed = draw({ [what]: value });
+    assert.notDeepEqual(changed.lines, first.lines, what);
+    assert.notDeepEqual(changed.stroked, first.stroked, what);
     assert.deepEqual(draw(), first, what);
   }
   const doubled = draw({ canvas: changes.canvas });
-  assert.ok(Math.abs(doubled[0].pieces[0][0].x - 2 * first[0].pieces[0][0].x) < 1e-9);
+  assert.ok(Math.abs(doubled.lines[0].pieces[0][0].x - 2 * first.lines[0].pieces[0][0].x) < 1e-9);
   lines.setOptics({ ...CAMERA, fov_deg: 60 });
-  assert.notDeepEqual(draw(), first);
+  assert.notDeepEqual(draw().stroked, first.stroked);
   lines.setOptics(CAMERA);
   assert.deepEqual(draw(), first);
-  assert.equal(draw({ rad: null }).some(({ kind }) => kind === "path"), false);
+  assert.equal(draw({ rad: null }).lines.some(({ kind }) => kind === "path"), false);
   assert.deepEqual(draw(), first);
+});
+
+test("all outlines are drawn before the lines", () => {
+  const { stroked } = drawing().draw();
+  const [outlines, lines] = [stroked.slice(0, 3), stroked.slice(3)];
+  assert.deepEqual(lines.map(([colour]) => colour), Object.values(COLOURS));
+  for (const [i, [colour, width, points]] of outlines.entries()) {
+    assert.equal(colour, "rgba(0,0,0,0.55)");
+    assert.ok(width > lines[i][1]);
+    assert.deepEqual(points, lines[i][2]);
+  }
 });

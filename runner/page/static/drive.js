@@ -16,7 +16,7 @@ import { byId, displayName, latency, setAttribute, setText, whole } from "./form
 
 const MODES = { single: "Single", automatic: "Automatic", collective: "Collective" };
 const WORDS = { unsupported: "NO PICTURE" };
-const STANDING = Object.keys(ALARMS).filter((status) => ALARMS[status] === "lost");
+const NOT_LIVE = Object.keys(ALARMS).filter((status) => ALARMS[status] === "lost");
 const KMH = 3.6; // of 1 m/s
 const GUIDES = "tod-guides";
 const RETURNED_MS = 1000; // a press within this time belongs to the return
@@ -47,24 +47,24 @@ function refresh() {
   }
 }
 
-/** The worst latency of all pictures, in monitors as well. A picture that stands still has none, and is worse than any. */
+/** The worst latency of all pictures, in monitors as well. A picture that is not live has none, and is worse than any. */
 function refreshLatency() {
   const { camera, age_ms, bound_ms, level } = worstOf([...ownPictures(), ...inMonitors()], store.hello?.late_ms ?? 0);
-  const standing = names().filter(isStanding);
+  const notLive = names().filter(isNotLive);
   const from = camera === null ? "no moving picture" : `${level === "unknown" ? "unknown" : "worst"}: ${displayName(camera)}`;
-  setAttribute(byId("latency"), "data-level", standing.length ? "late" : level);
+  setAttribute(byId("latency"), "data-level", notLive.length ? "late" : level);
   setText(byId("worst"), latency(age_ms, bound_ms));
-  setText(byId("worst-of"), standing.length ? `${standing.length} of ${names().length} pictures not live` : from);
+  setText(byId("worst-of"), notLive.length ? `${notLive.length} of ${names().length} pictures not live` : from);
 }
 
 /** Pictures in monitors, which say where they are. */
 const inMonitors = () => monitored().map((picture) => ({ ...picture, camera: inMonitor(picture.camera) }));
 const inMonitor = (camera) => `${displayName(camera)} (monitor)`;
 
-/** Whether a camera's picture stands still, here or in a monitor. */
-function isStanding(camera) {
+/** Whether a camera's picture is not live, here or in a monitor. */
+function isNotLive(camera) {
   const shown = monitored().filter((other) => other.camera === camera).map(({ status }) => status);
-  return [store.status[camera], ...shown].some((status) => STANDING.includes(alertStatus(camera, status)));
+  return [store.status[camera], ...shown].some((status) => NOT_LIVE.includes(alertStatus(camera, status)));
 }
 
 function refreshSpeed() {
@@ -103,7 +103,7 @@ function showAlarms(element, cameras, further = []) {
   const found = Object.keys(ALARMS).map((status) => ({ status, pictures: picturesOf(status, cameras) })).filter(({ pictures }) => pictures.length);
   const texts = found.map(({ status, pictures }) => `${SHAPES[status]} ${WORDS[status] ?? status.toUpperCase()} ${pictures.join(", ")}`);
   setText(element, [...texts, ...further].join("  "));
-  setAttribute(element, "data-level", found.some(({ status }) => STANDING.includes(status)) ? "late" : "near");
+  setAttribute(element, "data-level", found.some(({ status }) => NOT_LIVE.includes(status)) ? "late" : "near");
   return found.length > 0;
 }
 

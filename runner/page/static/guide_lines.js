@@ -16,7 +16,7 @@ const STRAIGHT_PX = 0.1; // of the canvas: points closer to a straight line are 
 export const STEERING_STEP_RAD = 1e-3; // a smaller change of the steering moves no line by a pixel
 
 /** @typedef {{kind: string, metres: number|null, pieces: import("./projection.js").Point[][]}} Line */
-/** @typedef {{lines: Line[], paths: Map<string, Path2D>}} Placed lines in the canvas, px, and a path for each kind */
+/** @typedef {{lines: Line[], strokes: Map<string, Path2D>}} InCanvas lines in the canvas, px, and what is stroked for each kind */
 /**
  * @typedef {object} Shown how a picture is shown
  * @property {import("./framing.js").Rectangle} region of the full image that the canvas shows, px
@@ -26,8 +26,8 @@ export const STEERING_STEP_RAD = 1e-3; // a smaller change of the steering moves
  * @property {boolean} mirrored whether the canvas is mirrored
  */
 
-/** @type {Placed} */
-const NOTHING = { lines: [], paths: new Map() };
+/** @type {InCanvas} */
+const NOTHING = { lines: [], strokes: new Map() };
 
 export class GuideLines {
   shown = false;
@@ -35,8 +35,8 @@ export class GuideLines {
   drawn = []; // for tests: in the canvas, px
   /** @type {{rad: number, lines: Line[]}} */
   paths = { rad: NaN, lines: [] }; // in the full image
-  /** @type {{where: string, rad: number|null, straight: Placed, paths: Placed}} */
-  placed = { where: "", rad: null, straight: NOTHING, paths: NOTHING };
+  /** @type {{where: string, rad: number|null, straight: InCanvas, wheels: InCanvas}} */
+  placed = { where: "", rad: null, straight: NOTHING, wheels: NOTHING };
 
   /**
    * @param {import("./projection.js").Optics & {calibrated: boolean}} camera
@@ -81,8 +81,8 @@ export class GuideLines {
     const moved = where !== this.placed.where;
     if (!moved && rounded === this.placed.rad) return;
     const toCanvas = ({ x, y }) => ({ x: ((x - region.x) * width) / region.width, y: ((y - region.y) * height) / region.height });
-    const straight = moved ? placed(this.straight, toCanvas) : this.placed.straight;
-    this.placed = { where, rad: rounded, straight, paths: rounded === null ? NOTHING : placed(this.pathsFor(rounded), toCanvas) };
+    const straight = moved ? inCanvas(this.straight, toCanvas) : this.placed.straight;
+    this.placed = { where, rad: rounded, straight, wheels: rounded === null ? NOTHING : inCanvas(this.pathsFor(rounded), toCanvas) };
   }
 
   /**
@@ -95,7 +95,7 @@ export class GuideLines {
     if (!this.shown || !seen) return;
     const { region, rad, area, css, mirrored } = seen;
     this.place(region, context.canvas, rad);
-    this.drawn = [...this.placed.straight.lines, ...this.placed.paths.lines];
+    this.drawn = [...this.placed.straight.lines, ...this.placed.wheels.lines];
     const thick = css * Math.min(1.5, Math.max(0.6, context.canvas.width / css / USUAL_PX));
     context.save();
     this.strokeAll(context, thick);
@@ -108,14 +108,14 @@ export class GuideLines {
 
   /** All outlines, and then the lines, so that no outline covers a line; those of one kind at once. */
   strokeAll(context, thick) {
-    const paths = [...this.placed.straight.paths, ...this.placed.paths.paths];
+    const strokes = [...this.placed.straight.strokes, ...this.placed.wheels.strokes];
     context.lineJoin = "round";
     context.strokeStyle = "rgba(0,0,0,0.55)";
-    for (const [kind, path] of paths) {
+    for (const [kind, path] of strokes) {
       context.lineWidth = thick * (LINE_WIDTHS[kind] + OUTLINE);
       context.stroke(path);
     }
-    for (const [kind, path] of paths) {
+    for (const [kind, path] of strokes) {
       context.lineWidth = thick * LINE_WIDTHS[kind];
       context.strokeStyle = COLOURS[kind];
       context.stroke(path);
@@ -125,12 +125,12 @@ export class GuideLines {
 
 /**
  * @param {Line[]} guides  @param {(point: import("./projection.js").Point) => import("./projection.js").Point} toCanvas
- * @returns {Placed}
+ * @returns {InCanvas}
  */
-function placed(guides, toCanvas) {
+function inCanvas(guides, toCanvas) {
   const lines = guides.map((guide) => ({ ...guide, pieces: guide.pieces.map((piece) => piece.map(toCanvas)) }));
   const kinds = new Set(lines.map(({ kind }) => kind));
-  return { lines, paths: new Map([...kinds].map((kind) => [kind, pathOf(lines.filter((line) => line.kind === kind))])) };
+  return { lines, strokes: new Map([...kinds].map((kind) => [kind, pathOf(lines.filter((line) => line.kind === kind))])) };
 }
 
 /** @param {Line[]} lines */

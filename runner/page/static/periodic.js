@@ -1,4 +1,4 @@
-/** Checks of what should have arrived meanwhile. */
+/** Periodic checks that something still arrives. */
 
 /**
  * Check every so many ms, except just after the page itself has stalled: what arrived meanwhile is still queued.
