@@ -20,7 +20,8 @@ DECAY = 0.75  # of both counts, from one update to the next
 INITIAL_RTT_MS = 100  # round trip assumed until the first retransmission
 LONGEST_MS = 300  # a picture that is later is useless for driving
 RETRANSMITTED = Gst.BufferFlags.LAST  # GST_RTP_BUFFER_FLAG_RETRANSMISSION, which has the same value
-LONGEST_S = 2.0  # a packet that seems to have arrived earlier has another clock's time
+LONGEST_S = 2.0  # a packet that seems to have arrived earlier has another clock's time ...
+CLOCK_STEP_S = 0.1  # ... and one that seems to arrive so much later
 FRAMES = 64  # whose end is remembered
 
 
@@ -110,12 +111,19 @@ class RepairBuffer:
         self._pad.push_event(Gst.Event.new_custom(Gst.EventType.CUSTOM_UPSTREAM, request))
 
     def _arrived(self, buffer: PassingBuffer, now: float) -> float:
-        """When the kernel received a packet, s, where the DTS states it: see `runner.gst.packet_times`."""
+        """When the kernel received a packet, s, where the DTS states it: see `runner.gst.packet_times`.
+
+        A DTS that cannot be right, because the kernel's clock is not this process's, is corrected.
+        """
         dts = buffer.dts
         if dts is None:
             return now
-        arrived = (self._buffer.get_base_time() + dts) / Gst.SECOND  # a pipeline's clock is the monotonic one
-        return arrived if now - LONGEST_S < arrived < now else now
+        base_time = self._buffer.get_base_time()  # a pipeline's clock is the monotonic one
+        arrived: float = (base_time + dts) / Gst.SECOND
+        if now - LONGEST_S < arrived < now + CLOCK_STEP_S:
+            return min(arrived, now)
+        buffer.dts = max(0, round(now * Gst.SECOND) - base_time)
+        return now
 
     def _limit_lateness(self, packet: Packet, buffer: PassingBuffer) -> None:
         if (dts := buffer.dts) is None:
