@@ -2,7 +2,7 @@
 # make test   install what is missing, then everything that CI runs
 # make check  lint, types, import contracts, schemas, unit tests: no GStreamer, no browser
 # make javascript  only the checks of the pages' scripts
-# make soak   long repetitions of faults that a drive must survive, 70 minutes; SOAK=0.1 make soak is a tenth, KEYS=1 encrypts
+# make soak   long repetitions of faults that a drive must survive, 80 minutes; SOAK=0.1 make soak is a tenth, KEYS=1 encrypts
 # make deadspot UPLINK=FILE.csv  two drives over a recorded uplink: the picture of the README
 # make setup  install what driving needs; the command is then .venv/bin/tod-runner
 # make ros2   ROS 2 in an environment of its own, .venv-ros2; docs/ros.md

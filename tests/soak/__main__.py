@@ -2,7 +2,7 @@
 new sizes, garbage, reports of any kind, clocks that drift apart, outages with keys, addresses that change, and
 thousands of changes that must leak nothing.
 
-    make soak                           everything, about 70 minutes on two cores
+    make soak                           everything, about 80 minutes on two cores
     SOAK=0.1 make soak                  a tenth of it
     SOAK_SEED=7 make soak               repeats the random choices; each run prints its seed
     make soak PARTS="stalls hostile"    some parts only
