@@ -20,8 +20,9 @@ DECAY = 0.75  # of both counts, from one update to the next
 INITIAL_RTT_MS = 100  # round trip assumed until the first retransmission
 LONGEST_MS = 300  # a picture that is later is useless for driving
 RETRANSMITTED = Gst.BufferFlags.LAST  # GST_RTP_BUFFER_FLAG_RETRANSMISSION, which has the same value
-LONGEST_S = 2.0  # a packet that seems to have arrived earlier has another clock's time ...
-CLOCK_STEP_S = 0.1  # ... and one that seems to arrive so much later
+# A packet waits for less than the first in the kernel; one that seems to have waited longer, or to arrive in the future
+# by more than the second, has another clock's time.
+UNREAD_S, FUTURE_S = 2.0, 0.1
 FRAMES = 64  # whose end is remembered
 
 
@@ -120,7 +121,7 @@ class RepairBuffer:
             return now
         base_time = self._buffer.get_base_time()  # a pipeline's clock is the monotonic one
         arrived: float = (base_time + dts) / Gst.SECOND
-        if now - LONGEST_S < arrived < now + CLOCK_STEP_S:
+        if now - UNREAD_S < arrived < now + FUTURE_S:
             return min(arrived, now)
         buffer.dts = max(0, round(now * Gst.SECOND) - base_time)
         return now
