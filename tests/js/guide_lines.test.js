@@ -8,15 +8,15 @@ test("a straight line keeps its ends", () => {
   assert.deepEqual(withoutStraight(points), [points[0], points[59]]);
 });
 
-test("a curve stays within a tenth of a pixel of its points", () => {
+test("a curve stays within a quarter of a pixel of its points", () => {
   const points = Array.from({ length: 90 }, (_, i) => ({ x: 500 * Math.cos(i / 60), y: 300 * Math.sin(i / 60) }));
   const kept = withoutStraight(points);
-  assert.ok(kept.length > 5 && kept.length < 60, `${kept.length}`);
+  assert.ok(kept.length > 5 && kept.length < 40, `${kept.length}`);
   for (const point of points) {
     const after = kept.findIndex(({ x }) => x <= point.x);
     const [a, b] = [kept[Math.max(0, after - 1)], kept[Math.max(1, after)]];
     const apart = Math.abs((point.x - a.x) * (b.y - a.y) - (point.y - a.y) * (b.x - a.x)) / Math.hypot(b.x - a.x, b.y - a.y);
-    assert.ok(apart < 0.1, `${apart}`);
+    assert.ok(apart < 0.25, `${apart}`);
   }
 });
 

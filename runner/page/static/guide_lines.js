@@ -12,7 +12,7 @@ const LINE_WIDTHS = { width: 1.5, distance: 1.5, path: 3 }; // CSS px, on a pict
 const OUTLINE = 2; // CSS px, likewise
 export const ESTIMATED = "ESTIMATED"; // label of what is computed for a camera that is not calibrated
 const USUAL_PX = 960;
-const STRAIGHT_PX = 0.1; // of the canvas: points closer to a straight line are left out
+const STRAIGHT_PX = 0.25; // of the canvas: points closer to a straight line are left out
 export const STEERING_STEP_RAD = 1e-3; // a smaller change of the steering moves no line by a pixel
 
 /** @typedef {{kind: string, metres: number|null, pieces: import("./projection.js").Point[][]}} Line */
@@ -109,7 +109,7 @@ export class GuideLines {
   /** All outlines, and then the lines, so that no outline covers a line; those of one kind at once. */
   strokeAll(context, thick) {
     const strokes = [...this.placed.straight.strokes, ...this.placed.wheels.strokes];
-    context.lineJoin = "round";
+    context.lineJoin = "bevel"; // the lines bend so little that round joins look the same and take longer
     context.strokeStyle = "rgba(0,0,0,0.55)";
     for (const [kind, path] of strokes) {
       context.lineWidth = thick * (LINE_WIDTHS[kind] + OUTLINE);
