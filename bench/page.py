@@ -43,6 +43,7 @@ ONE, EIGHT = (
     ("one camera 960x540 at 30 Hz", 1, (960, 540, 30), 2500),
     ("eight 640x360 at 15 Hz", 8, (640, 360, 15), 6000),
 )
+SMALL = ("eight 320x180 at 15 Hz", 8, (320, 180, 15), 3000)  # shown as large; both sides leave the page more time
 COUNTS = (1, 2, 4, 8)  # of cameras, for skipped pictures
 PAIRS = 10  # of blocks with and without overlays or the bird's-eye view
 TOP_VIEWS = 4  # cameras of a bird's-eye view, which replaces their own pictures
@@ -69,7 +70,7 @@ def rows(seconds: float = 30, *, headless: bool = True) -> list[Row]:
             *measure(browser, *ONE, seconds),
             *measure(browser, *EIGHT, seconds),
             *(skipped(browser, count, seconds / 2) for count in COUNTS),
-            *(row for video in (ONE, EIGHT) for row in overlays(browser, *video, seconds)),
+            *(row for video in (ONE, SMALL, EIGHT) for row in overlays(browser, *video, seconds)),
             *birdseye(browser, *EIGHT, seconds),
         ]
         browser.close()
