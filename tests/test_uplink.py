@@ -586,6 +586,22 @@ def test_a_prediction_that_falls_soon_after_it_proved_too_high_was_not_late() ->
             assert cap.kbps <= 1.05 * kbps
 
 
+@pytest.mark.parametrize(("limit", "kbps"), [(4000, 3680), (3700, 3680), (1995, 1288)])
+def test_a_prediction_that_falls_further_than_the_link_has_fallen_announces_another_fall(
+    limit: float, kbps: float
+) -> None:
+    """Soon after the start any link narrower than predicted seems to have fallen."""
+    cap = capped(4000, 5700, 3680)._replace(overuse=Overuse(10.0, Fraction(4000), Fraction(5700), fell=True))
+    assert reported(cap, limit, (11.0, "filling", 3900, 10)) == [kbps]
+
+
+def test_a_rate_from_before_a_fall_of_the_prediction_raises_no_cap_soon_after_the_start() -> None:
+    """Such a cap grows beyond what is known without proof: it keeps to what is known when the prediction falls."""
+    cap = capped(14000, 20000, 17500)._replace(began=9.5, overuse=Overuse(10.0, Fraction(14000), Fraction(20000)))
+    reports = [(10.5 + n * 0.04, "clear", 14500, 0) for n in range(10)]
+    assert set(reported(cap, 5000, *reports)) == {3220}, "0.92 of 14 of 20"
+
+
 def test_an_operators_total_that_falls_lowers_no_cap_below_it() -> None:
     """Only a prediction that falls says something about the link."""
     cap = follow(capped(3000, 6000, 2800), Fraction(3500), is_prediction=False)

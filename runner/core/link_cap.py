@@ -216,10 +216,11 @@ def _recover(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps
         return cap  # a cap that is not in force is untested, and so does not grow
     if cap.provisional and t - cap.began >= capacity.BEGIN_S:  # static pictures may never fill it
         return cap._replace(kbps=None, provisional=False, changed=t)
-    if cap.provisional and cap.before is None:
-        return cap  # it does not grow before a rate has been measured
     steps, factor, last = cap.steps, FAST, cap.overuse
-    if cap.provisional or (last and last.t - cap.began < capacity.BEGIN_S):
+    begins = cap.provisional or (last is not None and last.t - cap.began < capacity.BEGIN_S)
+    if (cap.provisional and cap.before is None) or (begins and capacity.just_fell(cap, link, t)):
+        return cap  # it does not grow before a rate has been measured under this limit
+    if begins:
         factor = min(FAST, BEGIN * (link.kbps or 0) / cap.kbps)
     elif last:
         factor = min(FAST, capacity.RESERVE * last.known(full) / cap.kbps)

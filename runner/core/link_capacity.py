@@ -30,11 +30,12 @@ def fall_with_limit(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
     last, before = cap.overuse, cap.limit.kbps
     if not cap.predicted or cap.kbps is None or last is None or limit >= before:
         return cap
-    if last.fell and t - last.t <= LATE_S:
+    if _was_late(last, t, limit):
         return cap
     sent, known = cap.in_force(before), min(limit, last.known(limit))
     same_share = sent * limit / before
-    is_outdated = known < FELL * same_share
+    has_begun = last.t - cap.began >= BEGIN_S  # before, the cap grows beyond what is known without proof
+    is_outdated = has_begun and known < FELL * same_share
     return cap._replace(kbps=tenths(same_share if is_outdated else min(sent, RESERVE * known)))
 
 
@@ -53,11 +54,16 @@ def adapt_overuse(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
         cap = cap._replace(outage=None)
     elif cap.outage and limit >= OUTAGE * cap.outage.limit:
         return _end_outage(cap, t, limit, cap.outage.overuse)
-    if last is None or not last.fell or limit >= last.limit or last.carried >= last.limit or t - last.t > LATE_S:
+    if last is None or limit >= last.limit or last.carried >= last.limit or not _was_late(last, t, limit):
         return cap
     followed = max(limit, last.carried)
     trust = relieve(cap.trust, last.t, followed / last.limit)
     return cap._replace(overuse=last._replace(limit=followed), trust=trust)
+
+
+def _was_late(last: Overuse, t: float, limit: Kbps) -> bool:
+    """Whether a limit that falls only follows the link. To clearly less than the link carries since, it falls again."""
+    return last.fell and t - last.t <= LATE_S and limit >= FELL * last.carried
 
 
 def _end_outage(cap: LinkCap, t: float, limit: Kbps, before: Overuse | None) -> LinkCap:
@@ -108,7 +114,7 @@ def raise_known(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> Link
     measured under the one before.
     """
     last = cap.overuse
-    if cap.predicted and _is_recent(cap.limit.fell, link, t):
+    if just_fell(cap, link, t):
         limit = max(limit, cap.limit.before_fall)
     if last is None or link.kbps is None or link.kbps <= (known := last.known(limit)):
         return cap
@@ -117,6 +123,11 @@ def raise_known(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> Link
     if _is_recent(cap.lowering.t, link, t):
         return cap._replace(overuse=_known_now(last, max(known, min(link.kbps, cap.lowering.known)), limit))
     return cap
+
+
+def just_fell(cap: LinkCap, link: LinkMeasured, t: float) -> bool:
+    """Whether what arrives may have been sent before the prediction fell."""
+    return cap.predicted and _is_recent(cap.limit.fell, link, t)
 
 
 def _known_now(last: Overuse, carried: Kbps, limit: Kbps) -> Overuse:
