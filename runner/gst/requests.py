@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+import weakref
+from collections import OrderedDict
 from collections.abc import Callable
 
 from gi.repository import Gst
@@ -10,10 +12,28 @@ from gi.repository import Gst
 from runner.gst.probes import RequestProbe
 
 # Packets resent, at most, per packet sent. Up to 15 % loss an operator's side requests each missing packet, and again
-# after a round trip; there may be several viewers.
-REPEATED = 0.5
+# after a round trip. If there are several viewers, each gets fewer: all receive what one of them has requested, and one
+# whose own link is narrow requests most packets, which takes the uplink from the others.
+REPEATED, SHARED = 0.5, 0.1
 AT_ONCE = 300  # packets resent at once, as after a short outage: 0.4 s of 8 Mbit/s
+FIRST = 50  # to a new viewer beside others
+REMEMBERED = 16  # viewers, the latest ones: each may change its SSRC
 KEY_UNIT_S = 1.0  # between two requests for a key frame
+
+
+class _Allowance:
+    """Packets that may be resent.
+
+    sent  RTP sequence number of the newest packet
+    """
+
+    def __init__(self, sent: int, packets: float) -> None:
+        self._sent, self.packets = sent, packets
+
+    def earn(self, sent: int, share: float) -> None:
+        """Add a share of the packets that were sent since the last request."""
+        self.packets = min(AT_ONCE, self.packets + share * ((sent - self._sent) % 65536))
+        self._sent = sent
 
 
 class RequestLimit:
@@ -24,13 +44,17 @@ class RequestLimit:
 
     packets    source pad of the payloader
     on_report  called, from a streaming thread, when the limit is first exceeded
+    viewers    number of viewers
     """
+
+    viewers = 1
 
     def __init__(self, packets: Gst.Pad, on_report: Callable[[str], None]) -> None:
         self._payloader, self._on_report = packets.get_parent_element(), on_report
         self._has_payloader = self._payloader.find_property("seqnum") is not None  # else nothing counts the packets
-        self._allowance = float(AT_ONCE)
-        self._sent = 0  # RTP sequence number at the last request
+        self._all = _Allowance(0, AT_ONCE)
+        self._by_viewer: OrderedDict[int, _Allowance] = OrderedDict()  # by SSRC
+        self._asking = 0  # SSRC of the viewer whose request is being handled
         self._key_unit: float | None = None  # when the last one was granted
         self._reported = False
         self._retransmissions = RequestProbe("GstRTPRetransmissionRequest", self._grant_retransmission)  # NACK
@@ -42,14 +66,24 @@ class RequestLimit:
         if self._has_payloader:
             self._retransmissions.add_to(element.get_static_pad("src"))
 
+    def add_session(self, element: Gst.Element) -> None:
+        """The RTP session by which viewers request packets."""
+        element.get_property("internal-session").connect("on-feedback-rtcp", _on_feedback, weakref.ref(self))
+
     def _grant_retransmission(self) -> bool:
         sent: int = self._payloader.get_property("seqnum")
-        self._allowance = min(AT_ONCE, self._allowance + REPEATED * ((sent - self._sent) % 65536))
-        self._sent = sent
-        if self._allowance < 1:
+        first, share = (FIRST, SHARED) if self.viewers > 1 else (AT_ONCE, REPEATED)
+        viewer = self._by_viewer.pop(self._asking, None) or _Allowance(sent, first)
+        self._by_viewer[self._asking] = viewer
+        if len(self._by_viewer) > REMEMBERED:
+            self._by_viewer.popitem(last=False)
+        self._all.earn(sent, REPEATED)
+        viewer.earn(sent, share)
+        if min(self._all.packets, viewer.packets) < 1:
             self._report_limit()
             return False
-        self._allowance -= 1
+        self._all.packets -= 1
+        viewer.packets -= 1
         return True
 
     def _grant_key_unit(self) -> bool:
@@ -62,6 +96,12 @@ class RequestLimit:
     def _report_limit(self) -> None:
         if not self._reported:
             self._reported = True
-            self._on_report(
-                f"viewers request more than {100 * REPEATED:.0f} % of the packets again; some requests are ignored"
-            )
+            self._on_report("viewers request too many packets again; some requests are ignored")
+
+
+def _on_feedback(
+    _session: object, _kind: int, _format: int, sender: int, _media: int, _fci: object, limit: weakref.ref[RequestLimit]
+) -> None:
+    """Called in the streaming thread, right before the requests of an RTCP packet go upstream as events."""
+    if own := limit():
+        own._asking = sender

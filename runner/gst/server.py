@@ -560,6 +560,8 @@ class CameraServer:
         self._wake(left)
         for name in left:
             self._unblock(name, now)
+        for name, pipeline in tuple(self.pipelines.items()):
+            pipeline.requests.viewers = len(self._watching(name))
         if self._viewers:
             self._drop_silent([connection for _, connection in connections], now)
         for client, connection in connections:
@@ -780,6 +782,8 @@ def _on_element(pipeline: Gst.Bin, parent: Gst.Bin, element: Gst.Element, built:
     camera = built()
     if camera and factory == "rtprtxsend":
         camera.requests.add_store(element)
+    if camera and factory == "rtpsession":
+        camera.requests.add_session(element)
     if element.find_property("processing-deadline"):
         # Sinks of a live pipeline hold packets until their time: pure latency, and retransmissions wait behind them.
         element.set_property("sync", False)

@@ -414,11 +414,15 @@ def streaming(*overrides: str, cameras: Sequence[str] = ("front_left",)) -> Iter
 
 
 class Client:
-    """Receives and decodes one camera; keeps the size of each frame and, if requested, the last picture."""
+    """Receives and decodes one camera; keeps the size of each frame and, if requested, the last picture.
 
-    def __init__(self, plan: Any, *, pictures: bool = False) -> None:
+    feedback  requests retransmission of lost packets (AVPF), as the operator's side does
+    """
+
+    def __init__(self, plan: Any, *, pictures: bool = False, feedback: bool = False) -> None:
         from runner.gst import Gst
         from runner.gst.caps import structure
+        from runner.gst.receiver import prefer_feedback
 
         self._gst, self._structure = Gst, structure
         line = plan.receiver
@@ -434,6 +438,8 @@ class Client:
             client = self.pipeline.get_by_name(element.name)
             if client and client.find_property("tcp-timeout"):  # as patient as the server: it does not reconnect
                 client.set_property("tcp-timeout", 20_000_000)
+            if client and feedback:
+                prefer_feedback(client)
         self._sink = self.pipeline.get_by_name("sink")
         self._sink.get_static_pad("sink").add_probe(Gst.PadProbeType.BUFFER, self._on_frame)
         self.pipeline.get_bus().set_sync_handler(self._on_message)
@@ -478,8 +484,8 @@ class Client:
 
 
 @contextmanager
-def watching(plan: Any, *, pictures: bool = False) -> Iterator[Client]:
-    client = Client(plan, pictures=pictures)
+def watching(plan: Any, *, pictures: bool = False, feedback: bool = False) -> Iterator[Client]:
+    client = Client(plan, pictures=pictures, feedback=feedback)
     try:
         yield client
     finally:

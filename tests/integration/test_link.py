@@ -173,12 +173,16 @@ def test_rtsp_over_tcp_is_queued_where_udp_is_dropped():
 
 @needs_root
 @pytest.mark.alone
-def test_two_viewers_share_the_total_although_one_has_a_narrow_link():
-    """Both copies leave the vehicle over one link; most packets of the second one are lost behind it."""
+@pytest.mark.parametrize("feedback", [False, True], ids=["AVP", "AVPF"])
+def test_two_viewers_share_the_total_although_one_has_a_narrow_link(feedback):
+    """Both copies leave the vehicle over one link; most packets of the second one are lost behind it.
+
+    With feedback it requests them again and again.
+    """
     with driving("netns", lambda t: 20_000, sent_kbps=1400) as drive:
         drive.settle()
         alone, before = drive.kbps(), drive.received()
-        with watching(drive.plan) as second:
+        with watching(drive.plan, feedback=feedback) as second:
             passed = _narrow(second, kbps=200)
             until(passed)
             drive.settle()
