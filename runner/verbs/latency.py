@@ -12,7 +12,7 @@ the difference, which camera and screen add; and latency.fixed_ms, to be given t
 With loop=true the vehicle's side runs here, too, and its camera delivers drawn pictures of the counter. Without camera
 and screen in between, the difference shows how far the page's latency can be trusted.
 
-  tod-runner latency camera=front_center media.host=192.0.2.7 control.host=192.0.2.7
+  tod-runner latency camera=front_center keys=keys/alice media.host=192.0.2.7 control.host=192.0.2.1 control.port=8883
   tod-runner latency camera=rear vehicle=delivery_robot loop=true fps_max=15
 """
 

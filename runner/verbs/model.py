@@ -15,7 +15,7 @@ bitrates_kbps= b_full_quality= cpu_cores= pool= masks= metric_every= workers= an
 Measurements are cached by content in the user's cache directory: an interrupted run resumes where it stopped.
 
   tod-runner model camera=front_center sequence=drive.mp4 output=models
-  tod-runner model camera=front_center sequence=drive.mp4 output=models metric=[mssim,psnr] plan=full
+  tod-runner model camera=front_center sequence=drive.mp4 output=models 'metric=[mssim,psnr]' plan=full
   tod-runner model vehicle=tum_q7 sequence=recording/ output=models 'pool={front_side:[front_left,front_right]}'
   tod-runner model vehicle=tum_q7 source=synthetic output=models graph=openh264_rtsp
   tod-runner model camera=front_left sequence=drive.mcap cameras.front_left.topic=/left/image_raw output=models

@@ -9,7 +9,7 @@ DIR/operator.jsonl, for `report` and `export`; with drives=DIR to DIR/TIME/opera
 UTC. With experiment= it sends that experiment's requests at their times.
 
   tod-runner operator                      everything from the vehicle at media.host
-  tod-runner operator vehicle=delivery_robot media.host=192.0.2.7 control.host=192.0.2.7
+  tod-runner operator keys=keys/alice media.host=192.0.2.7 control.host=192.0.2.1 control.port=8883
   tod-runner operator page.serve=false     the table only
   tod-runner operator ros.pictures=true    with decoded pictures as ROS topics, see docs/ros.md
 """

@@ -7,7 +7,8 @@ with drives=DIR to DIR/TIME/drive.jsonl, where TIME is the start in UTC.
 
   tod-runner vehicle                                        the paper's vehicle with a synthetic drive
   tod-runner vehicle source=v4l2 pqos=live                  real cameras; predictions come over the control link
-  tod-runner vehicle graph=h264_srt media.host=192.0.2.7    connect to an operator that listens there
+  tod-runner vehicle keys=tod-keys graph=h264_srt media.host=192.0.2.7 control.host=192.0.2.7 control.port=8883
+                                                            connect to an operator that listens there
 """
 
 from __future__ import annotations
