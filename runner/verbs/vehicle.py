@@ -31,6 +31,9 @@ def run(arguments: Arguments) -> int:
         live_vehicle(arguments.overrides, arguments.conf, log=arguments.drive(), say=say, progress=progress) as vehicle,
         stopping(action=vehicle.loop.stop) as stop,
     ):
+        if vehicle.loop.track is not None:
+            own = "for the vehicle's own: pqos=live, or pqos.position.kind=live"
+            say(f"positions, and predictions that follow from them, are those of a simulated drive; {own}")
         freeze_loaded()
         vehicle.run(duration)
     return stop.status
