@@ -24,7 +24,7 @@ from runner.mqtt.messages import JsonObject, MqttMessage
 from runner.system.reports import LimitedReports
 
 CONNECT_S = 1.0  # one attempt to connect
-RETRY_S = (0.25, 1.0)  # between attempts, initially and at most
+RETRY_S = (0.25, 0.5)  # between attempts, initially and at most: after an outage the vehicle waits for its operator
 STALLED_S = 1.5  # a connection without progress for this long is dropped
 KEEPALIVE_S = 1  # s without a message before a ping; the broker publishes a will after one and a half of these
 LOOP_S = 0.25  # how often the keepalive is checked
