@@ -11,7 +11,7 @@ from fractions import Fraction
 from typing import Any
 
 from runner.core.events import LinkMeasured, PositionReported
-from runner.core.link_cap import believed_limit, drain, start_cap, update_cap
+from runner.core.link_cap import believed_limit, start_cap, update_cap
 from runner.core.link_memory import UNCAPPED, LinkCap
 from runner.core.uplink import LinkEstimate, LinkReport, ReceivedUnit, UplinkMemory, estimate
 from runner.records import SentFrame
@@ -247,8 +247,8 @@ def drive(
                 cap = update_cap(
                     cap, measured, t, Fraction(limit(t)), Fraction(1, 2), position(t) if position else None
                 )
-            trusted = believed_limit(cap, Fraction(limit(t)), Fraction(1, 2))
-            in_force = float(drain(cap, t, cap.in_force(trusted)))
+            trusted = float(believed_limit(cap, Fraction(limit(t)), Fraction(1, 2)))
+            in_force = min(trusted, float(cap.kbps)) if cap.kbps is not None else trusted
             done.caps.append((t, in_force, estimated.state if estimated else ""))
     return done
 

@@ -243,21 +243,6 @@ def test_a_start_ends_although_standing_pictures_do_not_fill_the_total() -> None
     assert drive.total == 3000
 
 
-def test_sizes_stay_while_a_queue_drains_that_a_steep_fall_of_the_prediction_has_left() -> None:
-    drive = connected()
-    drive.accept("bitrate_predicted", t=3, kbps=16000, valid_s=1000)
-    measure(drive, *(3 + i / 10 for i in range(1, 20)), kbps=15000)
-    assert drive.total == 16000
-    drive.accept("bitrate_predicted", t=5, kbps=8000, valid_s=1000)
-    assert 0.7 * 8000 < drive.total < 0.8 * 8000
-    front = drive["front_left"]
-    assert "still on its way" in front.reason
-    assert "for the full image shortly after" in front.reason
-    measure(drive, *(5 + i / 10 for i in range(1, 6)), kbps=7500)
-    assert drive.total == 8000
-    assert drive["front_left"].width == front.width
-
-
 def test_a_repeated_connection_does_not_restart_the_start() -> None:
     drive = connected()
     for t in (2, 3, 4, 5, 6, 6.1):

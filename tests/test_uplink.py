@@ -19,8 +19,8 @@ from simulated_link import Link, ShortFlows, busy, drive, jitter, stalls, steps,
 from soak import reports
 
 from runner.core.events import LinkMeasured, PositionReported
-from runner.core.link_cap import drain, follow, start_cap, update_cap
-from runner.core.link_memory import LEAST, LastLimit, LinkCap, Most, Overuse, Stall
+from runner.core.link_cap import follow, start_cap, update_cap
+from runner.core.link_memory import LEAST, LastLimit, LinkCap, Most, Overuse
 from runner.core.trust import (
     KNOWN_S,
     METRES_PER_DEGREE,
@@ -600,59 +600,6 @@ def test_a_rate_from_before_a_fall_of_the_prediction_raises_no_cap_soon_after_th
     cap = capped(14000, 20000, 17500)._replace(began=9.5, overuse=Overuse(10.0, Fraction(14000), Fraction(20000)))
     reports = [(10.5 + n * 0.04, "clear", 14500, 0) for n in range(10)]
     assert set(reported(cap, 5000, *reports)) == {3220}, "0.92 of 14 of 20"
-
-
-FALLEN = LinkCap(
-    predicted=True, before=Fraction(5000), changed=5.0, limit=LastLimit(fell=10.0, before_fall=Fraction(5000))
-)
-
-
-@pytest.mark.parametrize(
-    ("t", "limit", "kbps"),
-    [
-        (10.0, 2500, 1875),  # 50 ms at 5000 are 100 ms at 2500, a quarter of 400 ms
-        (10.39, 2500, 1875),
-        (10.4, 2500, 2500),
-        (10.0, 1000, 600),  # 250 ms: at most two fifths of the link are left to them
-        (10.62, 1000, 600),
-        (10.63, 1000, 1000),
-        (10.0, 3400, 3400),  # not steep
-        (10.0, 500, 500),  # an outage
-        (10.0, 0, 0),
-    ],
-)
-def test_less_is_sent_soon_after_a_prediction_fell_steeply(t: float, limit: float, kbps: float) -> None:
-    assert drain(FALLEN, t, Fraction(limit)) == kbps
-
-
-@pytest.mark.parametrize(
-    ("cap", "kbps"),
-    [
-        (FALLEN._replace(before=Fraction(2400)), 2500),  # no more was on its way: the prediction is late, or too high
-        (FALLEN._replace(before=None), 2500),
-        (FALLEN._replace(changed=10.1), 2500),  # the queue has been measured
-        (FALLEN._replace(stall=Stall(9.0, 1)), 2500),
-        (FALLEN._replace(predicted=False), 2500),
-        (FALLEN._replace(floors=Fraction(2200)), 2200),
-        (FALLEN._replace(floors=Fraction(2600)), 2500),
-    ],
-)
-def test_nothing_drains_that_is_not_on_its_way_and_no_camera_falls_below_its_floor(cap: LinkCap, kbps: float) -> None:
-    assert drain(cap, 10.2, Fraction(2500)) == kbps
-
-
-@pytest.mark.parametrize("share", [0.9, 1.4])
-def test_a_link_that_falls_steeply_with_its_prediction_is_used_again_within_a_second(share: float) -> None:
-    link = Link(steps((0, 6000), (10, 2000)), one_way_s=0.02)
-    done = drive(link, lambda t: share * link.kbps(t), 20, fps=15)
-    assert done.lowest(10, 10.3) <= 0.65 * min(1, share) * 2000
-    assert done.kbps(11, 20) >= 0.85 * 2000
-    assert done.wait_ms(0.95, since=11) <= 100
-
-
-def test_a_prediction_that_alternates_never_starves_the_cameras() -> None:
-    done = drive(Link(lambda t: 5000.0), lambda t: 5000.0 if int(10 * t) % 2 else 2400.0, 20, fps=15)
-    assert done.lowest(5, 20) >= 0.6 * 2400
 
 
 def test_an_operators_total_that_falls_lowers_no_cap_below_it() -> None:

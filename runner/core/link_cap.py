@@ -21,8 +21,6 @@ from runner.core.uplink import LinkState
 
 DRAIN_MS = 400  # a queue should drain within about this time ...
 DEEPEST, SHALLOWEST = Fraction(3, 5), Fraction(19, 20)  # ... by a cut to a share of what the link carries
-# What was sent before a prediction fell by this factor, and has not passed the link, becomes a queue.
-STEEP, IN_FLIGHT_MS = Fraction(3, 2), 50
 LOSS_S = 1.4  # losses are measured over 1 s, and a full queue drains in 0.4 s: until then they do not reflect a cut
 TOO_LOSSY = 0.1  # share of packets lost; random loss on the radio link stays below
 LOSING_S = 0.3  # a loss share that has only fallen for longer reflects earlier packets: losses have stopped
@@ -122,20 +120,6 @@ def _doubt_limit(cap: LinkCap, t: float, least: Fraction) -> LinkCap:
     return cap._replace(trust=add_doubt(cap.trust, t, share))
 
 
-def drain(cap: LinkCap, t: float, kbps: Kbps) -> Kbps:
-    """What may be sent at time t of a cap or limit, on the wire: less for some time after a steep fall of a prediction.
-
-    What was sent before at a higher rate then drains, until the queue is measured. An outage leaves nothing to drain.
-    """
-    before, is_measured = min(cap.limit.before_fall, cap.before or 0), cap.changed > cap.limit.fell
-    if is_measured or not cap.predicted or cap.stall or not STEEP * kbps <= before < capacity.OUTAGE * kbps:
-        return kbps
-    queue_ms = IN_FLIGHT_MS * before / kbps
-    share = _drain_share(queue_ms)
-    is_over = 1000 * (exact(t) - exact(cap.limit.fell)) >= queue_ms / (1 - share)
-    return kbps if is_over else max(kbps * share, min(kbps, cap.floors))
-
-
 def raise_cap(cap: LinkCap, least: Kbps) -> LinkCap:
     """The cap, but at least the minimum needed to measure the link."""
     return cap._replace(kbps=least) if cap.kbps is not None and cap.kbps < least else cap
@@ -166,12 +150,8 @@ def follow(cap: LinkCap, limit: Kbps, is_prediction: bool) -> LinkCap:
 
 def _drained(link: LinkMeasured, carried: Kbps) -> Kbps:
     """Low enough to drain the queue of a link that carries this much."""
-    return carried * (DEEPEST if is_lossy(link) else _drain_share(exact(link.queue_ms or 0)))
-
-
-def _drain_share(queue_ms: Fraction) -> Fraction:
-    """Share of a link's capacity that drains such a queue in time."""
-    return max(DEEPEST, min(SHALLOWEST, 1 - queue_ms / DRAIN_MS))
+    drain = 1 - exact(link.queue_ms or 0) / DRAIN_MS
+    return carried * (DEEPEST if is_lossy(link) else max(DEEPEST, min(SHALLOWEST, drain)))
 
 
 def _may_be_jitter(cap: LinkCap, link: LinkMeasured) -> bool:

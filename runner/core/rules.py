@@ -221,7 +221,7 @@ def share_equally(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) 
 def scaling_from_rate_quality(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
     """Eq. (4): the factor whose bitrate range contains the allocation, converted to the full image."""
     factors, reasons = {}, {}
-    # At the start, and while a queue drains, sizes are chosen for the larger total that follows.
+    # At the start, sizes are chosen for the larger total that follows.
     later = draft.sized_for / draft.total if draft.sized_for and draft.total else None
     for name, camera in vehicle.cameras.items():
         if not state.on[name]:
@@ -233,7 +233,7 @@ def scaling_from_rate_quality(vehicle: Vehicle, state: State, draft: Draft, memo
         factors[name], why = scaling.select_scaling(camera.rate_quality, bitrate if kbps else allocation.ZERO)
         seen = ""
         if kbps and (later is not None or (roi is not full and roi != full)):
-            seen = f", as {_whole(bitrate)} for the full image" + ("" if later is None else " shortly after")
+            seen = f", as {_whole(bitrate)} for the full image" + ("" if later is None else " after the start")
         reasons[name] = f"{kbps} of {_short(draft.demand[name])} kbit/s{seen}, {why}"
     return draft.replaced(scaling=factors, reasons=reasons), memory
 
@@ -381,12 +381,9 @@ def cap_by_link(
     if cap.kbps is not None and cap.kbps - reserve_kbps < carried:
         carried = max(least, cap.kbps - reserve_kbps)
         why = _why_capped(cap)
-    # A new size restarts the encoder: at the start, and while a queue drains, sizes are chosen for the time after it.
-    lasting = _lower_total(draft, video_kbps(cameras, carried), why)
-    if (drained := link_cap.drain(cap, state.t, carried)) < carried:
-        why = "what was sent before the prediction fell is still on its way"
-        return _lower_total(draft, video_kbps(cameras, drained), why).replaced(sized_for=lasting.total), memory
-    return lasting.replaced(sized_for=lasting.uncapped) if cap.provisional else lasting, memory
+    lowered = _lower_total(draft, video_kbps(cameras, carried), why)
+    # A new size restarts the encoder, so sizes at the start are chosen for the time after it.
+    return lowered.replaced(sized_for=lowered.uncapped) if cap.provisional else lowered, memory
 
 
 @lru_cache(maxsize=64)  # for a few sets of cameras that are on
