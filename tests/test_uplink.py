@@ -591,7 +591,7 @@ def test_a_prediction_that_falls_further_than_the_link_has_fallen_announces_anot
     limit: float, kbps: float
 ) -> None:
     """Soon after the start any link narrower than predicted seems to have fallen."""
-    cap = capped(4000, 5700, 3680)._replace(overuse=Overuse(10.0, Fraction(4000), Fraction(5700), fell=True))
+    cap = capped(4000, 5700, 3680)._replace(began=9.0, overuse=Overuse(10.0, Fraction(4000), Fraction(5700), fell=True))
     assert reported(cap, limit, (11.0, "filling", 3900, 10)) == [kbps]
 
 
@@ -600,6 +600,24 @@ def test_a_rate_from_before_a_fall_of_the_prediction_raises_no_cap_soon_after_th
     cap = capped(14000, 20000, 17500)._replace(began=9.5, overuse=Overuse(10.0, Fraction(14000), Fraction(20000)))
     reports = [(10.5 + n * 0.04, "clear", 14500, 0) for n in range(10)]
     assert set(reported(cap, 5000, *reports)) == {3220}, "0.92 of 14 of 20"
+
+
+def test_later_a_prediction_that_falls_further_than_the_link_was_only_late() -> None:
+    """It may be a lower bound, which stays below the link."""
+    cap = capped(3000, 4800, 2760)._replace(overuse=Overuse(10.0, Fraction(3000), Fraction(4800), fell=True))
+    assert reported(cap, 2400, (10.5, "filling", 2800, 10)) == [2760]
+
+
+@pytest.mark.parametrize("share", [1, 1.5])
+def test_a_noisy_prediction_blocks_neither_the_start_nor_the_recovery(share: float) -> None:
+    """Ten predictions a second, each a little different; in its first second the link carries less."""
+    noise = random.Random(1)
+    limits = [share * 4000 * noise.uniform(0.98, 1) for _ in range(300)]
+    link = Link(steps((0, 4000), (0.5, 1500), (1.2, 4000)))
+    done = drive(link, lambda t: limits[int(10 * t)], 20, fps=15, start=HALF)
+    assert done.kbps(8, 20) >= 0.85 * 4000
+    done = drive(Link(lambda t: 4000.0), lambda t: limits[int(10 * t)], 4, fps=15, start=HALF)
+    assert done.first(0.1, lambda cap: cap >= 0.8 * 4000) <= 1.3
 
 
 def test_an_operators_total_that_falls_lowers_no_cap_below_it() -> None:

@@ -217,10 +217,9 @@ def _recover(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps
     if cap.provisional and t - cap.began >= capacity.BEGIN_S:  # static pictures may never fill it
         return cap._replace(kbps=None, provisional=False, changed=t)
     steps, factor, last = cap.steps, FAST, cap.overuse
-    begins = cap.provisional or (last is not None and last.t - cap.began < capacity.BEGIN_S)
-    if (cap.provisional and cap.before is None) or (begins and capacity.just_fell(cap, link, t)):
+    if (cap.provisional and cap.before is None) or capacity.is_start_over(cap, link, t, full):
         return cap  # it does not grow before a rate has been measured under this limit
-    if begins:
+    if cap.provisional or (last and capacity.is_start(cap, last.t)):
         factor = min(FAST, BEGIN * (link.kbps or 0) / cap.kbps)
     elif last:
         factor = min(FAST, capacity.RESERVE * last.known(full) / cap.kbps)

@@ -30,12 +30,12 @@ def fall_with_limit(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
     last, before = cap.overuse, cap.limit.kbps
     if not cap.predicted or cap.kbps is None or last is None or limit >= before:
         return cap
-    if _was_late(last, t, limit):
+    if _was_late(cap, last, t, limit):
         return cap
     sent, known = cap.in_force(before), min(limit, last.known(limit))
     same_share = sent * limit / before
-    has_begun = last.t - cap.began >= BEGIN_S  # before, the cap grows beyond what is known without proof
-    is_outdated = has_begun and known < FELL * same_share
+    # At the start, the cap grows beyond what is known without proof.
+    is_outdated = not is_start(cap, t) and known < FELL * same_share
     return cap._replace(kbps=tenths(same_share if is_outdated else min(sent, RESERVE * known)))
 
 
@@ -54,16 +54,27 @@ def adapt_overuse(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
         cap = cap._replace(outage=None)
     elif cap.outage and limit >= OUTAGE * cap.outage.limit:
         return _end_outage(cap, t, limit, cap.outage.overuse)
-    if last is None or limit >= last.limit or last.carried >= last.limit or not _was_late(last, t, limit):
+    if last is None or limit >= last.limit or last.carried >= last.limit or not _was_late(cap, last, t, limit):
         return cap
     followed = max(limit, last.carried)
     trust = relieve(cap.trust, last.t, followed / last.limit)
     return cap._replace(overuse=last._replace(limit=followed), trust=trust)
 
 
-def _was_late(last: Overuse, t: float, limit: Kbps) -> bool:
-    """Whether a limit that falls only follows the link. To clearly less than the link carries since, it falls again."""
-    return last.fell and t - last.t <= LATE_S and limit >= FELL * last.carried
+def is_start(cap: LinkCap, t: float) -> bool:
+    """Whether the link has been measured for too short a time to know its capacity."""
+    return t - cap.began < BEGIN_S
+
+
+def _was_late(cap: LinkCap, last: Overuse, t: float, limit: Kbps) -> bool:
+    """Whether a limit that falls only follows the link, which has fallen before.
+
+    At the start any link that is narrower than the limit seems to have fallen. One that falls to clearly less than what
+    was carried then is not late.
+    """
+    if is_start(cap, last.t) and limit < FELL * last.carried:
+        return False
+    return last.fell and t - last.t <= LATE_S
 
 
 def _end_outage(cap: LinkCap, t: float, limit: Kbps, before: Overuse | None) -> LinkCap:
@@ -123,6 +134,11 @@ def raise_known(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> Link
     if _is_recent(cap.lowering.t, link, t):
         return cap._replace(overuse=_known_now(last, max(known, min(link.kbps, cap.lowering.known)), limit))
     return cap
+
+
+def is_start_over(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> bool:
+    """Whether the prediction has clearly fallen at the start, so that the link's capacity has to be found again."""
+    return is_start(cap, t) and just_fell(cap, link, t) and limit < FELL * cap.limit.before_fall
 
 
 def just_fell(cap: LinkCap, link: LinkMeasured, t: float) -> bool:

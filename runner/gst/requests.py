@@ -16,8 +16,8 @@ from runner.gst.probes import RequestProbe
 # whose own link is narrow requests most packets, which takes the uplink from the others.
 REPEATED, SHARED = 0.5, 0.1
 AT_ONCE = 300  # packets resent at once, as after a short outage: 0.4 s of 8 Mbit/s
-FIRST = 50  # to a new viewer beside others
-REMEMBERED = 16  # viewers, the latest ones: each may change its SSRC
+SHARED_AT_ONCE = 50  # to each of several viewers
+REMEMBERED = 16  # viewers, the latest ones
 KEY_UNIT_S = 1.0  # between two requests for a key frame
 
 
@@ -30,9 +30,9 @@ class _Allowance:
     def __init__(self, sent: int, packets: float) -> None:
         self._sent, self.packets = sent, packets
 
-    def earn(self, sent: int, share: float) -> None:
+    def earn(self, sent: int, share: float, most: int = AT_ONCE) -> None:
         """Add a share of the packets that were sent since the last request."""
-        self.packets = min(AT_ONCE, self.packets + share * ((sent - self._sent) % 65536))
+        self.packets = min(most, self.packets + share * ((sent - self._sent) % 65536))
         self._sent = sent
 
 
@@ -44,7 +44,7 @@ class RequestLimit:
 
     packets    source pad of the payloader
     on_report  called, from a streaming thread, when the limit is first exceeded
-    viewers    number of viewers
+    viewers    number of viewers over the uplink that may request packets
     """
 
     viewers = 1
@@ -54,6 +54,7 @@ class RequestLimit:
         self._has_payloader = self._payloader.find_property("seqnum") is not None  # else nothing counts the packets
         self._all = _Allowance(0, AT_ONCE)
         self._by_viewer: OrderedDict[int, _Allowance] = OrderedDict()  # by SSRC
+        self._new = _Allowance(0, AT_ONCE)  # of all new viewers: each may change its SSRC
         self._asking = 0  # SSRC of the viewer whose request is being handled
         self._key_unit: float | None = None  # when the last one was granted
         self._reported = False
@@ -72,19 +73,26 @@ class RequestLimit:
 
     def _grant_retransmission(self) -> bool:
         sent: int = self._payloader.get_property("seqnum")
-        first, share = (FIRST, SHARED) if self.viewers > 1 else (AT_ONCE, REPEATED)
-        viewer = self._by_viewer.pop(self._asking, None) or _Allowance(sent, first)
-        self._by_viewer[self._asking] = viewer
-        if len(self._by_viewer) > REMEMBERED:
-            self._by_viewer.popitem(last=False)
+        share, most = (SHARED, SHARED_AT_ONCE) if self.viewers > 1 else (REPEATED, AT_ONCE)
         self._all.earn(sent, REPEATED)
-        viewer.earn(sent, share)
+        self._new.earn(sent, share)
+        viewer = self._by_viewer.pop(self._asking, None) or self._admit(sent, most)
+        viewer.earn(sent, share, most)
+        self._by_viewer[self._asking] = viewer
         if min(self._all.packets, viewer.packets) < 1:
             self._report_limit()
             return False
         self._all.packets -= 1
         viewer.packets -= 1
         return True
+
+    def _admit(self, sent: int, most: int) -> _Allowance:
+        """A new viewer."""
+        first = min(most, self._new.packets)
+        self._new.packets -= first
+        if len(self._by_viewer) == REMEMBERED:
+            self._by_viewer.popitem(last=False)
+        return _Allowance(sent, first)
 
     def _grant_key_unit(self) -> bool:
         now = time.monotonic()

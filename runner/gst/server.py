@@ -561,7 +561,8 @@ class CameraServer:
         for name in left:
             self._unblock(name, now)
         for name, pipeline in tuple(self.pipelines.items()):
-            pipeline.requests.viewers = len(self._watching(name))
+            viewers = [each for each in self._watching(name) if over_uplink(each.viewer.address)]
+            pipeline.requests.viewers = sum(not each.interleaved for each in viewers)
         if self._viewers:
             self._drop_silent([connection for _, connection in connections], now)
         for client, connection in connections:
