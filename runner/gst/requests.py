@@ -14,7 +14,7 @@ from runner.gst.probes import RequestProbe
 # Packets resent, at most, per packet sent. Up to 15 % loss an operator's side requests each missing packet, and again
 # after a round trip. If there are several viewers, each gets fewer: all receive what one of them has requested, and one
 # whose own link is narrow requests most packets, which takes the uplink from the others.
-REPEATED, SHARED = 0.5, 0.1
+REPEATED, SHARED = 0.5, 1 / 15
 AT_ONCE = 300  # packets resent at once, as after a short outage: 0.4 s of 8 Mbit/s
 SHARED_AT_ONCE = 50  # to each of several viewers
 REMEMBERED = 16  # viewers, the latest ones
