@@ -190,7 +190,7 @@ def _alternating(
         blocks = []
         with _steering(broker):
             time.sleep(SETTLE_S)
-            turns = (True, False, False, True) * (pairs // 2)  # a trend of the machine affects both
+            turns = ((True, False, False, True) * pairs)[: 2 * pairs]  # a trend of the machine affects both
             for with_them in turns:
                 show(page, with_them)
                 blocks.append(_block(page, names, with_them, seconds / len(turns)))

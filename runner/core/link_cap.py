@@ -214,7 +214,7 @@ def _recover(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps
     cap = cap._replace(before=link.kbps or cap.before, queue_ms=0.0)
     if cap.kbps is None or cap.kbps >= limit or t - cap.changed < STEP_S + rtt_s(link):
         return cap  # a cap that is not in force is untested, and so does not grow
-    if cap.provisional and t - cap.began >= capacity.BEGIN_S:  # static pictures may never fill it
+    if cap.provisional and not capacity.is_start(cap, t):  # static pictures may never fill it
         return cap._replace(kbps=None, provisional=False, changed=t)
     steps, factor, last = cap.steps, FAST, cap.overuse
     if (cap.provisional and cap.before is None) or capacity.is_start_over(cap, link, t, full):
