@@ -507,6 +507,11 @@ def test_a_driver_is_alerted_to_a_picture_lost_in_a_monitor_only(chromium, pictu
         until(lambda: page.inner_text("#alarms") == "✕ LOST mast (monitor)")
         viewing(page, "configure")
         assert page.inner_text("#hidden-alarms") == "✕ LOST mast (monitor)"
+        monitor.evaluate("dispatchEvent(new Event('pagehide'))")
+        monitor.evaluate("new Promise((done) => setTimeout(done, 1000))")  # its worker and its timer go on for a moment
+        assert page.locator("#hidden-alarms").is_hidden()
+        monitor.evaluate("dispatchEvent(new Event('pageshow'))")
+        until(lambda: page.inner_text("#hidden-alarms") == "✕ LOST mast (monitor)")
         monitor.close(run_before_unload=True)
         until(page.locator("#hidden-alarms").is_hidden)
         assert "no longer responds" not in page.inner_text("#toasts")

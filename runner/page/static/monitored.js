@@ -68,10 +68,15 @@ const publishStatus = (id, camera, status) => publish("monitored", { picture: `$
 
 export function startMonitored() {
   if (globalThis.boot.shown) {
-    const reportOwn = () => report(store.status);
+    let closing = false; // tasks may still run after `pagehide`: a report from one would announce this monitor again
+    const reportOwn = () => closing || report(store.status);
     listen("status ages", reportOwn);
     setInterval(reportOwn, REPORT_MS);
-    addEventListener("pagehide", () => report(null));
+    addEventListener("pagehide", () => {
+      closing = true;
+      report(null);
+    });
+    addEventListener("pageshow", () => (closing = false)); // the browser may restore the page from its cache
     return;
   }
   channel.onmessage = ({ data }) => onReport(data);
