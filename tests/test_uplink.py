@@ -88,10 +88,10 @@ def test_a_start_at_half_of_a_prediction_that_is_too_high_loses_less(fps: float)
 
 
 @pytest.mark.parametrize("fps", [5, 15, 30])
-def test_a_start_at_half_of_a_right_prediction_is_over_within_a_second(fps: float) -> None:
+def test_a_start_at_half_of_a_right_prediction_is_over_soon(fps: float) -> None:
     done = drive(Link(steps((0, 4000))), steps((0, RIGHT)), 10, fps=fps, start=HALF, key_frame=6)
     assert done.caps[0][1] == RIGHT / 2
-    assert done.lowest(1 + 5 / fps, 10) == RIGHT
+    assert done.lowest(1 + 10 / fps, 10) == RIGHT
 
 
 def test_a_camera_that_starts_slowly_hides_no_queue() -> None:
@@ -350,9 +350,9 @@ def test_a_link_too_narrow_for_the_floors_gets_less(kbps: float, queue_s: float)
     """A short queue drops packets until less is sent."""
     link = Link(steps((0, 4000), (10, kbps), (30, 4000)), one_way_s=0.05, queue_s=queue_s)
     done = drive(link, steps((0, 4000)), 45, fps=15, floors=300)
-    assert done.first(10, lambda cap: cap < kbps) < 2.5
+    assert done.first(10, lambda cap: cap < kbps) < 3.5
     assert done.wait_ms(0.95, since=14) <= 100
-    assert done.kbps(40, 45) >= 1500, "half of a prediction that proved too high is trusted"
+    assert done.kbps(41, 45) >= 1500, "half of a prediction that proved too high is trusted"
 
 
 @pytest.mark.parametrize("kbps", [100, 250, 600, 850, 1200, 1300])
@@ -518,6 +518,12 @@ def capped(carried: float, limit: float, kbps: float, t: float = 10.0, **other: 
     )
 
 
+def starting(kbps: float, limit: float) -> LinkCap:
+    """The cap half a second after the link was first measured, at t = 10, before it has proved narrow."""
+    limited = {"kbps": Fraction(kbps), "limit": LastLimit(Fraction(limit)), "predicted": True}
+    return LinkCap(provisional=True, began=9.5, changed=10.0, **limited)  # type: ignore[arg-type]
+
+
 def varying(seed: int, low: float, high: float) -> Callable[[float], float]:
     """A capacity that is another one each second."""
     rng = random.Random(seed)
@@ -600,6 +606,35 @@ def test_a_rate_from_before_a_fall_of_the_prediction_raises_no_cap_soon_after_th
     cap = capped(14000, 20000, 17500)._replace(began=9.5, overuse=Overuse(10.0, Fraction(14000), Fraction(20000)))
     reports = [(10.5 + n * 0.04, "clear", 14500, 0) for n in range(10)]
     assert set(reported(cap, 5000, *reports)) == {3220}, "0.92 of 14 of 20"
+
+
+@pytest.mark.parametrize(("queue_ms", "kbps"), [(0, 3220), (20, 2800), (60, 2100)])
+def test_a_prediction_that_falls_at_the_start_leaves_room_to_drain_the_queue(queue_ms: float, kbps: float) -> None:
+    """What waits is carried four times as slowly: 20 ms become 80, and a fifth less is sent; at least 0.6 is."""
+    overuse = Overuse(10.0, Fraction(14000), Fraction(20000), fell=True)
+    cap = capped(14000, 20000, 13000)._replace(began=9.5, overuse=overuse)
+    assert reported(cap, 5000, (10.5, "filling", 14000, queue_ms)) == [kbps]
+
+
+@pytest.mark.parametrize(("limit", "kbps"), [(19000, 15200), (5000, 2700)])
+def test_before_the_link_proves_narrow_a_clear_fall_of_the_prediction_lowers_the_cap_below_what_arrives(
+    limit: float, kbps: float
+) -> None:
+    """A slight one is noise, and lowers it in proportion. Here 12 of 20 Mbit/s arrive, and 10 ms become 40."""
+    assert reported(starting(16000, 20000), limit, (10.5, "clear", 12000, 10)) == [kbps]
+
+
+@pytest.mark.parametrize(("queue_ms", "kbps"), [(0, 11250), (10, 11250), (16, 10500), (20, 10000), (40, 10000)])
+def test_at_the_start_the_cap_grows_less_with_a_queue(queue_ms: float, kbps: float) -> None:
+    assert reported(starting(10000, 20000), 20000, (10.5, "clear", 10000, queue_ms)) == [kbps]
+
+
+def test_at_the_start_what_is_sent_does_not_count_as_carried() -> None:
+    """The first overuse of a link of 14.5 Mbit/s with a short queue, while the cap is 18.6 Mbit/s."""
+    measured = LinkMeasured(t=10.5, kbps=Fraction(14500), queue_ms=38, state=LinkState.FILLING, rtt_ms=30)
+    overuse = update_cap(starting(18600, 20000), measured, 10.5, Fraction(20000)).overuse
+    assert overuse
+    assert overuse.known(Fraction(20000)) == 14500
 
 
 def test_later_a_prediction_that_falls_further_than_the_link_was_only_late() -> None:

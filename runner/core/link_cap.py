@@ -19,15 +19,15 @@ from runner.core.model import Kbps, exact
 from runner.core.trust import Trust, add_doubt, thousandths, update_trust
 from runner.core.uplink import LinkState
 
-DRAIN_MS = 400  # a queue should drain within about this time ...
-DEEPEST, SHALLOWEST = Fraction(3, 5), Fraction(19, 20)  # ... by a cut to a share of what the link carries
 LOSS_S = 1.4  # losses are measured over 1 s, and a full queue drains in 0.4 s: until then they do not reflect a cut
 TOO_LOSSY = 0.1  # share of packets lost; random loss on the radio link stays below
 LOSING_S = 0.3  # a loss share that has only fallen for longer reflects earlier packets: losses have stopped
 LASTED_S = 0.3  # a long queue is real once it has lasted this long: delays on a busy machine are shorter
 PROVEN = 2  # once the link proved narrow, the most that arrived is limited to this multiple of the capacity
 FAST = Fraction(3, 2)  # increase in each step up to the known capacity
-BEGIN = Fraction(5, 4)  # while that is uncertain, the cap grows in steps up to this multiple of what arrives
+# While that is uncertain, the cap grows in smaller steps, and up to a multiple of what arrives: less with a queue, and
+# not at all with one of this length, ms. A queue shows a while after its cause.
+BEGIN_STEP, BEGIN, BEGIN_MS = Fraction(9, 8), Fraction(5, 4), 20
 CAREFUL, DOUBLING = Fraction(1, 50), 8  # first increase beyond it, and the number of steps that double it
 HELD_S = 2.0  # after an overuse that proved a prediction too high, until the first careful increase
 TESTED = 3  # a cap grows up to this multiple of what arrives
@@ -58,7 +58,7 @@ def update_cap(
         unmeasured = t - max(cap.measured, cap.changed, cap.idle)
         has_started = cap.measured >= cap.connected and not cap.provisional
         return _reset(cap, limit) if unmeasured > (UNMEASURED_S if has_started else START_S) else cap
-    cap, full = capacity.adapt_overuse(capacity.fall_with_limit(cap, t, limit), t, limit), limit
+    cap, full = capacity.adapt_overuse(capacity.fall_with_limit(cap, link, t, limit), t, limit), limit
     cap = cap._replace(trust=update_trust(cap.trust, t, least_trust, position))
     limit = believed_limit(cap, limit, least_trust)
     if link.t > cap.measured:
@@ -150,8 +150,7 @@ def follow(cap: LinkCap, limit: Kbps, is_prediction: bool) -> LinkCap:
 
 def _drained(link: LinkMeasured, carried: Kbps) -> Kbps:
     """Low enough to drain the queue of a link that carries this much."""
-    drain = 1 - exact(link.queue_ms or 0) / DRAIN_MS
-    return carried * (DEEPEST if is_lossy(link) else max(DEEPEST, min(SHALLOWEST, drain)))
+    return carried * (capacity.DEEPEST if is_lossy(link) else capacity.drained(exact(link.queue_ms or 0)))
 
 
 def _may_be_jitter(cap: LinkCap, link: LinkMeasured) -> bool:
@@ -164,13 +163,14 @@ def _may_be_jitter(cap: LinkCap, link: LinkMeasured) -> bool:
 def _cut_by_jitter(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps) -> LinkCap:
     """A cut for a queue that may be jitter; none for a short queue if the link is known to carry more than is sent.
 
-    With jitter, at most as much arrives as is sent. Mistaken for the capacity, it would lower the cap repeatedly.
+    With jitter, at most as much arrives as is sent. Mistaken for the capacity, it would lower the cap repeatedly. At
+    the start the link may not yet have carried what is sent, so what arrives is all that is known.
     """
     sent = cap.in_force(limit)
     known = cap.overuse.known(full) if cap.overuse else sent
     if cap.overuse and sent <= capacity.RESERVE * known and is_short(link):
         return capacity.raise_known(cap, link, t, full)
-    return _cut(cap, link, t, limit, full, known)
+    return _cut(cap, link, t, limit, full, Fraction(0) if capacity.is_start(cap, t) else known)
 
 
 def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps, known: Kbps = Fraction(0)) -> LinkCap:
@@ -190,7 +190,7 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps, kn
     target = max(_drained(link, carried), contention.yielded(cap, link, t) * most)
     in_outage = capacity.is_of_outage(cap, link, t, full)
     if cap.provisional or in_outage:  # not all cameras may have started, so a low rate proves little
-        target = max(target, DEEPEST * cap.in_force(limit))
+        target = max(target, capacity.DEEPEST * cap.in_force(limit))
     if not (below := contention.is_below_floors(cap, link, t, limit)):
         target = max(target, cap.floors)
     settled, seen = t - cap.changed >= SETTLE_S + rtt_s(link), capacity.limit_seen(cap, link, t, full)
@@ -219,20 +219,26 @@ def _recover(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps
     steps, factor, last = cap.steps, FAST, cap.overuse
     if (cap.provisional and cap.before is None) or capacity.is_start_over(cap, link, t, full):
         return cap  # it does not grow before a rate has been measured under this limit
-    if cap.provisional or (last and capacity.is_start(cap, last.t)):
-        factor = min(FAST, BEGIN * (link.kbps or 0) / cap.kbps)
+    beyond = _begin_factor(link) * (link.kbps or 0) / cap.kbps
+    if cap.provisional:
+        factor = min(BEGIN_STEP, beyond)
     elif last:
         factor = min(FAST, capacity.RESERVE * last.known(full) / cap.kbps)
-        if last.t - cap.resumed < capacity.BEGIN_S:  # the link may have been recovering
-            factor = max(factor, min(BEGIN, BEGIN * (link.kbps or 0) / cap.kbps))
+        if capacity.is_start(cap, last.t) or last.t - cap.resumed < capacity.BEGIN_S:  # it may have carried more since
+            factor = max(factor, min(BEGIN_STEP, beyond))
     if factor < 1 + CAREFUL:
-        if not _may_probe(cap, link, t, limit):
+        if cap.provisional or not _may_probe(cap, link, t, limit):
             return cap
         factor, steps = min(FAST, 1 + CAREFUL * 2 ** (steps // DOUBLING)), steps + 1
     kbps = tenths(cap.kbps * factor)
     if kbps >= limit:
         return cap._replace(kbps=None, provisional=False, steps=steps, changed=t)
     return cap._replace(kbps=kbps, steps=steps, changed=t)
+
+
+def _begin_factor(link: LinkMeasured) -> Fraction:
+    """Up to what multiple of what arrives the cap may grow while the capacity is uncertain."""
+    return 1 + (BEGIN - 1) * max(Fraction(0), 1 - exact(link.queue_ms or 0) / BEGIN_MS)
 
 
 def _may_probe(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> bool:
@@ -252,7 +258,7 @@ def _handle_stall(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> Li
         if t - cap.idle < SILENCE_S + rtt_s(link):
             return cap
         arrived = min(cap.in_force(limit), cap.before or limit)
-        kbps = max(arrived * DEEPEST, min(arrived, Fraction(0) if cap.below else cap.floors))
+        kbps = max(arrived * capacity.DEEPEST, min(arrived, Fraction(0) if cap.below else cap.floors))
         return cap._replace(kbps=tenths(kbps), stall=Stall(t, 0), changed=t, provisional=False)
     return _halve(cap, cap.stall, t, limit)
 

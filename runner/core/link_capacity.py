@@ -9,9 +9,11 @@ from fractions import Fraction
 
 from runner.core.events import LinkMeasured
 from runner.core.link_memory import SEEN_S, LinkCap, Lowering, Overuse, PredictedOutage, rtt_s, tenths
-from runner.core.model import Kbps
+from runner.core.model import Kbps, exact
 from runner.core.trust import FALL_S, LATE_S, relieve
 
+DRAIN_MS = 400  # a queue should drain within about this time ...
+DEEPEST, SHALLOWEST = Fraction(3, 5), Fraction(19, 20)  # ... by a cut to a share of what the link carries
 RESERVE = Fraction(23, 25)  # share of what the link carried up to which recovery is fast
 FELL = Fraction(9, 10)  # share of the known capacity below which the link has fallen, or of a prediction: too high
 # A prediction that falls by this factor announces an outage, and one that rises by it ends it. If it is short, what
@@ -20,23 +22,37 @@ OUTAGE, OUTAGE_S = 10, 10.0
 BEGIN_S = 2.0  # after the first measurement or an outage: until then the capacity is too uncertain
 
 
-def fall_with_limit(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
+def fall_with_limit(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:
     """The cap when a prediction falls: a link that carries a constant share of it has fallen, too.
 
     The cap falls to what is then known to be carried: careful increases end, too. If it has grown far beyond that, the
     known capacity is outdated, and the cap keeps its share of the prediction. It does not fall if the link has fallen
     before, and the prediction follows.
+
+    At the start, when the cap grows beyond what is known, it keeps its share. If the prediction falls clearly, it falls
+    to what is known to be carried or, before the link proves narrow, to what arrives, and far enough to drain the
+    queue, which a link that has fallen carries more slowly.
     """
     last, before = cap.overuse, cap.limit.kbps
-    if not cap.predicted or cap.kbps is None or last is None or limit >= before:
+    if not cap.predicted or cap.kbps is None or limit >= before:
         return cap
-    if _was_late(cap, last, t, limit):
+    if cap.provisional:
+        last = Overuse(t, link.kbps or cap.in_force(before), before)
+    elif last is None or _was_late(cap, last, t, limit):
         return cap
     sent, known = cap.in_force(before), min(limit, last.known(limit))
     same_share = sent * limit / before
-    # At the start, the cap grows beyond what is known without proof.
-    is_outdated = not is_start(cap, t) and known < FELL * same_share
-    return cap._replace(kbps=tenths(same_share if is_outdated else min(sent, RESERVE * known)))
+    if not is_start(cap, t):
+        return cap._replace(kbps=tenths(same_share if known < FELL * same_share else min(sent, RESERVE * known)))
+    if limit >= FELL * before:
+        return cap._replace(kbps=tenths(same_share))
+    queue_ms = exact(link.queue_ms or 0) * last.known(before) / known
+    return cap._replace(kbps=tenths(min(sent, min(RESERVE, drained(queue_ms)) * known)))
+
+
+def drained(queue_ms: Fraction) -> Fraction:
+    """The share of its capacity with which a queue drains in time."""
+    return max(DEEPEST, min(SHALLOWEST, 1 - queue_ms / DRAIN_MS))
 
 
 def adapt_overuse(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
