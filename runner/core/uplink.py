@@ -19,6 +19,7 @@ from math import inf
 from operator import attrgetter
 from statistics import median
 from types import MappingProxyType
+from typing import NamedTuple
 
 BUCKET_S = 10.0  # the path's delay is the minimum of the current time bucket and the previous one
 NEW_S = 1.0  # how long a new camera must send before its own path is measured
@@ -27,21 +28,40 @@ SAME_S = 0.001  # closer capture times, after rounding, belong to the same frame
 STEADY_S = 0.25  # the link's rate is the highest measured in this time: late units make it look lower
 LONGEST_INTERVAL_S = 1.0  # between two frames; a longer one is a pause
 SILENT = 4  # a camera without a frame for this many of its intervals, while others send, no longer does
-RECENT_S = 0.06  # the queue is the shortest that a unit met in this time, or in a frame interval
 RATE_S = 0.25  # the rate is averaged over this time, or over three frame intervals
 # With a queue longer than the first of these, the rate of the link has probably dropped and earlier measurements are
 # obsolete. The link is busy, so a short time suffices to measure the new rate.
 FALLEN_S, FALLEN_RATE_S = 0.04, 0.1
+PAUSE_S = 0.01  # without a unit for this long beyond 1.5 frame intervals, measurement of the rate restarts ...
+VISIBLE_S = 0.003  # ... or later if the last unit met a queue of this length: a large frame takes long on a narrow link
+
+
+class _Windows(NamedTuple):
+    """Times that depend on how much jitter there is, s.
+
+    recent    the queue is the shortest that a unit met in this time, or in a frame interval
+    evidence  a rate measured over a shorter time is not significant
+    pause     as PAUSE_S, once there is a queue
+    steady    as STEADY_S, once the rate of the link has dropped
+    """
+
+    recent: float
+    evidence: float
+    pause: float
+    steady: float
+
+
+ON_ARRIVAL = _Windows(recent=0.06, evidence=0.08, pause=PAUSE_S, steady=FALLEN_RATE_S)
+# A play-out delay hides jitter: units that are late nevertheless have met a long queue, and arrive at the link's rate.
+HELD_BACK = _Windows(recent=0.04, evidence=0.05, pause=0.04, steady=0.05)
+
 SLOW_S = 0.15  # a longer interval between frames is a gap in which frames were lost
-EVIDENCE_S = 0.08  # a rate measured over a shorter time is not significant ...
-LATE_EVIDENCE_S = 0.05  # ... or over this one with a play-out delay: all late units arrive at the link's rate
 EMPTY_S = 0.010  # a unit that waited less met no queue
 GROWN_S = 0.020  # a queue from here on may be growing
 GROWTH_S = 0.006  # change within COMPARED_S from which a queue counts as growing or draining
 COMPARED_S = 0.08
 LONG_S = 0.060  # a queue from here on is too long unless it drains
 UNDRAINED_S = 0.4  # a queue that is no shorter after this time is not draining
-PAUSE_S = 0.01  # without a unit for this long and 1.5 frame intervals, measurement of the rate restarts
 LATE_REPORT_S = 0.06  # between two reports; a longer time means that the operator's side was held up
 GAP_S = 0.12  # without a unit for this long, or for two frame intervals, the link has stalled
 COUNTED_S, LONGEST_S = 1.0, 2.0  # losses are counted for this long; with few packets for longer ...
@@ -199,7 +219,8 @@ def estimate(uplink: UplinkMemory, report: LinkReport) -> tuple[UplinkMemory, Li
     if not uplink.units:
         return uplink, None
     frame, last = _frame_interval(uplink.intervals, uplink.captured), uplink.units[-1].arrived
-    queue = min(unit.queue for unit in _later(uplink.units, last - max(RECENT_S, frame)))
+    windows = _windows(uplink.units[-1].playout)
+    queue = min(unit.queue for unit in _later(uplink.units, last - max(windows.recent, frame)))
     if queue <= EMPTY_S:
         onset = None
     elif uplink.onset is None:
@@ -223,12 +244,16 @@ def estimate(uplink: UplinkMemory, report: LinkReport) -> tuple[UplinkMemory, Li
         return _lengthen_path(uplink), LinkEstimate(kbps, 0.0, _loss(packets), LinkState.CLEAR)
     state = LinkState.STALLED if stalled else _state(queues, queue, onset)
     if state in (LinkState.FILLING, LinkState.DRAINING) and kbps is not None:
-        steady = FALLEN_RATE_S if fallen else STEADY_S
+        steady = windows.steady if fallen else STEADY_S
         rates = (*_entries_since(uplink.rates, max(report.at - steady, since)), (report.at, kbps))
         uplink, kbps = replace(uplink, rates=rates), max(rate for _, rate in rates)
     elif state is LinkState.CLEAR:
         uplink = replace(uplink, rates=())
     return uplink, LinkEstimate(kbps, 1000 * queue, _loss(packets), state)
+
+
+def _windows(playout: float) -> _Windows:
+    return HELD_BACK if playout else ON_ARRIVAL
 
 
 def _add_units(uplink: UplinkMemory, units: Iterable[ReceivedUnit]) -> UplinkMemory:
@@ -249,7 +274,8 @@ def _add_units(uplink: UplinkMemory, units: Iterable[ReceivedUnit]) -> UplinkMem
             paths[unit.camera] = path
         shortest = path.delay if path and path.own else min((other.delay for other in paths.values()), default=inf)
         gap = unit.arrived - newest if newest else 0.0
-        if gap > PAUSE_S and gap > PAUSE_S + 1.5 * _frame_interval(intervals, captured):  # rarely compute the second
+        pause = _windows(unit.playout).pause if kept and kept[-1].queue > VISIBLE_S else PAUSE_S
+        if gap > pause and gap > pause + 1.5 * _frame_interval(intervals, captured):  # rarely compute the second
             resumed = unit.arrived
         newest = max(newest, unit.arrived) if newest else unit.arrived
         queue = max(0.0, unit.arrived - unit.captured - unit.late - shortest)
@@ -281,7 +307,7 @@ def _rate(uplink: UplinkMemory, last: float, window: float, queue: float, frame:
 
     A shorter time than a frame interval may lack the frame of the camera that sends most.
     """
-    evidence = max(LATE_EVIDENCE_S if uplink.units[-1].playout else EVIDENCE_S, frame)
+    evidence = max(_windows(uplink.units[-1].playout).evidence, frame)
     # From one arrival to another: a window that begins in between would count too much or too little.
     within = len(_later(uplink.units, last - window))
     begin = uplink.units[max(0, len(uplink.units) - within - 1)].arrived
