@@ -57,13 +57,19 @@ def update_cap(
     if link is None:
         unmeasured = t - max(cap.measured, cap.changed, cap.idle)
         has_started = cap.measured >= cap.connected and not cap.provisional
-        return _reset(cap, limit) if unmeasured > (UNMEASURED_S if has_started else START_S) else cap
-    cap, full = capacity.adapt_overuse(capacity.fall_with_limit(cap, link, t, limit), t, limit), limit
+        if unmeasured > (UNMEASURED_S if has_started else START_S):
+            return _reset(cap, limit)
+        return _follow_limit(cap, None, t, limit) if cap.provisional else cap
+    cap, full = _follow_limit(cap, link, t, limit), limit
     cap = cap._replace(trust=update_trust(cap.trust, t, least_trust, position))
     limit = believed_limit(cap, limit, least_trust)
     if link.t > cap.measured:
         cap = _handle_measurement(cap, link, t, limit, full, least_trust)
     return _handle_silence(cap, link, t, limit)
+
+
+def _follow_limit(cap: LinkCap, link: LinkMeasured | None, t: float, limit: Kbps) -> LinkCap:
+    return capacity.adapt_overuse(capacity.fall_with_limit(cap, link, t, limit), t, limit)
 
 
 def _handle_measurement(
@@ -214,20 +220,18 @@ def _recover(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps
     cap = cap._replace(before=link.kbps or cap.before, queue_ms=0.0)
     if cap.kbps is None or cap.kbps >= limit or t - cap.changed < STEP_S + rtt_s(link):
         return cap  # a cap that is not in force is untested, and so does not grow
-    if cap.provisional and not capacity.is_start(cap, t):  # static pictures may never fill it
-        return cap._replace(kbps=None, provisional=False, changed=t)
     steps, factor, last = cap.steps, FAST, cap.overuse
-    if (cap.provisional and cap.before is None) or capacity.is_start_over(cap, link, t, full):
+    if capacity.is_start_over(cap, link, t, full):
         return cap  # it does not grow before a rate has been measured under this limit
-    beyond = _begin_factor(link) * (link.kbps or 0) / cap.kbps
-    if cap.provisional:
-        factor = min(BEGIN_STEP, beyond)
+    is_start = last is None and capacity.is_start(cap, t)  # later the cap grows although static pictures never fill it
+    if is_start:
+        factor = _begin_factor(cap.kbps, link)
     elif last:
         factor = min(FAST, capacity.RESERVE * last.known(full) / cap.kbps)
-        if capacity.is_start(cap, last.t) or last.t - cap.resumed < capacity.BEGIN_S:  # it may have carried more since
-            factor = max(factor, min(BEGIN_STEP, beyond))
+        if capacity.is_start(cap, last.t) or last.t - cap.resumed < capacity.BEGIN_S:
+            factor = max(factor, _begin_factor(cap.kbps, link))  # that overuse may understate the link
     if factor < 1 + CAREFUL:
-        if cap.provisional or not _may_probe(cap, link, t, limit):
+        if is_start or not _may_probe(cap, link, t, limit):
             return cap
         factor, steps = min(FAST, 1 + CAREFUL * 2 ** (steps // DOUBLING)), steps + 1
     kbps = tenths(cap.kbps * factor)
@@ -236,9 +240,10 @@ def _recover(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps
     return cap._replace(kbps=kbps, steps=steps, changed=t)
 
 
-def _begin_factor(link: LinkMeasured) -> Fraction:
-    """Up to what multiple of what arrives the cap may grow while the capacity is uncertain."""
-    return 1 + (BEGIN - 1) * max(Fraction(0), 1 - exact(link.queue_ms or 0) / BEGIN_MS)
+def _begin_factor(kbps: Kbps, link: LinkMeasured) -> Fraction:
+    """The factor by which a cap may grow while the capacity is uncertain; 1 or less: not."""
+    growth = 1 + (BEGIN - 1) * max(Fraction(0), 1 - exact(link.queue_ms or 0) / BEGIN_MS)
+    return min(BEGIN_STEP, growth * (link.kbps or 0) / kbps)
 
 
 def _may_probe(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> bool:

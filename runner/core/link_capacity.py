@@ -22,32 +22,40 @@ OUTAGE, OUTAGE_S = 10, 10.0
 BEGIN_S = 2.0  # after the first measurement or an outage: until then the capacity is too uncertain
 
 
-def fall_with_limit(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:
+def fall_with_limit(cap: LinkCap, link: LinkMeasured | None, t: float, limit: Kbps) -> LinkCap:
     """The cap when a prediction falls: a link that carries a constant share of it has fallen, too.
 
     The cap falls to what is then known to be carried: careful increases end, too. If it has grown far beyond that, the
     known capacity is outdated, and the cap keeps its share of the prediction. It does not fall if the link has fallen
-    before, and the prediction follows.
-
-    At the start, when the cap grows beyond what is known, it keeps its share. If the prediction falls clearly, it falls
-    to what is known to be carried or, before the link proves narrow, to what arrives, and far enough to drain the
-    queue, which a link that has fallen carries more slowly.
+    before, and the prediction follows. See `_fall_at_start` for the start.
     """
     last, before = cap.overuse, cap.limit.kbps
-    if not cap.predicted or cap.kbps is None or limit >= before:
+    if not cap.predicted or cap.kbps is None or limit >= before or (last and _was_late(cap, last, t, limit)):
         return cap
-    if cap.provisional:
-        last = Overuse(t, link.kbps or cap.in_force(before), before)
-    elif last is None or _was_late(cap, last, t, limit):
-        return cap
-    sent, known = cap.in_force(before), min(limit, last.known(limit))
+    sent = cap.in_force(before)
     same_share = sent * limit / before
-    if not is_start(cap, t):
-        return cap._replace(kbps=tenths(same_share if known < FELL * same_share else min(sent, RESERVE * known)))
-    if limit >= FELL * before:
-        return cap._replace(kbps=tenths(same_share))
+    if is_start(cap, t):
+        return cap._replace(kbps=tenths(min(sent, _fall_at_start(cap, link, t, limit, same_share))))
+    if last is None:
+        return cap
+    known = min(limit, last.known(limit))
+    return cap._replace(kbps=tenths(same_share if known < FELL * same_share else min(sent, RESERVE * known)))
+
+
+def _fall_at_start(cap: LinkCap, link: LinkMeasured | None, t: float, limit: Kbps, same_share: Kbps) -> Kbps:
+    """What may be sent when the prediction falls at the start, in which the cap grows beyond what is known.
+
+    A slight fall lowers the cap in proportion. After a clear one, less is sent than the link is known to carry or,
+    before it proves narrow, than a proportional part of what arrives: the queue drains, which takes longer on a link
+    that has fallen.
+    """
+    before = cap.limit.before_fall if link and just_fell(cap, link, t) else cap.limit.kbps
+    last = cap.overuse or Overuse(t, link.kbps or Fraction(0) if link else Fraction(0), before)
+    if link is None or limit >= FELL * min(before, last.carried):
+        return same_share
+    known = min(limit, last.known(limit))
     queue_ms = exact(link.queue_ms or 0) * last.known(before) / known
-    return cap._replace(kbps=tenths(min(sent, min(RESERVE, drained(queue_ms)) * known)))
+    return max(DEEPEST * same_share, min(RESERVE, drained(queue_ms)) * known)
 
 
 def drained(queue_ms: Fraction) -> Fraction:
@@ -78,7 +86,7 @@ def adapt_overuse(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
 
 
 def is_start(cap: LinkCap, t: float) -> bool:
-    """Whether the link has been measured for too short a time to know its capacity."""
+    """Whether the link has been measured for too short a time to know its capacity, or not at all."""
     return t - cap.began < BEGIN_S
 
 
