@@ -2,6 +2,7 @@
 
   python bench/uplinks.py OUT UPLINK.csv...                   5 runs of each, hours
   python bench/uplinks.py OUT UPLINK.csv --runs 1 --seconds 30 --only right high_50
+  python bench/uplinks.py OUT NARROW.csv --set vehicle=delivery_robot      three cameras fill a narrow uplink
 
 Drives `experiment=wrong_prediction` over each uplink, measures each drive, and prints a table: medians over the runs,
 and their range. A drive over an unlimited link first shows how much of their bitrate the cameras use: if that is
@@ -85,13 +86,15 @@ def main() -> None:
     parser.add_argument("--seconds", type=int, default=60)
     parser.add_argument("--fps", type=int, default=FPS, help="frames a second of each camera, at most")
     parser.add_argument("--only", nargs="*", help="conditions of the experiment; all if not given")
+    parser.add_argument(
+        "--set", nargs="*", default=[], help="other overrides, as vehicle=delivery_robot: fewer cameras"
+    )
     options = parser.parse_args()
+    common = [EXPERIMENT, "~experiment.runs", f"fps_max={options.fps}", f"duration_s={options.seconds}", *options.set]
     found: dict[str, dict[str, list[Figures]]] = {}
     filled: dict[str, float] = {}
     for uplink in options.uplinks:
-        filled[uplink.stem] = _bitrate_use(
-            options.output / uplink.stem / "unlimited", uplink, options.seconds, options.fps
-        )
+        filled[uplink.stem] = _bitrate_use(options.output / uplink.stem / "unlimited", [*common, _trace(uplink)])
         print(f"{uplink.stem}: the cameras use {filled[uplink.stem]:.0f} % of their bitrate", flush=True)
         conditions = _conditions(uplink)
         drives: dict[str, list[Figures]] = {name: [] for name in options.only or conditions}
@@ -99,8 +102,7 @@ def main() -> None:
         for number in range(options.runs):  # paired: other load on the machine affects all conditions
             for name, done in drives.items():
                 path = options.output / uplink.stem / f"{name}.{number}"
-                words = [EXPERIMENT, "~experiment.runs", *conditions[name], _trace(uplink)]
-                measured_drive(path, [*words, f"fps_max={options.fps}", f"duration_s={options.seconds}"])
+                measured_drive(path, [*common, _trace(uplink), *conditions[name]])
                 done.append(figures(path))
                 print(uplink.stem, path.name, {key: round(value, 3) for key, value in done[-1].items()}, flush=True)
             write_whole(options.output / "uplinks.json", json.dumps(found, indent=1).encode())
@@ -108,10 +110,9 @@ def main() -> None:
     print("\n".join(table(found, filled)))
 
 
-def _bitrate_use(path: Path, uplink: Path, seconds: int, fps: int) -> float:
+def _bitrate_use(path: Path, words: Sequence[str]) -> float:
     """Share of the allocated bitrate that the cameras send over an unlimited link, %."""
-    words = [EXPERIMENT, "~experiment.runs", "modes=open_loop", "link=null", _trace(uplink)]
-    ensure_drive(path, [*words, f"fps_max={fps}", f"duration_s={seconds}"])
+    ensure_drive(path, [*words, "modes=open_loop", "link=null"])
     return 100 * statistics(series(read_drive(path), path.name)).share
 
 
