@@ -160,7 +160,7 @@ def test_a_play_out_delay_that_hides_a_short_queue_delays_the_cut_little(seed: i
 @pytest.mark.parametrize("seed", range(3))
 def test_jitter_somewhat_beyond_a_play_out_delay_reduces_the_rate_little(seed: int) -> None:
     link = Link(steps((0, 4400)), jitter(0.5, 0.1, 80, seed=seed), one_way_s=0.02, playout_s=0.06)
-    assert drive(link, steps((0, 4000)), 30, cameras=3, fps=40, seed=seed, noise=0.1).kbps(2, 30) >= 0.9 * 4000
+    assert drive(link, steps((0, 4000)), 30, cameras=3, fps=40, seed=seed, noise=0.1).kbps(2, 30) >= 0.8 * 4000
 
 
 @pytest.mark.parametrize("seconds", [0.1, 0.15, 0.2, 0.25])

@@ -33,7 +33,8 @@ RATE_S = 0.25  # the rate is averaged over this time, or over three frame interv
 # obsolete. The link is busy, so a short time suffices to measure the new rate.
 FALLEN_S, FALLEN_RATE_S = 0.04, 0.1
 PAUSE_S = 0.01  # without a unit for this long beyond 1.5 frame intervals, measurement of the rate restarts ...
-VISIBLE_S = 0.003  # ... or later if the last unit met a queue of this length: a large frame takes long on a narrow link
+# ... or for this long if the last unit met a queue of the first length: a large frame takes long on a narrow link.
+VISIBLE_S, QUEUED_PAUSE_S = 0.003, 0.04
 
 
 class _Windows(NamedTuple):
@@ -41,19 +42,17 @@ class _Windows(NamedTuple):
 
     recent    the queue is the shortest that a unit met in this time, or in a frame interval
     evidence  a rate measured over a shorter time is not significant
-    pause     as PAUSE_S, once there is a queue
     steady    as STEADY_S, once the rate of the link has dropped
     """
 
     recent: float
     evidence: float
-    pause: float
     steady: float
 
 
-ON_ARRIVAL = _Windows(recent=0.06, evidence=0.08, pause=PAUSE_S, steady=FALLEN_RATE_S)
+ON_ARRIVAL = _Windows(recent=0.06, evidence=0.08, steady=FALLEN_RATE_S)
 # A play-out delay hides jitter: units that are late nevertheless have met a long queue, and arrive at the link's rate.
-HELD_BACK = _Windows(recent=0.04, evidence=0.05, pause=0.04, steady=0.05)
+HELD_BACK = _Windows(recent=0.04, evidence=0.05, steady=0.05)
 
 SLOW_S = 0.15  # a longer interval between frames is a gap in which frames were lost
 EMPTY_S = 0.010  # a unit that waited less met no queue
@@ -68,6 +67,7 @@ COUNTED_S, LONGEST_S = 1.0, 2.0  # losses are counted for this long; with few pa
 FEW_PACKETS = 100  # ... until there are so many; with fewer the loss share is not reported
 OVERFLOWING = 0.04  # packets lost per packet received, more than usual on the radio link: the queue overflows
 STUCK_GROWTH = 1.5  # a queue longer than this multiple of its minimum is growing
+DROPPED_SHARE = 0.75  # of the rate before the queue: less is no jitter, which delays units but lets all of them through
 STUCK_S = 0.6  # a queue that has not drained for this long ...
 STUCK_SHARE = 0.75  # ... although the rate fell to this share is not a queue: the path has become longer
 
@@ -124,7 +124,7 @@ class LinkEstimate:
     """The uplink at the time of a report.
 
     kbps      received kbit/s; while the queue is filling or draining, the capacity. None: too little has arrived
-    queue_ms  wait in the queue
+    queue_ms  wait in the queue, including what a play-out delay hides of it
     loss      share of packets lost in the last second or, with few packets, two; 0 to 1
     """
 
@@ -190,6 +190,7 @@ class UplinkMemory:
     onset      when the queue was last empty; None: it is empty
     level      wait in the queue when it last grew clearly, s
     peak       kbit/s, highest rate since then: a queue that grows because the link fell carried more before
+    cleared    kbit/s, rate when the queue was last empty
     rates      (time of the report, kbit/s) since the onset, of the last STEADY_S
     """
 
@@ -203,6 +204,7 @@ class UplinkMemory:
     onset: float | None = None
     level: float = 0.0
     peak: float = 0.0
+    cleared: float = 0.0
     rates: tuple[tuple[float, float], ...] = ()
 
 
@@ -239,17 +241,21 @@ def estimate(uplink: UplinkMemory, report: LinkReport) -> tuple[UplinkMemory, Li
     kbps, since = _rate(uplink, last, max(FALLEN_RATE_S, own) if fallen else max(RATE_S, 3 * frame), queue, own)
     if onset is None or stalled or queue > STUCK_GROWTH * uplink.level + GROWN_S:
         uplink = replace(uplink, level=queue, peak=0.0)
-    uplink = replace(uplink, peak=max(uplink.peak, kbps or 0.0))
+    cleared = kbps if onset is None and kbps else uplink.cleared
+    uplink = replace(uplink, peak=max(uplink.peak, kbps or 0.0), cleared=cleared)
     if _is_stuck(uplink, kbps):
         return _lengthen_path(uplink), LinkEstimate(kbps, 0.0, _loss(packets), LinkState.CLEAR)
     state = LinkState.STALLED if stalled else _state(queues, queue, onset)
-    if state in (LinkState.FILLING, LinkState.DRAINING) and kbps is not None:
+    is_queued = state in (LinkState.FILLING, LinkState.DRAINING)
+    if is_queued and kbps is not None:
         steady = windows.steady if fallen else STEADY_S
         rates = (*_entries_since(uplink.rates, max(report.at - steady, since)), (report.at, kbps))
         uplink, kbps = replace(uplink, rates=rates), max(rate for _, rate in rates)
     elif state is LinkState.CLEAR:
         uplink = replace(uplink, rates=())
-    return uplink, LinkEstimate(kbps, 1000 * queue, _loss(packets), state)
+    has_dropped = is_queued and kbps is not None and kbps < DROPPED_SHARE * uplink.cleared
+    hidden = uplink.units[-1].playout if has_dropped else 0.0
+    return uplink, LinkEstimate(kbps, 1000 * (queue + hidden), _loss(packets), state)
 
 
 def _windows(playout: float) -> _Windows:
@@ -274,7 +280,7 @@ def _add_units(uplink: UplinkMemory, units: Iterable[ReceivedUnit]) -> UplinkMem
             paths[unit.camera] = path
         shortest = path.delay if path and path.own else min((other.delay for other in paths.values()), default=inf)
         gap = unit.arrived - newest if newest else 0.0
-        pause = _windows(unit.playout).pause if kept and kept[-1].queue > VISIBLE_S else PAUSE_S
+        pause = QUEUED_PAUSE_S if unit.playout and kept and kept[-1].queue > VISIBLE_S else PAUSE_S
         if gap > pause and gap > pause + 1.5 * _frame_interval(intervals, captured):  # rarely compute the second
             resumed = unit.arrived
         newest = max(newest, unit.arrived) if newest else unit.arrived
