@@ -685,6 +685,18 @@ def test_at_the_start_what_is_sent_does_not_count_as_carried() -> None:
     assert overuse.known(Fraction(20000)) == 14500
 
 
+def test_at_the_start_jitter_of_the_first_cameras_is_not_taken_for_the_capacity() -> None:
+    """One of eight has started, and its two first pictures are late."""
+    reports = ((10.2, "filling", 1250, 25), (10.24, "filling", 1250, 27))
+    assert min(reported(starting(10000, 20000), 20000, *reports)) >= 6000
+
+
+@pytest.mark.parametrize(("arrives", "kbps"), [(3000, 20000), (13900, 13900)])
+def test_after_the_start_a_cap_that_a_queue_kept_is_not_released_at_once(arrives: int, kbps: float) -> None:
+    cap = starting(13900, 20000)._replace(changed=11.3)
+    assert reported(cap, 20000, (11.6, "clear", arrives, 20))[-1] == pytest.approx(kbps, rel=0.025)
+
+
 def test_later_a_prediction_that_falls_further_than_the_link_was_only_late() -> None:
     """It may be a lower bound, which stays below the link."""
     cap = capped(3000, 4800, 2760)._replace(overuse=Overuse(10.0, Fraction(3000), Fraction(4800), fell=True))

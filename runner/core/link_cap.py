@@ -156,7 +156,7 @@ def follow(cap: LinkCap, limit: Kbps, is_prediction: bool) -> LinkCap:
 
 def _drained(link: LinkMeasured, carried: Kbps) -> Kbps:
     """Low enough to drain the queue of a link that carries this much."""
-    return carried * (capacity.DEEPEST if is_lossy(link) else capacity.drained(exact(link.queue_ms or 0)))
+    return carried * (capacity.DEEPEST if is_lossy(link) else capacity.drain_share(exact(link.queue_ms or 0)))
 
 
 def _may_be_jitter(cap: LinkCap, link: LinkMeasured) -> bool:
@@ -170,13 +170,15 @@ def _cut_by_jitter(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full
     """A cut for a queue that may be jitter; none for a short queue if the link is known to carry more than is sent.
 
     With jitter, at most as much arrives as is sent. Mistaken for the capacity, it would lower the cap repeatedly. At
-    the start the link may not yet have carried what is sent, so what arrives is all that is known.
+    the start the link may not yet have carried what is sent, so what arrives is all that is known, unless it is so
+    little that not all cameras have started.
     """
     sent = cap.in_force(limit)
     known = cap.overuse.known(full) if cap.overuse else sent
     if cap.overuse and sent <= capacity.RESERVE * known and is_short(link):
         return capacity.raise_known(cap, link, t, full)
-    return _cut(cap, link, t, limit, full, Fraction(0) if capacity.is_start(cap, t) else known)
+    is_all_known = capacity.is_start(cap, t) and (link.kbps or 0) >= capacity.DEEPEST * sent
+    return _cut(cap, link, t, limit, full, Fraction(0) if is_all_known else known)
 
 
 def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps, known: Kbps = Fraction(0)) -> LinkCap:
@@ -223,8 +225,9 @@ def _recover(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps
     steps, factor, last = cap.steps, FAST, cap.overuse
     if capacity.is_start_over(cap, link, t, full):
         return cap  # it does not grow before a rate has been measured under this limit
-    is_start = last is None and capacity.is_start(cap, t)  # later the cap grows although static pictures never fill it
-    if is_start:
+    is_start = last is None and capacity.is_start(cap, t)
+    # Static pictures may never fill the cap; later it grows although they do not.
+    if is_start or (cap.provisional and BEGIN * (link.kbps or 0) >= cap.kbps):
         factor = _begin_factor(cap.kbps, link)
     elif last:
         factor = min(FAST, capacity.RESERVE * last.known(full) / cap.kbps)

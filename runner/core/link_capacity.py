@@ -45,20 +45,22 @@ def fall_with_limit(cap: LinkCap, link: LinkMeasured | None, t: float, limit: Kb
 def _fall_at_start(cap: LinkCap, link: LinkMeasured | None, t: float, limit: Kbps, same_share: Kbps) -> Kbps:
     """What may be sent when the prediction falls at the start, in which the cap grows beyond what is known.
 
-    A slight fall lowers the cap in proportion. After a clear one, less is sent than the link is known to carry or,
-    before it proves narrow, than a proportional part of what arrives: the queue drains, which takes longer on a link
-    that has fallen.
+    A fall that is slight, or leaves more than arrives, lowers the cap in proportion. After a clear one, less is sent
+    than the link is known to carry or, before it proves narrow, than a proportional part of what arrives: the queue
+    drains, which takes longer on a link that has fallen.
     """
-    before = cap.limit.before_fall if link and just_fell(cap, link, t) else cap.limit.kbps
-    last = cap.overuse or Overuse(t, link.kbps or Fraction(0) if link else Fraction(0), before)
-    if link is None or limit >= FELL * min(before, last.carried):
+    if link is None:
+        return same_share
+    before = cap.limit.before_fall if just_fell(cap, link, t) else cap.limit.kbps
+    last = cap.overuse or Overuse(t, link.kbps or Fraction(0), before)  # as if what arrives were the capacity
+    if limit >= FELL * min(before, last.carried):
         return same_share
     known = min(limit, last.known(limit))
     queue_ms = exact(link.queue_ms or 0) * last.known(before) / known
-    return max(DEEPEST * same_share, min(RESERVE, drained(queue_ms)) * known)
+    return max(DEEPEST * same_share, min(RESERVE, drain_share(queue_ms)) * known)
 
 
-def drained(queue_ms: Fraction) -> Fraction:
+def drain_share(queue_ms: Fraction) -> Fraction:
     """The share of its capacity with which a queue drains in time."""
     return max(DEEPEST, min(SHALLOWEST, 1 - queue_ms / DRAIN_MS))
 

@@ -33,12 +33,13 @@ RATE_S = 0.25  # the rate is averaged over this time, or over three frame interv
 # obsolete. The link is busy, so a short time suffices to measure the new rate.
 FALLEN_S, FALLEN_RATE_S = 0.04, 0.1
 PAUSE_S = 0.01  # without a unit for this long beyond 1.5 frame intervals, measurement of the rate restarts ...
-# ... or for this long if the last unit met a queue of the first length: a large frame takes long on a narrow link.
+# ... or, behind a play-out delay, for the second of these times if the last unit was late by the first: a large frame
+# takes long on a narrow link.
 VISIBLE_S, QUEUED_PAUSE_S = 0.003, 0.04
 
 
 class _Windows(NamedTuple):
-    """Times that depend on how much jitter there is, s.
+    """Times that depend on whether a play-out delay hides jitter, s.
 
     recent    the queue is the shortest that a unit met in this time, or in a frame interval
     evidence  a rate measured over a shorter time is not significant
@@ -67,7 +68,7 @@ COUNTED_S, LONGEST_S = 1.0, 2.0  # losses are counted for this long; with few pa
 FEW_PACKETS = 100  # ... until there are so many; with fewer the loss share is not reported
 OVERFLOWING = 0.04  # packets lost per packet received, more than usual on the radio link: the queue overflows
 STUCK_GROWTH = 1.5  # a queue longer than this multiple of its minimum is growing
-DROPPED_SHARE = 0.85  # of the rate before the queue: less is no jitter, which delays units but lets all of them through
+DROPPED_SHARE = 0.8  # of the rate before the queue: less is no jitter, which delays units but lets all of them through
 STUCK_S = 0.6  # a queue that has not drained for this long ...
 STUCK_SHARE = 0.75  # ... although the rate fell to this share is not a queue: the path has become longer
 
@@ -124,7 +125,7 @@ class LinkEstimate:
     """The uplink at the time of a report.
 
     kbps      received kbit/s; while the queue is filling or draining, the capacity. None: too little has arrived
-    queue_ms  wait in the queue, including what a play-out delay hides of it
+    queue_ms  wait in the queue, including what a play-out delay hides of it once the link's rate has dropped
     loss      share of packets lost in the last second or, with few packets, two; 0 to 1
     """
 
