@@ -86,9 +86,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=int, default=60)
     parser.add_argument("--fps", type=int, default=FPS, help="frames a second of each camera, at most")
     parser.add_argument("--only", nargs="*", help="conditions of the experiment; all if not given")
-    parser.add_argument(
-        "--set", nargs="*", default=[], help="other overrides, as vehicle=delivery_robot: fewer cameras"
-    )
+    parser.add_argument("--set", nargs="*", default=[], help="further overrides, such as vehicle=delivery_robot")
     options = parser.parse_args()
     common = [EXPERIMENT, "~experiment.runs", f"fps_max={options.fps}", f"duration_s={options.seconds}", *options.set]
     found: dict[str, dict[str, list[Figures]]] = {}

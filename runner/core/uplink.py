@@ -67,8 +67,8 @@ GAP_S = 0.12  # without a unit for this long, or for two frame intervals, the li
 COUNTED_S, LONGEST_S = 1.0, 2.0  # losses are counted for this long; with few packets for longer ...
 FEW_PACKETS = 100  # ... until there are so many; with fewer the loss share is not reported
 OVERFLOWING = 0.04  # packets lost per packet received, more than usual on the radio link: the queue overflows
-STUCK_GROWTH = 1.5  # a queue longer than this multiple of its minimum is growing
 DROPPED_SHARE = 0.8  # of the rate before the queue: less is no jitter, which delays units but lets all of them through
+STUCK_GROWTH = 1.5  # a queue longer than this multiple of its minimum is growing
 STUCK_S = 0.6  # a queue that has not drained for this long ...
 STUCK_SHARE = 0.75  # ... although the rate fell to this share is not a queue: the path has become longer
 
