@@ -225,16 +225,16 @@ def _recover(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps
     steps, factor, last = cap.steps, FAST, cap.overuse
     if capacity.is_start_over(cap, link, t, full):
         return cap  # it does not grow before a rate has been measured under this limit
-    is_start = last is None and capacity.is_start(cap, t)
+    is_starting = last is None and capacity.is_start(cap, t)
     # Static pictures may never fill the cap; later it grows although they do not.
-    if is_start or (cap.provisional and BEGIN * (link.kbps or 0) >= cap.kbps):
+    if is_starting or (cap.provisional and BEGIN * (link.kbps or 0) >= cap.kbps):
         factor = _begin_factor(cap.kbps, link)
     elif last:
         factor = min(FAST, capacity.RESERVE * last.known(full) / cap.kbps)
         if capacity.is_start(cap, last.t) or last.t - cap.resumed < capacity.BEGIN_S:
             factor = max(factor, _begin_factor(cap.kbps, link))  # that overuse may understate the link
     if factor < 1 + CAREFUL:
-        if is_start or not _may_probe(cap, link, t, limit):
+        if is_starting or not _may_probe(cap, link, t, limit):
             return cap
         factor, steps = min(FAST, 1 + CAREFUL * 2 ** (steps // DOUBLING)), steps + 1
     kbps = tenths(cap.kbps * factor)
@@ -293,7 +293,7 @@ def _resume(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
     """After a stall, unless it was short, the first report with an empty queue restores half of the rate before it."""
     if cap.stall is None:
         return cap
-    kbps, is_short = cap.kbps, not cap.stall.halved and cap.resumed < cap.stall.t
-    if kbps is None or is_short or not cap.before:
+    kbps, was_short = cap.kbps, not cap.stall.halved and cap.resumed < cap.stall.t
+    if kbps is None or was_short or not cap.before:
         return cap._replace(stall=None)
     return cap._replace(kbps=max(kbps, min(cap.before, limit) / 2), stall=None, changed=t)
