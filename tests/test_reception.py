@@ -201,8 +201,10 @@ def test_video_that_is_not_sent_is_no_stall(kbps: int) -> None:
 # --- without a prediction ---------------------------------------------------------------------------------------------
 
 
-def measured(drive: Drive, t: float, kbps: float, state: str = "clear", queue_ms: float = 0) -> Fraction:
-    drive.accept("link_measured", t=t, kbps=kbps, queue_ms=queue_ms, state=state, rtt_ms=30)
+def measured(
+    drive: Drive, t: float, kbps: float, state: str = "clear", queue_ms: float = 0, loss: float = 0
+) -> Fraction:
+    drive.accept("link_measured", t=t, kbps=kbps, queue_ms=queue_ms, state=state, loss=loss, rtt_ms=30)
     return drive.run.decision.total
 
 
@@ -410,6 +412,28 @@ def test_a_cut_ends_at_the_floors_unless_they_are_too_much_for_the_link() -> Non
     assert drive.total < 300
 
 
+def test_a_floor_above_what_the_operator_asks_for_reserves_nothing() -> None:
+    """Of the floor of 800 only the 200 that the camera is set to are needed."""
+    drive = single("cameras.front.floor_kbps=800")
+    drive.accept("camera_configured", camera="front", kbps=200, scaling=1)
+    measured(drive, 0.1, 750, "filling", 200)
+    assert drive.total < 750
+    assert drive.sent("front")[0] == 200
+
+
+def test_a_full_queue_of_the_floors_alone_gives_them_up() -> None:
+    """10 % less than the floors arrives: competing traffic would have backed off after the losses."""
+    drive = Drive("vehicle=delivery_robot", "modes=safe", "cameras.front.floor_kbps=500", "cameras.mast.floor_kbps=100")
+    drive.accept("bitrate_predicted", kbps=3000, valid_s=1000)
+    measured(drive, 0.1, 300, "filling", 200)
+    for n in range(1, 400):
+        measured(drive, 0.1 + n / 25, 590, "filling", 300, loss=0.1 if n % 100 else 0.0)
+    assert drive.total == 600, "losses stop every 4 s, as with competing flows"
+    for n in range(400, 620):
+        measured(drive, 0.1 + n / 25, 590, "filling", 300, loss=0.1)
+    assert drive.total < 0.95 * 590
+
+
 SHED = ("cameras.front.floor_kbps=600", "cameras.rear.floor_kbps=300", "cameras.rear.shed=1")
 
 
@@ -458,6 +482,21 @@ def test_copies_for_other_viewers_occupy_the_measured_link_too() -> None:
     measured(drive, 0.1, 1500, "filling", 60)
     assert 0.75 * 3000 < drive.total < 3000
     assert 2 * sum(drive[name].kbps for name in NAMES) <= drive.total
+
+
+def test_copies_count_with_the_bitrate_that_they_have() -> None:
+    """Front, with a small ROI, asks for a tenth of its b_full: its second copy adds little."""
+    drive = single()
+    drive.accept("roi_set", camera="front", x=0, y=0, width=320, height=288)
+    drive.accept("mode_selected", mode="automatic")
+    drive.accept("bitrate_predicted", kbps=3000, valid_s=1000)
+    drive.accept("copies_counted", copies={"front": 2})
+    one = {name: float(drive[name].kbps) for name in NAMES}
+    share = 1 + one["front"] / sum(one.values())
+    assert 1.05 < share < 1.25
+    measured(drive, 0.1, 2000, "filling", 60)
+    carried = share * 2000
+    assert 0.75 * carried < drive.total < 0.9 * carried
 
 
 # --- what must not happen ---------------------------------------------------------------------------------------------

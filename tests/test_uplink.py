@@ -350,6 +350,16 @@ def test_competing_flows_take_no_camera_below_its_floor() -> None:
     assert lowest[500] == 500
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_first_overuse_does_not_make_a_prediction_late(seed: int) -> None:
+    """As over a recorded LTE uplink: soon after a prediction 50 % too high filled the link, prediction and link fall."""
+    link = Link(steps((0, 7200), (1.8, 8800), (2.8, 6000), (3.8, 8800)))
+    limit = steps((0, 9900), (1.8, 12000), (2.8, 8250), (3.8, 12000))
+    done = drive(link, limit, 6, cameras=8, fps=10, seed=seed, start=HALF, key_frame=3)
+    assert done.first(2.8, lambda cap: cap < 6000) <= 0.1
+    assert done.wait_ms(0.99, since=2.8) <= 170
+
+
 @pytest.mark.parametrize("queue_s", [0.3, 0.03])
 @pytest.mark.parametrize("kbps", [60, 150, 220])
 def test_a_link_too_narrow_for_the_floors_gets_less(kbps: float, queue_s: float) -> None:

@@ -2,7 +2,8 @@
 
 On overuse it is cut immediately below the link's capacity, low enough to drain the queue. It recovers in steps up to
 the limit, which is the prediction or the operator's total, and never beyond: the prediction saves probing. Where the
-link proved narrower than the limit, recovery is fast up to that capacity, scaled with the limit, and careful beyond.
+link proved narrower than the limit, recovery is fast up to that capacity, which is scaled with a prediction but not
+with an operator's total, and careful beyond.
 When an operator connects, the cap starts at a share of the limit.
 """
 
@@ -208,7 +209,7 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps, kn
     carried = max(carried, tenths(known * seen / full))
     return cap._replace(
         kbps=tenths(target),
-        overuse=cap.overuse if in_outage else capacity.next_overuse(cap.overuse, t, carried, seen),
+        overuse=cap.overuse if in_outage else capacity.next_overuse(cap, t, carried, seen),
         queue_ms=link.queue_ms or 0.0,
         steps=0,
         changed=t,

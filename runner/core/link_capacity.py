@@ -1,6 +1,7 @@
 """What the link is known to carry, in relation to the limit, which is a prediction or the operator's total. Pure.
 
-A link that proved at its last overuse to carry a share of the limit is expected to carry that share of the next limit.
+A link that proved at its last overuse to carry a share of a prediction is expected to carry that share of the next one.
+An operator's total does not scale it.
 """
 
 from __future__ import annotations
@@ -118,9 +119,13 @@ def _end_outage(cap: LinkCap, t: float, limit: Kbps, before: Overuse | None) -> 
     return cap._replace(kbps=kbps, queue_ms=float("inf"), steps=0, changed=t)  # the queue is the outage's
 
 
-def next_overuse(last: Overuse | None, t: float, carried: Kbps, limit: Kbps) -> Overuse:
-    """A new overuse after the last one; cuts within FALL_S belong to the same fall of the link."""
-    has_fallen = carried < FELL * (last.known(limit) if last else limit)
+def next_overuse(cap: LinkCap, t: float, carried: Kbps, limit: Kbps) -> Overuse:
+    """A new overuse after the last one; cuts within FALL_S belong to the same fall of the link.
+
+    The first one shows a fall only if more has arrived before. Otherwise the limit may always have been too high.
+    """
+    last = cap.overuse
+    has_fallen = carried < FELL * (last.known(limit) if last else min(limit, cap.most.kbps))
     return Overuse(t, carried, limit, has_fallen or (last is not None and last.fell and t - last.t < FALL_S))
 
 

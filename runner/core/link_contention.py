@@ -18,6 +18,8 @@ NARROW = ((0.0, Fraction(1, 2)), (1.0, Fraction(4, 5)))
 TRIED_S, TRIED = 2.0, Fraction(19, 20)
 # Likewise while only the floors are sent; without losses, encoders that use less are the more likely reason.
 NARROW_FLOORS = ((0.0, Fraction(1, 2)), (1.0, Fraction(2, 3)), (3.0, Fraction(4, 5)))
+# Competing TCP flows back off after losses. A long queue that loses packets for longer is full of the floors alone.
+FULL_S = 8.0
 # Without predictions, this often within this many s means that short competing flows keep restarting: each fills the
 # queue and drops packets, like a link whose capacity falls. From then on, the share above falls by a third over
 # BURST_S while the queue is long, and only after that the link is considered narrow.
@@ -44,7 +46,8 @@ def is_below_floors(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> 
     held_s, sent = t - (cap.changed if drops else max(cap.changed, cap.short)), cap.may_send(limit)
     tiers = NARROW if drops else NARROW_FLOORS
     is_proof = any(held_s >= least_s and link.kbps < share * sent for least_s, share in tiers)
-    return cap.below or (is_proof and (drops or not is_short(link)))
+    is_full = t - max(cap.changed, cap.unfilled) >= FULL_S
+    return cap.below or is_full or (is_proof and (drops or not is_short(link)))
 
 
 def note_proof(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:

@@ -131,6 +131,7 @@ class LinkCap(NamedTuple):
     losses      of packets
     limit       the last one
     short       t at which the queue was last shorter than JITTER_MS
+    unfilled    t at which it was last not full: short, or without losses
     lowering    the last lowering of the known capacity
     proofs      that the link is narrow
     """
@@ -161,6 +162,7 @@ class LinkCap(NamedTuple):
     losses: Losses = Losses()
     limit: LastLimit = LastLimit()
     short: float = -float("inf")
+    unfilled: float = -float("inf")
     lowering: Lowering = Lowering()
     proofs: Proofs = Proofs()
 
@@ -187,7 +189,8 @@ def record(cap: LinkCap, link: LinkMeasured, t: float) -> LinkCap:
     losses = Losses(loss, t if loss > cap.losses.share else cap.losses.t)
     most = most._replace(kbps=max(most.kbps, kbps))
     short = t if is_short(link) else cap.short
-    return cap._replace(most=most, passed=(cap.changed, passed), losses=losses, short=short)
+    unfilled = cap.unfilled if is_lossy(link) and not is_short(link) else t
+    return cap._replace(most=most, passed=(cap.changed, passed), losses=losses, short=short, unfilled=unfilled)
 
 
 def rtt_s(link: LinkMeasured) -> float:

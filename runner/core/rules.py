@@ -11,7 +11,7 @@ import inspect
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from fractions import Fraction
-from functools import cache, lru_cache
+from functools import cache
 from math import ceil, isfinite
 from typing import Any
 
@@ -128,13 +128,17 @@ def total_fixed(vehicle: Vehicle, state: State, draft: Draft, memory: Memory, *,
 @rule(gives=["demand"], reads=["on", "rois"])
 def demand_from_roi(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
     """Eq. (1): each camera that is on asks in proportion to the pixels of its ROI."""
-    demands = {
+    return draft.replaced(demand=_demands(vehicle, state)), memory
+
+
+def _demands(vehicle: Vehicle, state: State) -> dict[str, Kbps]:
+    """kbit/s by camera, Eq. (1); 0 when off."""
+    return {
         name: allocation.demand(camera.rate_quality.b_full, state.rois[name], camera.full_roi)
         if state.on[name]
         else allocation.ZERO
         for name, camera in vehicle.cameras.items()
     }
-    return draft.replaced(demand=demands), memory
 
 
 @rule(needs=["total", "demand"], gives=["bitrate"], reads=["weights"])
@@ -328,7 +332,9 @@ def fade_when_stale(
 @rule(
     needs=["total"],
     gives=["total"],
-    reads=["copies", "link", "on", "operator_lost", "operator_since", "position", "prediction", "t"],
+    reads=[
+        *("copies", "link", "on", "operator_lost", "operator_since", "position", "prediction", "rois", "t", "weights"),
+    ],
 )
 def cap_by_link(
     vehicle: Vehicle,
@@ -344,8 +350,8 @@ def cap_by_link(
     """The total is at most what the uplink carries, as the operator's side measures it; see `runner.core.link_cap`.
 
     The measured link also carries packet headers, and `reserve_kbps` of it are left to other traffic. The operator
-    measures its own copy of each camera; other copies that leave the vehicle occupy the link in proportion. While there
-    is nothing to send, nothing can be measured. A prediction older than its own `valid_s`, otherwise `alone_after_s`,
+    measures its own copy of each camera; other copies that leave the vehicle carry the same bitrates. While there is
+    nothing to send, nothing can be measured. A prediction older than its own `valid_s`, otherwise `alone_after_s`,
     is ignored while the link is measured: the total then follows the measurement alone. A prediction that repeatedly
     proved too high is trusted less, down to the share `least_trust`; trust recovers with time, and drops again at
     places where it dropped before; see `runner.core.trust`. When an operator connects, the total starts at the share
@@ -359,7 +365,8 @@ def cap_by_link(
     mounted = vehicle.cameras.items()
     cameras = tuple(c for name, c in mounted if state.on[name] for _ in range(state.copies.get(name, 1)))
     limit, least = wire_kbps(cameras, draft.total), wire_kbps(cameras, max(LEAST, Fraction(len(cameras))))
-    cap, link = memory.get("cap_by_link", UNCAPPED), _of_all_copies(vehicle, state)
+    cap = memory.get("cap_by_link", UNCAPPED)
+    link = _of_all_copies(vehicle, state, draft, memory, cameras, limit)
     alone = alone_after_s is not None and _is_stale(state, alone_after_s) and link_cap.is_fresh(link, state.t)
     if not cameras or state.operator_lost is not None or (draft.total < max(1, len(cameras)) and not alone):
         cap = cap._replace(idle=state.t)  # silence now, or soon after, is no stall
@@ -372,7 +379,7 @@ def cap_by_link(
             cap = cap._replace(alone=False)  # `follow` relates the known capacity to the limit
         cap = link_cap.follow(cap, limit, state.mode is Mode.AUTOMATIC and not alone)
         cap = link_cap.start_cap(cap, link, state.operator_since, limit, start)
-        cap = cap._replace(reserve=reserve_kbps, floors=_capped_floors(cameras, reserve_kbps))
+        cap = cap._replace(reserve=reserve_kbps, floors=_capped_floors(vehicle, state, draft, cameras, reserve_kbps))
         cap = link_cap.update_cap(cap, link, state.t, limit, least_trust, state.position)
         cap = link_cap.raise_cap(cap, least)  # with less, some cameras would not be sent, and so not measured
     memory = {**memory, "cap_by_link": cap}
@@ -386,10 +393,27 @@ def cap_by_link(
     return lowered.replaced(sized_for=lowered.uncapped) if cap.provisional else lowered, memory
 
 
-@lru_cache(maxsize=64)  # for a few sets of cameras that are on
-def _capped_floors(cameras: tuple[Camera, ...], reserve: Kbps) -> Kbps:
-    """The cap, in tenths of a kbit/s, that leaves the floors of all cameras that are never given up; 0: no floors."""
-    floors = sum((camera.floor_kbps for camera in cameras if camera.shed is None), allocation.ZERO)
+def _wanted(vehicle: Vehicle, state: State, draft: Draft) -> Mapping[str, Kbps]:
+    """The most that each camera will get, kbit/s: in mode S what the operator has set, otherwise Eq. (1)."""
+    return draft.bitrate or draft.demand or _demands(vehicle, state)
+
+
+def _capped_floors(vehicle: Vehicle, state: State, draft: Draft, cameras: tuple[Camera, ...], reserve: Kbps) -> Kbps:
+    """The cap, in tenths of a kbit/s, that leaves the floors of all cameras that are never given up; 0: no floors.
+
+    cameras  that are on, with repetitions for copies
+    """
+    if not (lowest := _floors(vehicle)):
+        return allocation.ZERO
+    wanted = _wanted(vehicle, state, draft)
+    floors = sum(
+        (
+            min(floor, wanted[name]) * state.copies.get(name, 1)
+            for name, floor in lowest.items()
+            if vehicle.cameras[name].shed is None
+        ),
+        allocation.ZERO,
+    )
     return Fraction(ceil(10 * (reserve + wire_kbps(cameras, floors))), 10) if floors else floors
 
 
@@ -408,13 +432,25 @@ def _lower_total(draft: Draft, total: Kbps, why: str) -> Draft:
     return draft.noted(f"total {_short(draft.total)} -> {_short(total)}: {why}", total=total, uncapped=draft.total)
 
 
-def _of_all_copies(vehicle: Vehicle, state: State) -> LinkMeasured | None:
-    """The measurement of one copy of each camera, scaled to all copies that leave the vehicle."""
-    if state.link is None or state.link.kbps is None or not state.copies:
-        return state.link
-    sizes = {name: camera.rate_quality.b_full for name, camera in vehicle.cameras.items() if state.on[name]}
-    sent = sum(size * state.copies.get(name, 1) for name, size in sizes.items())
-    return replace(state.link, kbps=state.link.kbps * sent / max(1, sum(sizes.values())))
+def _of_all_copies(
+    vehicle: Vehicle, state: State, draft: Draft, memory: Memory, cameras: tuple[Camera, ...], limit: Kbps
+) -> LinkMeasured | None:
+    """The measurement of one copy of each camera, scaled to all copies that leave the vehicle.
+
+    cameras  that are on, with repetitions for copies
+    limit    kbit/s on the wire, until the link has been measured under one
+    """
+    link = state.link
+    if link is None or link.kbps is None or not state.copies:
+        return link
+    cap = memory.get("cap_by_link", UNCAPPED)
+    total = video_kbps(cameras, cap.may_send(cap.limit.kbps or limit))
+    given_up = memory.get("fit_to_total" if state.mode is Mode.SINGLE else "share_above_floors", ())
+    sent = _shared(vehicle, state, _without(given_up, _wanted(vehicle, state, draft)), total)
+    if not (of_one := sum(sent.values())):
+        return link
+    of_all = sum(own * state.copies.get(name, 1) for name, own in sent.items())
+    return replace(link, kbps=link.kbps * of_all / of_one)
 
 
 def _is_stale(state: State, after_s: Fraction) -> bool:

@@ -28,20 +28,20 @@ SAME_S = 0.001  # closer capture times, after rounding, belong to the same frame
 STEADY_S = 0.25  # the link's rate is the highest measured in this time: late units make it look lower
 LONGEST_INTERVAL_S = 1.0  # between two frames; a longer one is a pause
 SILENT = 4  # a camera without a frame for this many of its intervals, while others send, no longer does
-RATE_S = 0.25  # the rate is averaged over this time, or over three frame intervals
+RATE_S = 0.25  # the rate is averaged over this time or three frame intervals, whichever is longer
 # With a queue longer than the first of these, the rate of the link has probably dropped and earlier measurements are
 # obsolete. The link is busy, so a short time suffices to measure the new rate.
 FALLEN_S, FALLEN_RATE_S = 0.04, 0.1
 PAUSE_S = 0.01  # without a unit for this long beyond 1.5 frame intervals, measurement of the rate restarts ...
-# ... or, behind a play-out delay, for the second of these times if the last unit was late by the first: a large frame
-# takes long on a narrow link.
+# ... or, behind a playout delay, for the second of these times if the last unit was late by more than the first: a
+# large frame takes long on a narrow link.
 VISIBLE_S, QUEUED_PAUSE_S = 0.003, 0.04
 
 
 class _Windows(NamedTuple):
-    """Times that depend on whether a play-out delay hides jitter, s.
+    """Times that depend on whether a playout delay hides jitter, s.
 
-    recent    the queue is the shortest that a unit met in this time, or in a frame interval
+    recent    the queue is the shortest that a unit met in this time or one frame interval, whichever is longer
     evidence  a rate measured over a shorter time is not significant
     steady    as STEADY_S, once the rate of the link has dropped
     """
@@ -52,7 +52,7 @@ class _Windows(NamedTuple):
 
 
 ON_ARRIVAL = _Windows(recent=0.06, evidence=0.08, steady=FALLEN_RATE_S)
-# A play-out delay hides jitter: units that are late nevertheless have met a long queue, and arrive at the link's rate.
+# A playout delay hides jitter: units that are late nevertheless have met a long queue, and arrive at the link's rate.
 HELD_BACK = _Windows(recent=0.04, evidence=0.05, steady=0.05)
 
 SLOW_S = 0.15  # a longer interval between frames is a gap in which frames were lost
@@ -63,7 +63,7 @@ COMPARED_S = 0.08
 LONG_S = 0.060  # a queue from here on is too long unless it drains
 UNDRAINED_S = 0.4  # a queue that is no shorter after this time is not draining
 LATE_REPORT_S = 0.06  # between two reports; a longer time means that the operator's side was held up
-GAP_S = 0.12  # without a unit for this long, or for two frame intervals, the link has stalled
+GAP_S = 0.12  # without a unit for this long and for two frame intervals, the link has stalled
 COUNTED_S, LONGEST_S = 1.0, 2.0  # losses are counted for this long; with few packets for longer ...
 FEW_PACKETS = 100  # ... until there are so many; with fewer the loss share is not reported
 OVERFLOWING = 0.04  # packets lost per packet received, more than usual on the radio link: the queue overflows
@@ -125,7 +125,7 @@ class LinkEstimate:
     """The uplink at the time of a report.
 
     kbps      received kbit/s; while the queue is filling or draining, the capacity. None: too little has arrived
-    queue_ms  wait in the queue, including what a play-out delay hides of it once the link's rate has dropped
+    queue_ms  wait in the queue, including what a playout delay hides of it once the link's rate has dropped
     loss      share of packets lost in the last second or, with few packets, two; 0 to 1
     """
 
@@ -169,7 +169,7 @@ def _new_path(unit: ReceivedUnit, others: Iterable[_Path]) -> _Path:
 
 @dataclass(frozen=True, slots=True)
 class _Unit:
-    """When a unit arrived, how long it visibly waited in the queue, s, its size, and the play-out delay, s."""
+    """When a unit arrived, how long it visibly waited in the queue, s, its size, and the playout delay, s."""
 
     arrived: float
     queue: float

@@ -329,7 +329,7 @@ class Station:
             before, self.clock = self.clock, self._clocks.difference(now)
         if self.clock is None and before is not None and self.state:
             unstated = f"the vehicle has not stated its clock for {KEPT_S:g} s"
-            why = "a clock was set" if self._clocks.was_set else unstated
+            why = "a clock was stepped" if self._clocks.was_set else unstated
             self.note(f"{why}: latencies are unknown")
 
     def _with_latency(self, name: str, received: Any, now: float) -> StreamCounters:

@@ -458,7 +458,7 @@ def test_a_driver_is_warned_if_the_vehicle_has_another_operator_in_control(chrom
         server.on_state(station.state)  # names no operator: nothing from this station arrives any more
         unheard = "the vehicle receives nothing from this station"
         until(lambda: page.inner_text("#attention") == f"NOT IN CONTROL: {unheard}")
-        assert page.inner_text("#holder") == "You are not heard"
+        assert page.inner_text("#holder") == "Vehicle does not receive you"
         assert page.inner_text("#connection") == "✕ vehicle receives nothing"
         assert f"CONTROL LOST: {unheard}" in page.inner_text("#toasts")
         until(lambda: tones(page) >= before + 4)
@@ -529,7 +529,7 @@ def test_a_driver_is_alerted_to_a_monitor_that_crashed(chromium, picture):
         monitor.evaluate("BroadcastChannel.prototype.postMessage = () => {}")  # all that the page sees of a crash
         until(lambda: "a monitor no longer responds: reload it" in page.inner_text("#toasts"))
         until(lambda: tones(page) >= before + 4)
-        until(lambda: "▲ MONITOR GONE front, mast" in page.text_content("#alarms"))
+        until(lambda: "▲ MONITOR NOT RESPONDING front, mast" in page.text_content("#alarms"))
         for holder in ("nobody", "you"):
             page.keyboard.press("t")
             until(lambda holder=holder: monitor.evaluate("tod.control") == holder)

@@ -45,7 +45,7 @@ export const ACTIONS = {
   straighten: { description: "straighten the picture of the selected fisheye, or show the original", run: () => toggleStraight() },
   drawer: { description: "Drive view: open or close the drawer", run: toggleDrawer },
   map: { description: "the map; in the Drive view opens or closes the drawer with it", run: () => toggleTab("map") },
-  sound: { description: "Drive view: alarm tones on or off", run: toggleSound },
+  sound: { description: "alarm tones on or off", run: toggleSound },
   full_screen: { description: "full screen", run: toggleFullScreen },
   monitors: { description: "pictures in additional windows, for other monitors", run: listMonitors },
   switch: { description: "switch the selected camera on or off", run: () => store.selected && switchCamera(store.selected) },

@@ -50,7 +50,7 @@ export class Attention {
     const warnings = [
       !this.focused && !this.elsewhere && "OUT OF FOCUS: keys do not reach this page; click it",
       this.covered && "HIDDEN: another window of this page cannot be seen",
-      this.slow && "SLOW: this page draws fewer than 10 pictures a second",
+      this.slow && "SLOW: this page does not draw enough of the pictures that arrive",
     ];
     return warnings.filter(Boolean).join(" · ") || null;
   }

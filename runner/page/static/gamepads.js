@@ -44,7 +44,7 @@ function onConnected({ gamepad }) {
 
 function onDisconnected({ gamepad }) {
   reportProblem(`${nameOf(gamepad)} disconnected: its buttons no longer work`);
-  remind(keyOf(gamepad), `GAMEPAD GONE ${nameOf(gamepad)}`);
+  remind(keyOf(gamepad), `GAMEPAD DISCONNECTED ${nameOf(gamepad)}`);
   if (inControl()) publish("unplugged");
   if (pads().length) return;
   clearInterval(pollTimer);

@@ -10,7 +10,7 @@ import { byId, displayName, setAttribute, setText, whole } from "./format.js";
 
 const START_MS = 800; // no alarm while the page is opening
 const GRACE_MS = 2000; // of a warning
-const UNKNOWN = "▲ Age of the pictures unknown: no capture times, or no answer from the vehicle's clock; LATE is not shown";
+const UNKNOWN = "▲ Latency unknown: no capture times, or no answer from the vehicle's clock; LATE covers only the time since arrival here";
 const UNMEASURED = "▲ No measurements from the station: speed, advised speed and bitrates are unknown";
 const HOLDERS = { you: "You are in control", another: "Another page is in control", nobody: "Nobody is in control" };
 const UNHEARD = "the vehicle receives nothing from this station";
@@ -103,7 +103,7 @@ function refreshControl() {
   const button = byId("take-control", HTMLButtonElement);
   const other = otherOperator();
   const isUnheard = store.holder === "you" && hearing.isLost;
-  setText(byId("holder"), !store.connected ? "" : other ? `Operator ${other} is in control` : isUnheard ? "You are not heard" : HOLDERS[store.holder]);
+  setText(byId("holder"), !store.connected ? "" : other ? `Operator ${other} is in control` : isUnheard ? "Vehicle does not receive you" : HOLDERS[store.holder]);
   setAttribute(byId("holder"), "data-holder", other || isUnheard ? "another" : store.holder);
   setText(button, store.holder === "you" ? "Release" : "Take control");
   button.classList.toggle("strong", store.connected && store.holder !== "you");
@@ -123,7 +123,7 @@ function refreshBanner() {
 
 /** What is wrong with the connection to the vehicle; null: nothing. */
 export function linkFault() {
-  if (!store.connected) return store.hung ? "video stopped" : "no station";
+  if (!store.connected) return store.hung ? "video stopped" : "station unreachable";
   if (!store.state) return "no state yet";
   return !store.state.online ? "vehicle offline" : hearing.isLost ? "vehicle receives nothing" : null;
 }

@@ -55,7 +55,7 @@ function checkMonitors(now) {
 /** A monitor has crashed: the driver is alerted once, and its pictures no longer count. */
 function onSilent(id, cameras) {
   reportProblem("a monitor no longer responds: reload it");
-  remind(keyOf(cameras), `MONITOR GONE ${cameras.map(displayName).join(", ")}`);
+  remind(keyOf(cameras), `MONITOR NOT RESPONDING ${cameras.map(displayName).join(", ")}`);
   for (const camera of cameras) publishStatus(id, camera, "lost");
   reports.delete(id);
 }

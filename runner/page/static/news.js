@@ -1,4 +1,4 @@
-/** News, newest first, and toasts for events that need immediate attention. */
+/** Events, newest first, and toasts for events that need immediate attention. */
 
 import { listen, store } from "./store.js";
 import { byId, clockTime, make, setText } from "./format.js";
@@ -17,7 +17,7 @@ const line = ({ time, text, level }) =>
 function refresh() {
   list.replaceChildren(...store.notes.map(line));
   const [newest] = store.notes;
-  setText(latest, newest ? `${clockTime(newest.time)}  ${newest.text}` : "no news yet");
+  setText(latest, newest ? `${clockTime(newest.time)}  ${newest.text}` : "no events yet");
 }
 
 function showToast({ text, level }) {

@@ -183,7 +183,7 @@ function refreshSettings(info, now) {
   full.title = why ?? withKey("full image", "full_image");
   apply.title = why ?? "send these numbers; a rectangle dragged on the picture does the same";
   fill(weight, now?.weight ?? info.weight, whyNot(), pending(`weight:${name()}`));
-  setText(weightNote, whyNot() ?? (mode() === "single" ? "used in modes A and C only" : "share of the total"));
+  setText(weightNote, whyNot() ?? (mode() === "single" ? "used in modes A and C only" : "scales this camera's share of the total"));
 }
 
 /** A number field shows the value in force, except while it is being edited or a request is pending. */
