@@ -251,7 +251,7 @@ class VehicleSide:
                 self._server = CameraServer(served, media, self._build, on_report, keyring)
             for caller in self._callers.values():
                 caller.start()
-            self._looking = GLib.timeout_add(LOOK_MS, self._look)
+            self._looking = every(LOOK_MS, self._look, lambda what: on_report("senders", what))
 
         self._glib.call("starting the cameras", start)
 
@@ -376,12 +376,11 @@ class VehicleSide:
             source,
         )
 
-    def _look(self) -> bool:
+    def _look(self) -> None:
         """Look which frame each camera has sent last."""
         for name in self._wanted:
             if (pipeline := self._pipeline(name)) and pipeline.sent_frames:
                 pipeline.sent_frames.look()
-        return True
 
     def _on_knobs_turned(self) -> None:
         self.on_turned()  # looked up now: it may have been set after the pipeline was built

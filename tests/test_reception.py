@@ -123,10 +123,13 @@ def test_a_restarted_operator_restarts_the_estimate() -> None:
 
 def test_of_two_processes_of_one_operator_the_first_is_measured() -> None:
     uplink, both = MeasuredUplink(ROBOT), zip(of_run(1, 0, 50, 0), of_run(2, 0.02, 50, 0.5), strict=True)
-    found = [(uplink.take(first), uplink.has_rival, uplink.take(second), uplink.has_rival) for first, second in both]
-    assert [(rival, ignored, is_rival) for _, rival, ignored, is_rival in found] == [(False, None, True)] * 50
-    assert found[-1][0]
-    assert uplink.take(of_run(2, 3.2, 1, 0)[0]) is not None or not uplink.has_rival  # the first has ended
+    found = [
+        (uplink.is_rival(first), uplink.take(first), uplink.is_rival(second), uplink.take(second))
+        for first, second in both
+    ]
+    assert [(rival, is_rival, ignored) for rival, _, is_rival, ignored in found] == [(False, True, None)] * 50
+    assert found[-1][1]
+    assert not uplink.is_rival(of_run(2, 3.2, 1, 0)[0]), "the first has ended"
 
 
 def test_units_of_unknown_cameras_are_left_out() -> None:
@@ -482,6 +485,23 @@ def test_copies_for_other_viewers_occupy_the_measured_link_too() -> None:
     measured(drive, 0.1, 1500, "filling", 60)
     assert 0.75 * 3000 < drive.total < 3000
     assert 2 * sum(drive[name].kbps for name in NAMES) <= drive.total
+
+
+def test_control_of_an_unmeasured_link_begins_like_a_connection() -> None:
+    """Watchers stayed, so the link was never unused: their reports do not count, and the cap has been lifted."""
+    drive = Drive("vehicle=delivery_robot", "modes=safe")
+    drive.accept("bitrate_predicted", kbps=6000, valid_s=1000)
+    drive.accept("operator_connected", t=0)
+    drive.accept("control_passed", t=0, operator="me")
+    assert drive.total < 3100
+    for n in range(1, 200):
+        measured(drive, n / 25, 6500)
+    assert drive.total == 6000
+    drive.accept("control_passed", t=8, operator="")
+    drive.accept("clock_advanced", t=11)
+    assert drive.total == 6000
+    drive.accept("control_passed", t=12, operator="me")
+    assert drive.total < 3100
 
 
 def test_copies_count_with_the_bitrate_that_they_have() -> None:

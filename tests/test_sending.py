@@ -84,7 +84,16 @@ def test_old_frames_are_forgotten_and_a_usual_time_that_grows_is_learnt() -> Non
 def test_a_clock_that_is_set_back_starts_anew() -> None:
     known = times(*sent(0.01, 0.01), *sent(0.2, 0.4, begin=NOW - 3600))
     assert known.late_s("front", NOW) == 0
+    assert not known.is_all_received(NOW - 3600 + 1), "a frame from before the step proves nothing about later ones"
     assert known.late_s("front", NOW - 3600 + 0.1) == pytest.approx(0.18, abs=1e-6)
+    assert known.is_all_received(NOW - 3600 + 1)
+
+
+def test_a_frame_lost_by_a_camera_that_is_then_off_is_forgotten() -> None:
+    known = times(*sent(0.01, 0.01))
+    known.late_s("front", NOW)
+    assert not known.is_all_received(NOW + 1)
+    assert known.is_all_received(NOW + 1 + KEPT_S)
 
 
 @given(st.lists(st.floats(0.001, 0.6), min_size=2, max_size=40), st.integers(0, 10_000))

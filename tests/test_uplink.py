@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
 from itertools import pairwise
+from operator import attrgetter
 from typing import Any
 
 import pytest
@@ -111,12 +112,16 @@ def test_a_camera_that_starts_slowly_hides_no_queue() -> None:
     assert min(shown[19:25]) > 90
 
 
+@pytest.mark.parametrize("origin", [0, 9000])
 @pytest.mark.parametrize("fps", [2, 3, 5, 8])
-def test_a_slow_camera_that_is_left_alone_is_no_stall(fps: int) -> None:
-    """Two fast cameras are switched off after 4 s; reports go on, 25 a second."""
-    frames = [("slow", n / fps) for n in range(8 * fps)]
-    frames += [(name, n / 30) for name in ("front", "rear") for n in range(4 * 30)]
-    units = sorted((ReceivedUnit(name, t, t + 0.02, 4000) for name, t in frames), key=lambda unit: unit.arrived)
+def test_a_slow_camera_that_is_left_alone_is_no_stall(fps: int, origin: float) -> None:
+    """Two fast cameras are switched off after 4 s; reports go on, 25 a second.
+
+    origin  of the fast ones' capture times: over SRT those of each camera have one of their own
+    """
+    frames = [("slow", n / fps, 0.0) for n in range(8 * fps)]
+    frames += [(name, n / 30, origin) for name in ("front", "rear") for n in range(4 * 30)]
+    units = sorted((ReceivedUnit(name, t + o, t + 0.02, 4000) for name, t, o in frames), key=attrgetter("arrived"))
     uplink, states = UplinkMemory(), []
     for number in range(1, 8 * 25):
         at = number / 25
@@ -125,6 +130,44 @@ def test_a_slow_camera_that_is_left_alone_is_no_stall(fps: int) -> None:
     stalled = [at for at, state, _ in states if state is LinkState.STALLED]
     assert all(4 < at < 4.1 + 1 / fps for at in stalled)
     assert all(kbps for at, _, kbps in states if at > 4.5 + 3 / fps)
+
+
+def test_a_camera_with_a_clock_of_its_own_meets_no_queue_at_the_start() -> None:
+    uplink, queues = UplinkMemory(), []
+    for n in range(60):
+        cameras = ("rear", -8000.0), *([("front", 0.0)] if n % 6 == 0 else [])
+        units = tuple(ReceivedUnit(name, n / 30 + origin, n / 30 + 0.02, 4000) for name, origin in reversed(cameras))
+        uplink, estimated = estimate(uplink, LinkReport(n / 30 + 0.03, units, 4))
+        queues += [estimated.queue_ms] if estimated else []
+    assert max(queues) < 0.001
+
+
+def test_while_nothing_is_sent_nothing_arrives() -> None:
+    """So the cap does not grow on the strength of the last measured rate."""
+    uplink, shown = UplinkMemory(), []
+    for n in range(150):
+        t = n / 15
+        units = (ReceivedUnit("front", t, t + 0.02, 4000),) if n < 60 else ()
+        uplink, estimated = estimate(uplink, LinkReport(t + 0.03, units, 4 * min(n, 60), all_received=not units))
+        shown += [(estimated.kbps, estimated.state)] if estimated else []
+    assert set(shown[-85:]) == {(0.0, LinkState.CLEAR)}
+    cap = LinkCap(kbps=Fraction(1500), changed=0, measured=0, overuse=Overuse(0, Fraction(1600), Fraction(6000)))
+    for t in range(1, 100):
+        link = LinkMeasured(t=t / 10, kbps=Fraction(0), queue_ms=0, loss=0, state=LinkState.CLEAR, rtt_ms=30)
+        cap = update_cap(cap, link, t / 10, Fraction(6000))
+    assert cap.kbps == 1500
+
+
+@pytest.mark.parametrize(("silent_s", "queue_ms"), [(60, 200), (3600, 0)])
+def test_path_delays_expire_while_nothing_arrives(silent_s: float, queue_ms: float) -> None:
+    """Clocks drift apart: after an hour, 200 ms more is no queue."""
+    uplink = UplinkMemory()
+    for n in range(61):
+        t, drift = (n / 15, 0.0) if n < 60 else (4 + silent_s, 0.2)
+        units = (ReceivedUnit("front", t, t + 0.02 + drift, 4000),)
+        uplink, estimated = estimate(uplink, LinkReport(t + 0.03 + drift, units, 4 * n))
+    assert estimated
+    assert estimated.queue_ms == pytest.approx(queue_ms)
 
 
 def test_the_rest_of_a_frame_in_a_later_report_is_no_clock_step() -> None:
@@ -352,7 +395,7 @@ def test_competing_flows_take_no_camera_below_its_floor() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_first_overuse_does_not_make_a_prediction_late(seed: int) -> None:
-    """As over a recorded LTE uplink: soon after a prediction 50 % too high filled the link, prediction and link fall."""
+    """As over a recorded LTE uplink: soon after a prediction 50 % too high filled the link, both fall."""
     link = Link(steps((0, 7200), (1.8, 8800), (2.8, 6000), (3.8, 8800)))
     limit = steps((0, 9900), (1.8, 12000), (2.8, 8250), (3.8, 12000))
     done = drive(link, limit, 6, cameras=8, fps=10, seed=seed, start=HALF, key_frame=3)

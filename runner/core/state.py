@@ -38,7 +38,7 @@ class State:
     position          the newest one
     steering          the newest one
     copies            by camera, copies of its stream that leave the vehicle; 1 for cameras not named
-    operator_since    t at which the operator's side connected; None: it is not connected
+    operator_since    t at which the operator's side connected, or took control of an unmeasured link; None: never
     operator_lost     t at which the operator's side disconnected
     attention         of the driver, as the operator in control states it
     """
@@ -122,8 +122,11 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
                 return {"link": event}
             _known(vehicle, name)
             return {}
-        case ev.ControlPassed():
-            return {"link": None, "attention": None}  # another place, network path and person
+        case ev.ControlPassed(operator=operator):
+            # Another place, network path and person. If the link is not measured, it is as if they had just connected.
+            is_new = bool(operator) and state.link is None and state.operator_since is not None
+            since = event.t if is_new else state.operator_since
+            return {"link": None, "attention": None, "operator_since": since}
         case ev.AttentionChanged(attention=attention):
             return {"attention": attention}
         case ev.CopiesCounted(copies=copies):

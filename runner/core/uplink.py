@@ -27,6 +27,12 @@ KEPT_S, MAX_UNITS = 1.0, 5000  # units are stored for this long, and at most thi
 SAME_S = 0.001  # closer capture times, after rounding, belong to the same frame
 STEADY_S = 0.25  # the link's rate is the highest measured in this time: late units make it look lower
 LONGEST_INTERVAL_S = 1.0  # between two frames; a longer one is a pause
+EXPIRED_S = (
+    120.0  # without a unit for longer, path delays expire: clocks that drift apart by 50 ppm change them by 6 ms
+)
+ONE_CLOCK_S = (
+    10.0  # delays that differ by more are not of the same clock: over SRT the capture times of each camera begin anew
+)
 SILENT = 4  # a camera without a frame for this many of its intervals, while others send, no longer does
 RATE_S = 0.25  # the rate is averaged over this time or three frame intervals, whichever is longer
 # With a queue longer than the first of these, the rate of the link has probably dropped and earlier measurements are
@@ -163,8 +169,13 @@ class _Path:
 
 def _new_path(unit: ReceivedUnit, others: Iterable[_Path]) -> _Path:
     delay = unit.arrived - unit.captured
-    shortest = min((path.delay for path in others), default=None)
+    shortest = _shortest(delay, others)
     return _Path(delay, delay, unit.arrived, own=True) if shortest is None else _Path(shortest, shortest, unit.arrived)
+
+
+def _shortest(delay: float, paths: Iterable[_Path]) -> float | None:
+    """The shortest path whose capture times are of the same clock as those of a unit with this delay; None: none."""
+    return min((path.delay for path in paths if abs(path.delay - delay) < ONE_CLOCK_S), default=None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,6 +225,8 @@ def estimate(uplink: UplinkMemory, report: LinkReport) -> tuple[UplinkMemory, Li
 
     returns  None before the first unit has arrived
     """
+    if uplink.units and report.units and report.units[0].arrived - uplink.units[-1].arrived > EXPIRED_S:
+        uplink = UplinkMemory()
     before, uplink = uplink, _add_units(uplink, report.units)
     packets = _recent_packets((*uplink.packets, (report.at, report.packets, report.lost)))
     if uplink.resumed != before.resumed:
@@ -221,7 +234,12 @@ def estimate(uplink: UplinkMemory, report: LinkReport) -> tuple[UplinkMemory, Li
     uplink = replace(uplink, packets=packets)
     if not uplink.units:
         return uplink, None
-    frame, last = _frame_interval(uplink.intervals, uplink.captured), uplink.units[-1].arrived
+    frame, last = _frame_interval(uplink.intervals, uplink.captured, uplink.paths), uplink.units[-1].arrived
+    is_overdue = report.at - last > _longest_gap(frame)
+    if report.all_received and is_overdue:  # nothing is sent, and nothing can be known of the link
+        now = (report.at, 0.0, report.packets, report.lost)
+        idle = replace(uplink, queues=(now,), onset=None, level=0.0, peak=0.0, rates=())
+        return idle, LinkEstimate(0.0, 0.0, _loss(packets), LinkState.CLEAR)
     windows = _windows(uplink.units[-1].playout)
     queue = min(unit.queue for unit in _later(uplink.units, last - max(windows.recent, frame)))
     if queue <= EMPTY_S:
@@ -279,13 +297,13 @@ def _add_units(uplink: UplinkMemory, units: Iterable[ReceivedUnit]) -> UplinkMem
         if unit.whole:  # without its last packets a unit seems to arrive sooner
             path = (path or _new_path(unit, paths.values())).after(unit, empty=uplink.onset is None)
             paths[unit.camera] = path
-        shortest = path.delay if path and path.own else min((other.delay for other in paths.values()), default=inf)
+        shortest = path.delay if path and path.own else _shortest(unit.arrived - unit.captured, paths.values())
         gap = unit.arrived - newest if newest else 0.0
         pause = QUEUED_PAUSE_S if unit.playout and kept and kept[-1].queue > VISIBLE_S else PAUSE_S
-        if gap > pause and gap > pause + 1.5 * _frame_interval(intervals, captured):  # rarely compute the second
+        if gap > pause and gap > pause + 1.5 * _frame_interval(intervals, captured, paths):  # rarely compute the second
             resumed = unit.arrived
         newest = max(newest, unit.arrived) if newest else unit.arrived
-        queue = max(0.0, unit.arrived - unit.captured - unit.late - shortest)
+        queue = 0.0 if shortest is None else max(0.0, unit.arrived - unit.captured - unit.late - shortest)
         kept.append(_Unit(unit.arrived, queue, unit.bytes, unit.playout))
     kept.sort(key=attrgetter("arrived"))  # a unit without its last packets is reported late
     recent = tuple(_later(kept, kept[-1].arrived - KEPT_S)[-MAX_UNITS:]) if kept else ()
@@ -297,10 +315,12 @@ def _later(units: Sequence[_Unit], time: float) -> Sequence[_Unit]:
     return units[bisect_right(units, time, key=attrgetter("arrived")) :]
 
 
-def _frame_interval(intervals: Mapping[str, float], captured: Mapping[str, float]) -> float:
+def _frame_interval(intervals: Mapping[str, float], captured: Mapping[str, float], paths: Mapping[str, _Path]) -> float:
     """Median of the cameras that send, s."""
-    newest = max(captured.values(), default=0.0)
-    active = [interval for name, interval in intervals.items() if newest - captured[name] <= SILENT * interval]
+    # When each last frame would have arrived without a queue: capture times may be of different clocks.
+    due = {name: at + paths[name].delay for name, at in captured.items() if name in paths}
+    newest = max(due.values(), default=0.0)
+    active = [own for name, own in intervals.items() if newest - due.get(name, newest) <= SILENT * own]
     return median(active) if active else 0.0
 
 

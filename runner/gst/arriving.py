@@ -81,7 +81,7 @@ class ArrivingFrames:
         self._newest: Packet | None = None
         self._handled = self._arrived = 0.0  # when the newest packet was added, and when it arrived
         self._captured, self._bytes = 0.0, 0  # of its frame; bytes not emitted yet
-        self._ahead = 0.0  # how far capture times are ahead of the media clock, s
+        self._ahead: float | None = None  # how far capture times are ahead of the media clock, s; None: not stated yet
         self._whole = False  # no packet of the frame is missing so far
         self._open = self._emitted = False  # the frame has not ended; its arrival is in `_frames`
         self._gap = 0.0
@@ -109,6 +109,7 @@ class ArrivingFrames:
             expected, self._restarted = self._restarted, (packet.number + 1) % (2 * HALF)
             if packet.number != expected:
                 return False
+            self._ahead = None
             self._add_newer(packet, now, arrived, retransmitted, whole=False)
             return True
 
@@ -174,11 +175,14 @@ class ArrivingFrames:
         self._began = now
         if packet.captured is not None:
             self._ahead = packet.captured - self._clock.seconds
-        self._captured = self._clock.seconds + self._ahead  # only the first packet states it, and may be lost
+        elif self._ahead is None and regular:
+            self._ahead = 0.0  # this sender states none
+        self._captured = self._clock.seconds + (self._ahead or 0.0)  # only the first packet states it, and may be lost
         self._whole = True
 
     def _emit(self) -> None:
-        self._frames.append(Arrival(self._arrived, self._captured, self._bytes, self._whole))
+        if self._ahead is not None:
+            self._frames.append(Arrival(self._arrived, self._captured, self._bytes, self._whole))
         self._bytes, self._emitted = 0, True
 
 

@@ -324,11 +324,12 @@ class ControlLoop:
                 (item.sender, item.report.run): t
             }
         reported = ReceptionReported(t, item.sender, item.sender == self._operators.in_control, item.report)
-        if reported.in_control:
+        is_rival = self._uplink.is_rival(reported)
+        if reported.in_control and not is_rival:
             reported = self._with_lateness(reported)
         self.log.record(reported if reported.in_control else replace(reported, report=_totals(reported.report)))
         link = self._uplink.take(reported)
-        if self._uplink.has_rival:
+        if is_rival:
             self._report_once(f"{item.sender}: two processes of this operator send reception reports; one is ignored")
             return
         if reported.in_control:

@@ -17,9 +17,10 @@ from operator import attrgetter
 from runner.records import SentFrame
 
 BUSY_S = 0.04  # between two looks at a payloader, twice the usual time
-KEPT_S = 5.0  # a frame that arrives later is not looked up
+KEPT_S = 5.0  # a frame that arrives later is not looked up, and one that has not arrived by then is lost
 BUCKET_S = 10.0  # the usual duration is the shortest of the current time bucket and the previous one
 SAME_S = 0.002  # capture times of the same frame, rounded by RTP and in reports, differ by less
+LOOK_S = 1.0  # a frame has arrived at most this long before it is seen to leave; if longer, a clock was stepped
 ON_ITS_WAY_S = 0.05  # what was sent less than this before an operator's view of the vehicle may still arrive
 
 
@@ -38,7 +39,7 @@ class _Camera:
         return min(self.before, self.shortest)
 
     def add(self, frame: SentFrame) -> None:
-        if self.frames and frame.captured < self.frames[-1].captured:  # a clock was set
+        if self.frames and frame.captured < self.frames[-1].captured:  # a clock was stepped
             self.frames, self.arrived, self.began, self.shortest = [], -inf, -inf, inf
         if frame.captured - self.began > BUCKET_S:
             self.began, self.before, self.shortest = frame.captured, self.shortest, inf
@@ -46,6 +47,10 @@ class _Camera:
         self.frames.append(frame)
         if self.frames[0].captured < frame.captured - 2 * KEPT_S:
             del self.frames[: self._index(frame.captured - KEPT_S)]
+
+    def add_arrived(self, captured: float) -> None:
+        if self.frames and captured <= self.frames[-1].captured + LOOK_S:
+            self.arrived = max(captured, self.arrived)
 
     def late_s(self, captured: float) -> float:
         index = self._index(captured - SAME_S)
@@ -82,7 +87,7 @@ class SendingTimes:
         camera = self._cameras.get(name)
         if camera is None:
             return 0.0
-        camera.arrived = max(captured, camera.arrived)
+        camera.add_arrived(captured)
         return camera.late_s(captured)
 
     def is_all_received(self, at: float) -> bool:
@@ -91,4 +96,5 @@ class SendingTimes:
         False if that is not known.
         """
         sending = [camera for camera in self._cameras.values() if camera.frames]
-        return bool(sending) and all(frame.sent > at - ON_ITS_WAY_S for camera in sending for frame in camera.missing())
+        missing = (frame.sent for camera in sending for frame in camera.missing())
+        return bool(sending) and not any(at - KEPT_S < sent <= at - ON_ITS_WAY_S for sent in missing)

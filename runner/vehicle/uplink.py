@@ -22,29 +22,27 @@ PRESENT_S = 1.0  # an operator's side that has reported within this time still r
 
 @dataclass
 class MeasuredUplink:
-    """Estimates the uplink from what the operator in control receives; a new operator, or process of it, restarts it.
-
-    has_rival  whether the last report was ignored because another process of the same operator reports, too
-    """
+    """Estimates the uplink from what the operator in control receives. Another operator or process begins anew."""
 
     vehicle: Vehicle
-    has_rival: bool = False
     _source: tuple[str, object] = ("", None)  # operator, and its run
     _at: float = 0.0
     _t: float = 0.0
     _memory: UplinkMemory = field(default_factory=UplinkMemory)
     _round_trips: deque[float] = field(default_factory=lambda: deque(maxlen=ROUND_TRIPS))
 
+    def is_rival(self, reported: ReceptionReported) -> bool:
+        """Whether another process of the operator in control, which reports, too, made this report."""
+        operator, run = self._source
+        is_other = reported.operator == operator and reported.report.run != run
+        return reported.in_control and is_other and reported.t - self._t < PRESENT_S
+
     def take(self, reported: ReceptionReported) -> LinkMeasured | None:
-        """The event that results from a report; None if its operator is not in control, or nothing has arrived."""
-        self.has_rival = False
-        if not reported.in_control:
+        """The event that results from a report; None: nothing has arrived, or it is not of the process in control."""
+        if not reported.in_control or self.is_rival(reported):
             return None
-        source, known = (reported.operator, reported.report.run), self._source
-        self.has_rival = source != known and source[0] == known[0] and reported.t - self._t < PRESENT_S
-        if self.has_rival:
-            return None
-        if source != known or reported.report.at < self._at:
+        source = (reported.operator, reported.report.run)
+        if source != self._source or reported.report.at < self._at:
             self._source, self._memory = source, UplinkMemory()
             self._round_trips.clear()
         self._at, self._t = reported.report.at, reported.t
