@@ -144,10 +144,12 @@ def test_a_vehicle_builds_on_another(conf: UserConf) -> None:
     conf.write(
         "vehicle/mine.yaml",
         "# @package _global_\ndefaults:\n  - tum_q7\n  - override /cameras@cameras.rear_center: top_view\n  - _self_\n"
-        "name: mine\ncameras: {front_left: {weight: 3}}\n",
+        "name: mine\ncameras: {front_left: {weight: 3}}\nlatency: {fixed_ms: 60}\n",
     )
-    cameras = configuration(["source=test", "vehicle=mine"], conf.path).vehicle().cameras
+    mine = configuration(["source=test", "vehicle=mine"], conf.path).vehicle()
+    cameras = mine.cameras
     assert (len(cameras), cameras["front_left"].weight, cameras["rear_center"].width) == (8, 3, 1280)
+    assert (mine.latency.fixed_ms, mine.latency.limit_ms) == (60, 200)
 
 
 def test_a_mounted_camera_may_have_its_own_graph_and_source(conf: UserConf) -> None:
@@ -393,6 +395,7 @@ def test_a_mistake_in_a_file(conf: UserConf, tod: Command, file: str, changes: d
         ("  - _self_\n", "  - 3\n", "defaults[3]: 3: must be a file's name or GROUP: NAME"),
         ("  - _self_\n", "  - delivery_robot\n", "defaults[3]: 'delivery_robot': is this file itself"),
         ("weight: 2", "weight: '${'", "cameras.front.weight: no viable alternative at input '${'"),
+        ("cameras:\n", "latency: {fixd_ms: 60}\ncameras:\n", "latency.fixd_ms: unknown key, did you mean fixed_ms?"),
         ("cameras:\n", "cameras: [1]\nx:\n", "a key is a list here and a mapping in a file that this builds on"),
         ("weight: 2", "weight: &a [*a]", "line 15: an alias, *a, is part of the value it refers to"),
         (

@@ -6,8 +6,8 @@ so no clocks are compared. The vehicle must be running. Ends duration_s after th
 or if no counter was read for five minutes.
 
 Prints the measured latency; the latency from capture to drawing that the operator's page states for the same pictures;
-the difference, which camera and screen add; and latency.fixed_ms, to be given to the vehicle's side as an override
-(latency.fixed_ms=...).
+the difference, which camera and screen add; and latency.fixed_ms, for the vehicle's file (latency: {fixed_ms: ...}) or
+as an override of its side (latency.fixed_ms=...).
 
 With loop=true the vehicle's side runs here, too, and its camera delivers drawn pictures of the counter. Without camera
 and screen in between, the difference shows how far the page's latency can be trusted.
