@@ -487,6 +487,21 @@ def test_copies_for_other_viewers_occupy_the_measured_link_too() -> None:
     assert 2 * sum(drive[name].kbps for name in NAMES) <= drive.total
 
 
+def test_after_a_prediction_of_0_no_more_is_sent_than_the_link_is_known_to_carry() -> None:
+    drive = Drive("vehicle=delivery_robot", "modes=safe")
+    drive.accept("bitrate_predicted", kbps=3000, valid_s=1)
+    measured(drive, 0.1, 250, "filling", 200)
+    known = drive.total
+    assert known < 250
+    drive.accept("bitrate_predicted", t=0.2, kbps=0, valid_s=1)
+    drive.accept("control_passed", t=0.2, operator="another")
+    assert drive.accept("clock_advanced", t=1).decision.total == 0
+    assert drive.accept("clock_advanced", t=1.5).decision.total == known
+    drive = Drive("vehicle=delivery_robot", "modes=safe")
+    drive.accept("bitrate_predicted", kbps=0, valid_s=1)
+    assert drive.accept("clock_advanced", t=1.5).decision.total == 500, "nothing is known"
+
+
 def test_control_of_an_unmeasured_link_begins_like_a_connection() -> None:
     """Watchers stayed, so the link was never unused: their reports do not count, and the cap has been lifted."""
     drive = Drive("vehicle=delivery_robot", "modes=safe")

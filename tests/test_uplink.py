@@ -247,9 +247,10 @@ def test_jitter_does_not_reduce_the_rate(limit: float, fps: float) -> None:
     assert done.lowest(5, 39) >= 0.4 * RIGHT
 
 
+@pytest.mark.parametrize("trace", ["urban_n8_v30", "arterial_n78_v50"])
 @pytest.mark.parametrize("limit", [RIGHT, HIGH])
-def test_the_jitter_of_a_recorded_5g_link_does_not_reduce_the_rate(limit: float) -> None:
-    with shared("traces/tidy/cicv5g_urban_n8_v30_rtt.csv").open() as file:
+def test_the_jitter_of_a_recorded_5g_link_does_not_reduce_the_rate(limit: float, trace: str) -> None:
+    with shared(f"traces/tidy/cicv5g_{trace}_rtt.csv").open() as file:
         rows = [(float(row["t_s"]), float(row["rtt_ms"]) / 1000) for row in csv.DictReader(file)]
     times, least = [t - rows[0][0] for t, _ in rows], min(rtt for _, rtt in rows)
     link = Link(steps((0, 4000)), lambda t: rows[bisect_right(times, t) - 1][1] - least)

@@ -26,39 +26,47 @@ BEGIN_S = 2.0  # after the first measurement or an outage: until then the capaci
 def fall_with_limit(cap: LinkCap, link: LinkMeasured | None, t: float, limit: Kbps) -> LinkCap:
     """The cap when a prediction falls: a link that carries a constant share of it has fallen, too.
 
-    The cap falls to what is then known to be carried: careful increases end, too. If it has grown far beyond that, the
-    known capacity is outdated, and the cap keeps its share of the prediction. It does not fall if the link has fallen
-    before, and the prediction follows. See `_fall_at_start` for the start.
+    The cap falls to what is then known to be carried, or further where a queue has to drain. Careful increases end.
+    If it has grown far beyond that, the known capacity is outdated, and the cap keeps its share of the prediction. It
+    does not fall if the link has fallen before, and the prediction follows. See `_fall_unproven` for a cap that has not
+    proved right or wrong.
     """
     last, before = cap.overuse, cap.limit.kbps
     if not cap.predicted or cap.kbps is None or limit >= before or (last and _was_late(cap, last, t, limit)):
         return cap
     sent = cap.in_force(before)
-    same_share = sent * limit / before
-    if is_start(cap, t):
-        return cap._replace(kbps=tenths(min(sent, _fall_at_start(cap, link, t, limit, same_share))))
+    if _is_unproven(cap, t):
+        return cap._replace(kbps=tenths(min(sent, _fall_unproven(cap, link, t, limit))))
     if last is None:
         return cap
-    known = min(limit, last.known(limit))
-    return cap._replace(kbps=tenths(same_share if known < FELL * same_share else min(sent, RESERVE * known)))
+    known, same_share = min(limit, last.known(limit)), sent * limit / before
+    drained = _drain_share_after(link, before, limit) * known
+    return cap._replace(kbps=tenths(same_share if known < FELL * same_share else min(sent, drained)))
 
 
-def _fall_at_start(cap: LinkCap, link: LinkMeasured | None, t: float, limit: Kbps, same_share: Kbps) -> Kbps:
-    """What may be sent when the prediction falls at the start, in which the cap grows beyond what is known.
+def _fall_unproven(cap: LinkCap, link: LinkMeasured | None, t: float, limit: Kbps) -> Kbps:
+    """What may be sent when the prediction falls while the cap grows beyond what is known.
 
-    A fall that is slight, or leaves more than arrives, lowers the cap in proportion. After a clear one, less is sent
-    than the link is known to carry or, before it proves narrow, than a proportional part of what arrives: the queue
-    drains, which takes longer on a link that has fallen.
+    A fall that is slight, or leaves more than arrives, lowers the cap in proportion at the start, and not later. After
+    another one, less is sent than the link is known to carry or, before it proves narrow, than a proportional part of
+    what arrives.
     """
+    sent, in_force = cap.in_force(cap.limit.kbps), cap.limit.kbps
+    same_share = sent * limit / in_force
+    otherwise = same_share if is_start(cap, t) else sent
     if link is None:
-        return same_share
-    before = cap.limit.before_fall if just_fell(cap, link, t) else cap.limit.kbps
+        return otherwise
+    before = cap.limit.before_fall if just_fell(cap, link, t) else in_force
     last = cap.overuse or Overuse(t, link.kbps or Fraction(0), before)  # as if what arrives were the capacity
-    if limit >= FELL * min(before, last.carried):
-        return same_share
-    known = min(limit, last.known(limit))
-    queue_ms = exact(link.queue_ms or 0) * last.known(before) / known
-    return max(DEEPEST * same_share, min(RESERVE, drain_share(queue_ms)) * known)
+    if limit >= FELL * before or last.carried < FELL * limit:
+        return otherwise
+    return max(DEEPEST * same_share, _drain_share_after(link, before, limit) * min(limit, last.known(limit)))
+
+
+def _drain_share_after(link: LinkMeasured | None, before: Kbps, limit: Kbps) -> Fraction:
+    """The share of its capacity with which the queue drains after the link has fallen in proportion to the limit."""
+    queue_ms = exact((link and link.queue_ms) or 0)
+    return min(RESERVE, drain_share(queue_ms * before / limit)) if limit else RESERVE
 
 
 def drain_share(queue_ms: Fraction) -> Fraction:
@@ -91,6 +99,11 @@ def adapt_overuse(cap: LinkCap, t: float, limit: Kbps) -> LinkCap:
 def is_start(cap: LinkCap, t: float) -> bool:
     """Whether the link has been measured for too short a time to know its capacity, or not at all."""
     return t - cap.began < BEGIN_S
+
+
+def _is_unproven(cap: LinkCap, t: float) -> bool:
+    """Whether the cap grows without proof of what the link carries."""
+    return cap.provisional or is_start(cap, t)
 
 
 def _was_late(cap: LinkCap, last: Overuse, t: float, limit: Kbps) -> bool:
@@ -169,7 +182,7 @@ def raise_known(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> Link
 
 def is_start_over(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> bool:
     """Whether the prediction has clearly fallen at the start, so that the link's capacity has to be found again."""
-    return is_start(cap, t) and just_fell(cap, link, t) and limit < FELL * cap.limit.before_fall
+    return _is_unproven(cap, t) and just_fell(cap, link, t) and limit < FELL * cap.limit.before_fall
 
 
 def just_fell(cap: LinkCap, link: LinkMeasured, t: float) -> bool:

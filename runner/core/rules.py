@@ -295,7 +295,7 @@ def cap_at_lower_bound(vehicle: Vehicle, state: State, draft: Draft, memory: Mem
     return draft.noted(note, total=lower), memory
 
 
-@rule(needs=["total"], gives=["total"], reads=["on", "prediction", "t"])
+@rule(needs=["total"], gives=["total"], reads=["copies", "on", "prediction", "t"])
 def fade_when_stale(
     vehicle: Vehicle,
     state: State,
@@ -309,9 +309,9 @@ def fade_when_stale(
     """A stale prediction is trusted less and less, unless the measured link replaces it (`cap_by_link`).
 
     Once it is older than its own `valid_s`, otherwise `after_s`, the total is halved, and again every `halve_every_s`,
-    down to `floor_kbps`; never above the prediction. After a prediction of 0 it is `floor_kbps`: with nothing sent, the
-    link could never be measured. Before the first prediction, the age counts from the start of the run; the
-    halvings count from when the link last replaced the prediction, if it did since.
+    down to `floor_kbps`; never above the prediction. After a prediction of 0 it is `floor_kbps`, or less if the link is
+    known to carry less: with nothing sent, it could never be measured. Before the first prediction, the age counts from
+    the start of the run; the halvings count from when the link last replaced the prediction, if it did since.
     """
     age, limit = _age(state, after_s)
     assert draft.total is not None
@@ -322,7 +322,11 @@ def fade_when_stale(
         overdue = min(overdue, max(allocation.ZERO, exact(state.t) - exact(cap.replaced)))
     halvings = int(overdue / halve_every_s) + 1
     # 64 halvings are below any floor; more would only produce long fractions.
-    least = floor_kbps if draft.total < max(1, sum(state.on.values())) else min(floor_kbps, draft.total)
+    cameras, least = _sent_cameras(vehicle, state), min(floor_kbps, draft.total)
+    if draft.total < max(1, len(cameras)):
+        least = floor_kbps
+        if cap.kbps is not None:
+            least = min(floor_kbps, Fraction(int(10 * video_kbps(cameras, _carried(cap, cameras))), 10))
     total = max(Fraction(draft.total) / 2 ** min(halvings, 64), least)
     why = f"no prediction for {float(age):.1f} s, limit {plain(limit)} s"
     note = f"total {_short(draft.total)} -> {_short(total)}: {why}"
@@ -362,9 +366,8 @@ def cap_by_link(
     assert draft.total is not None
     if state.link is None and "cap_by_link" not in memory and (start == 1 or state.operator_since is None):
         return draft, memory  # never measured
-    mounted = vehicle.cameras.items()
-    cameras = tuple(c for name, c in mounted if state.on[name] for _ in range(state.copies.get(name, 1)))
-    limit, least = wire_kbps(cameras, draft.total), wire_kbps(cameras, max(LEAST, Fraction(len(cameras))))
+    cameras = _sent_cameras(vehicle, state)
+    limit, least = wire_kbps(cameras, draft.total), _least(cameras)
     cap = memory.get("cap_by_link", UNCAPPED)
     link = _of_all_copies(vehicle, state, draft, memory, cameras, limit)
     alone = alone_after_s is not None and _is_stale(state, alone_after_s) and link_cap.is_fresh(link, state.t)
@@ -386,11 +389,27 @@ def cap_by_link(
     carried = link_cap.believed_limit(cap, limit, least_trust)
     why = f"{float(cap.trust.share):.0%} of a prediction that proved too high"
     if cap.kbps is not None and cap.kbps - reserve_kbps < carried:
-        carried = max(least, cap.kbps - reserve_kbps)
-        why = _why_capped(cap)
+        carried, why = _carried(cap, cameras), _why_capped(cap)
     lowered = _lower_total(draft, video_kbps(cameras, carried), why)
     # A new size restarts the encoder, so sizes at the start are chosen for the time after it.
     return lowered.replaced(sized_for=lowered.uncapped) if cap.provisional else lowered, memory
+
+
+def _sent_cameras(vehicle: Vehicle, state: State) -> tuple[Camera, ...]:
+    """The cameras that are on, with repetitions for those that leave the vehicle in several copies."""
+    mounted = vehicle.cameras.items()
+    return tuple(c for name, c in mounted if state.on[name] for _ in range(state.copies.get(name, 1)))
+
+
+def _least(cameras: tuple[Camera, ...]) -> Kbps:
+    """kbit/s on the wire with which all cameras are sent, and so measured."""
+    return wire_kbps(cameras, max(LEAST, Fraction(len(cameras))))
+
+
+def _carried(cap: LinkCap, cameras: tuple[Camera, ...]) -> Kbps:
+    """kbit/s on the wire under a cap in force."""
+    assert cap.kbps is not None
+    return max(_least(cameras), cap.kbps - cap.reserve)
 
 
 def _wanted(vehicle: Vehicle, state: State, draft: Draft) -> Mapping[str, Kbps]:
