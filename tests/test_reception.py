@@ -437,6 +437,19 @@ def test_a_full_queue_of_the_floors_alone_gives_them_up() -> None:
     assert drive.total < 0.95 * 590
 
 
+def test_the_total_recovers_although_all_cameras_were_given_up() -> None:
+    """Nothing arrives then, which must not keep the cap from growing."""
+    shed = [f"cameras.{name}.{key}" for name in NAMES for key in ("floor_kbps=300", f"shed={NAMES.index(name) + 1}")]
+    drive = Drive("vehicle=delivery_robot", "modes=safe", *shed)
+    drive.accept("bitrate_predicted", kbps=3000, valid_s=1000)
+    measured(drive, 0.1, 150, "filling", 200)
+    assert not any(drive[name].sending for name in NAMES)
+    for n in range(1, 3000):
+        sent = sum(drive[name].kbps for name in NAMES)
+        measured(drive, 0.1 + n / 25, 1.06 * sent)
+    assert drive.total == 3000
+
+
 SHED = ("cameras.front.floor_kbps=600", "cameras.rear.floor_kbps=300", "cameras.rear.shed=1")
 
 

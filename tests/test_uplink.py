@@ -143,7 +143,7 @@ def test_a_camera_with_a_clock_of_its_own_meets_no_queue_at_the_start() -> None:
 
 
 def test_while_nothing_is_sent_nothing_arrives() -> None:
-    """So the cap does not grow on the strength of the last measured rate."""
+    """The last measured rate is not repeated."""
     uplink, shown = UplinkMemory(), []
     for n in range(150):
         t = n / 15
@@ -151,11 +151,26 @@ def test_while_nothing_is_sent_nothing_arrives() -> None:
         uplink, estimated = estimate(uplink, LinkReport(t + 0.03, units, 4 * min(n, 60), all_received=not units))
         shown += [(estimated.kbps, estimated.state)] if estimated else []
     assert set(shown[-85:]) == {(0.0, LinkState.CLEAR)}
-    cap = LinkCap(kbps=Fraction(1500), changed=0, measured=0, overuse=Overuse(0, Fraction(1600), Fraction(6000)))
+
+
+@pytest.mark.parametrize(
+    "cap",
+    [
+        LinkCap(
+            kbps=Fraction(1000), changed=0, measured=0, began=0, overuse=Overuse(0, Fraction(1600), Fraction(6000))
+        ),
+        LinkCap(
+            kbps=Fraction(1500), changed=0, measured=0, began=0, overuse=Overuse(0, Fraction(1600), Fraction(6000))
+        ),
+        LinkCap(kbps=Fraction(3000), changed=0, measured=0, began=0, provisional=True),
+    ],
+)
+def test_the_cap_does_not_grow_while_nothing_is_sent(cap: LinkCap) -> None:
+    before = cap.kbps
     for t in range(1, 100):
         link = LinkMeasured(t=t / 10, kbps=Fraction(0), queue_ms=0, loss=0, state=LinkState.CLEAR, rtt_ms=30)
         cap = update_cap(cap, link, t / 10, Fraction(6000))
-    assert cap.kbps == 1500
+    assert cap.kbps == before
 
 
 @pytest.mark.parametrize(("silent_s", "queue_ms"), [(60, 200), (3600, 0)])

@@ -221,8 +221,8 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps, kn
 
 def _recover(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps) -> LinkCap:
     cap = cap._replace(before=link.kbps or cap.before, queue_ms=0.0)
-    if cap.kbps is None or cap.kbps >= limit or t - cap.changed < STEP_S + rtt_s(link):
-        return cap  # a cap that is not in force is untested, and so does not grow
+    if cap.kbps is None or cap.kbps >= limit or link.kbps == 0 or t - cap.changed < STEP_S + rtt_s(link):
+        return cap  # a cap that is not in force, or under which nothing is sent, is untested, and so does not grow
     steps, factor, last = cap.steps, FAST, cap.overuse
     if capacity.is_start_over(cap, link, t, full):
         return cap  # it does not grow before a rate has been measured under this limit

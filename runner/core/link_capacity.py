@@ -48,7 +48,7 @@ def _fall_unproven(cap: LinkCap, link: LinkMeasured | None, t: float, limit: Kbp
     """What may be sent when the prediction falls while the cap grows beyond what is known.
 
     A fall that is slight, or leaves more than arrives, lowers the cap in proportion at the start, and not later. After
-    another one, less is sent than the link is known to carry or, before it proves narrow, than a proportional part of
+    any other, less is sent than the link is known to carry or, before it proves narrow, than a proportional part of
     what arrives.
     """
     sent, in_force = cap.in_force(cap.limit.kbps), cap.limit.kbps
@@ -60,6 +60,8 @@ def _fall_unproven(cap: LinkCap, link: LinkMeasured | None, t: float, limit: Kbp
     last = cap.overuse or Overuse(t, link.kbps or Fraction(0), before)  # as if what arrives were the capacity
     if limit >= FELL * before or last.carried < FELL * limit:
         return otherwise
+    if limit >= FELL * in_force:
+        return same_share  # the last step of a fall for which the cap has been lowered
     return max(DEEPEST * same_share, _drain_share_after(link, before, limit) * min(limit, last.known(limit)))
 
 

@@ -46,7 +46,7 @@ def is_below_floors(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> 
     held_s, sent = t - (cap.changed if drops else max(cap.changed, cap.short)), cap.may_send(limit)
     tiers = NARROW if drops else NARROW_FLOORS
     is_proof = any(held_s >= least_s and link.kbps < share * sent for least_s, share in tiers)
-    is_full = t - max(cap.changed, cap.unfilled) >= FULL_S
+    is_full = t - max(cap.began, cap.changed, cap.unfilled) >= FULL_S
     return cap.below or is_full or (is_proof and (drops or not is_short(link)))
 
 

@@ -322,23 +322,22 @@ def fade_when_stale(
         overdue = min(overdue, max(allocation.ZERO, exact(state.t) - exact(cap.replaced)))
     halvings = int(overdue / halve_every_s) + 1
     # 64 halvings are below any floor; more would only produce long fractions.
-    cameras, least = _sent_cameras(vehicle, state), min(floor_kbps, draft.total)
+    cameras, least = sent_cameras(vehicle, state), min(floor_kbps, draft.total)
     if draft.total < max(1, len(cameras)):
         least = floor_kbps
-        if cap.kbps is not None:
-            least = min(floor_kbps, Fraction(int(10 * video_kbps(cameras, _carried(cap, cameras))), 10))
-    total = max(Fraction(draft.total) / 2 ** min(halvings, 64), least)
+    uncapped = total = max(Fraction(draft.total) / 2 ** min(halvings, 64), least)
+    if draft.total < least and cap.kbps is not None:
+        total = min(total, _tenths(video_kbps(cameras, _carried(cap, cameras))))
     why = f"no prediction for {float(age):.1f} s, limit {plain(limit)} s"
     note = f"total {_short(draft.total)} -> {_short(total)}: {why}"
-    return draft.noted(note, total=total, uncapped=None if draft.uncapped is None else total), memory
+    is_capped = draft.uncapped is not None or total < uncapped
+    return draft.noted(note, total=total, uncapped=uncapped if is_capped else None), memory
 
 
 @rule(
     needs=["total"],
     gives=["total"],
-    reads=[
-        *("copies", "link", "on", "operator_lost", "operator_since", "position", "prediction", "rois", "t", "weights"),
-    ],
+    reads=["copies", "link", "on", "operator_lost", "operator_since", "position", "prediction", "rois", "t", "weights"],
 )
 def cap_by_link(
     vehicle: Vehicle,
@@ -366,7 +365,7 @@ def cap_by_link(
     assert draft.total is not None
     if state.link is None and "cap_by_link" not in memory and (start == 1 or state.operator_since is None):
         return draft, memory  # never measured
-    cameras = _sent_cameras(vehicle, state)
+    cameras = sent_cameras(vehicle, state)
     limit, least = wire_kbps(cameras, draft.total), _least(cameras)
     cap = memory.get("cap_by_link", UNCAPPED)
     link = _of_all_copies(vehicle, state, draft, memory, cameras, limit)
@@ -395,7 +394,7 @@ def cap_by_link(
     return lowered.replaced(sized_for=lowered.uncapped) if cap.provisional else lowered, memory
 
 
-def _sent_cameras(vehicle: Vehicle, state: State) -> tuple[Camera, ...]:
+def sent_cameras(vehicle: Vehicle, state: State) -> tuple[Camera, ...]:
     """The cameras that are on, with repetitions for those that leave the vehicle in several copies."""
     mounted = vehicle.cameras.items()
     return tuple(c for name, c in mounted if state.on[name] for _ in range(state.copies.get(name, 1)))
@@ -427,7 +426,7 @@ def _capped_floors(vehicle: Vehicle, state: State, draft: Draft, cameras: tuple[
     wanted = _wanted(vehicle, state, draft)
     floors = sum(
         (
-            min(floor, wanted[name]) * state.copies.get(name, 1)
+            min(floor, wanted.get(name, allocation.ZERO)) * state.copies.get(name, 1)
             for name, floor in lowest.items()
             if vehicle.cameras[name].shed is None
         ),
@@ -447,8 +446,12 @@ def _lower_total(draft: Draft, total: Kbps, why: str) -> Draft:
     assert draft.total is not None
     if total >= draft.total:
         return draft
-    total = Fraction(int(10 * total), 10)
+    total = _tenths(total)
     return draft.noted(f"total {_short(draft.total)} -> {_short(total)}: {why}", total=total, uncapped=draft.total)
+
+
+def _tenths(kbps: Kbps) -> Kbps:
+    return Fraction(int(10 * kbps), 10)
 
 
 def _of_all_copies(
@@ -456,20 +459,36 @@ def _of_all_copies(
 ) -> LinkMeasured | None:
     """The measurement of one copy of each camera, scaled to all copies that leave the vehicle.
 
+    kbps is None if all cameras are given up, so that nothing can arrive.
+
     cameras  that are on, with repetitions for copies
     limit    kbit/s on the wire, until the link has been measured under one
     """
     link = state.link
-    if link is None or link.kbps is None or not state.copies:
+    if link is None or link.kbps is None:
         return link
-    cap = memory.get("cap_by_link", UNCAPPED)
+    if link.kbps == 0 and not any(_sent_wanted(vehicle, state, draft, memory).values()):
+        return replace(link, kbps=None)  # nothing arrives because all cameras are given up: the cap has to grow
+    if not state.copies:
+        return link
+    cap, wanted = memory.get("cap_by_link", UNCAPPED), _sent_wanted(vehicle, state, draft, memory)
     total = video_kbps(cameras, cap.may_send(cap.limit.kbps or limit))
-    given_up = memory.get("fit_to_total" if state.mode is Mode.SINGLE else "share_above_floors", ())
-    sent = _shared(vehicle, state, _without(given_up, _wanted(vehicle, state, draft)), total)
+    fits = state.mode is Mode.SINGLE and total >= _of_all(state, wanted)
+    sent = wanted if fits else _shared(vehicle, state, wanted, total)
     if not (of_one := sum(sent.values())):
         return link
-    of_all = sum(own * state.copies.get(name, 1) for name, own in sent.items())
-    return replace(link, kbps=link.kbps * of_all / of_one)
+    return replace(link, kbps=_tenths(link.kbps * _of_all(state, sent) / of_one))
+
+
+def _of_all(state: State, kbps: Mapping[str, Kbps]) -> Kbps:
+    """The sum over all copies that leave the vehicle."""
+    return sum((own * state.copies.get(name, 1) for name, own in kbps.items()), allocation.ZERO)
+
+
+def _sent_wanted(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Mapping[str, Kbps]:
+    """As `_wanted`, without the cameras that the last decision gave up."""
+    given_up = memory.get("fit_to_total" if state.mode is Mode.SINGLE else "share_above_floors", ())
+    return _without(given_up, _wanted(vehicle, state, draft))
 
 
 def _is_stale(state: State, after_s: Fraction) -> bool:

@@ -38,7 +38,7 @@ class State:
     position          the newest one
     steering          the newest one
     copies            by camera, copies of its stream that leave the vehicle; 1 for cameras not named
-    operator_since    t at which the operator's side connected, or took control of an unmeasured link; None: never
+    operator_since    t at which the operator's side connected, or took control of an unmeasured link; None: gone
     operator_lost     t at which the operator's side disconnected
     attention         of the driver, as the operator in control states it
     """

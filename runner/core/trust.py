@@ -13,7 +13,7 @@ from math import cos, hypot, radians
 from runner.core.events import PositionReported
 
 FALL_S = 1.0  # cuts within this time belong to the same drop of the link
-EPISODE_S, FEW = 8.0, 3  # a limit is doubted if it was followed, within the first of these, by this many drops ...
+EPISODE_S, FEW = 8.0, 3  # a limit is doubted after FEW drops of the link within EPISODE_S ...
 LATE_S = 2.5  # ... and at least this long after the first: by then a merely late prediction is right
 CONFIRM_S = 0.5  # a limit that follows a drop of the link within this time, as a prediction does, is not doubted
 REGAINED = Fraction(3, 100)  # of the limit, regained per second

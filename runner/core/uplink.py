@@ -12,7 +12,7 @@ shows a queue that does not drain although less is sent.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from math import inf
@@ -145,8 +145,8 @@ class LinkEstimate:
 class _Path:
     """Delay of one camera's path: the minimum of the previous time bucket and the current one, which began at `began`.
 
-    own  whether this camera was measured with an empty queue. Until then the path is the shortest of all cameras: a
-         camera that starts slowly or while a queue lasts would mistake that delay for its path
+    own  whether this camera was measured with an empty queue. Until then the path is the shortest of all cameras with
+         the same clock: a camera that starts slowly or while a queue lasts would mistake that delay for its path
     """
 
     before: float
@@ -167,10 +167,17 @@ class _Path:
         return replace(self, current=delay) if delay < self.current else self
 
 
-def _new_path(unit: ReceivedUnit, others: Iterable[_Path]) -> _Path:
+def _new_path(unit: ReceivedUnit, others: Collection[_Path], queue: float) -> _Path:
+    """The path of a new camera.
+
+    queue  which the newest unit of the others met, s
+    """
     delay = unit.arrived - unit.captured
+    if not others:
+        return _Path(delay, delay, unit.arrived, own=True)
     shortest = _shortest(delay, others)
-    return _Path(delay, delay, unit.arrived, own=True) if shortest is None else _Path(shortest, shortest, unit.arrived)
+    shortest = delay - queue if shortest is None else shortest
+    return _Path(shortest, shortest, unit.arrived)
 
 
 def _shortest(delay: float, paths: Iterable[_Path]) -> float | None:
@@ -295,7 +302,9 @@ def _add_units(uplink: UplinkMemory, units: Iterable[ReceivedUnit]) -> UplinkMem
         captured[unit.camera] = unit.captured
         path = paths.get(unit.camera)
         if unit.whole:  # without its last packets a unit seems to arrive sooner
-            path = (path or _new_path(unit, paths.values())).after(unit, empty=uplink.onset is None)
+            path = (path or _new_path(unit, paths.values(), kept[-1].queue if kept else 0.0)).after(
+                unit, empty=uplink.onset is None
+            )
             paths[unit.camera] = path
         shortest = path.delay if path and path.own else _shortest(unit.arrived - unit.captured, paths.values())
         gap = unit.arrived - newest if newest else 0.0

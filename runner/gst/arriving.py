@@ -175,7 +175,7 @@ class ArrivingFrames:
         self._began = now
         if packet.captured is not None:
             self._ahead = packet.captured - self._clock.seconds
-        elif self._ahead is None and regular:
+        elif self._ahead is None and regular and self._newest:
             self._ahead = 0.0  # this sender states none
         self._captured = self._clock.seconds + (self._ahead or 0.0)  # only the first packet states it, and may be lost
         self._whole = True

@@ -20,7 +20,7 @@ BUSY_S = 0.04  # between two looks at a payloader, twice the usual time
 KEPT_S = 5.0  # a frame that arrives later is not looked up, and one that has not arrived by then is lost
 BUCKET_S = 10.0  # the usual duration is the shortest of the current time bucket and the previous one
 SAME_S = 0.002  # capture times of the same frame, rounded by RTP and in reports, differ by less
-LOOK_S = 1.0  # a frame has arrived at most this long before it is seen to leave; if longer, a clock was stepped
+MAX_AHEAD_S = 1.0  # a frame that seems to arrive longer before it is seen to leave is from before a clock was stepped
 ON_ITS_WAY_S = 0.05  # what was sent less than this before an operator's view of the vehicle may still arrive
 
 
@@ -49,7 +49,7 @@ class _Camera:
             del self.frames[: self._index(frame.captured - KEPT_S)]
 
     def add_arrived(self, captured: float) -> None:
-        if self.frames and captured <= self.frames[-1].captured + LOOK_S:
+        if self.frames and captured <= self.frames[-1].captured + MAX_AHEAD_S:
             self.arrived = max(captured, self.arrived)
 
     def late_s(self, captured: float) -> float:

@@ -19,7 +19,8 @@ from runner.core.budget import wire_kbps
 from runner.core.events import LinkMeasured
 from runner.core.link_cap import REPORT_S
 from runner.core.link_memory import LEAST, UNCAPPED
-from runner.core.model import Camera, Mode, Vehicle, exact
+from runner.core.model import Mode, Vehicle, exact
+from runner.core.rules import sent_cameras
 from runner.core.step import Run, start, step
 from runner.core.uplink import LinkEstimate, LinkReport, ReceivedUnit, UplinkMemory, estimate
 
@@ -117,17 +118,11 @@ def _problems(run: Run) -> Iterator[str]:
         yield f"total {float(total)} where {float(allowed)} are allowed"
     if sent > total:
         yield f"{sent} kbit/s are sent of {float(total)}"
-    cap, on = run.memory.get("cap_by_link", UNCAPPED), _on(run)
+    cap, on = run.memory.get("cap_by_link", UNCAPPED), sent_cameras(vehicle(), run.state)
     if on and cap.kbps is not None:
         carried = max(cap.kbps, wire_kbps(on, max(LEAST, exact(len(on)))))
         if (wire := wire_kbps(on, total)) > carried:
             yield f"{float(wire)} kbit/s on the wire under a cap of {float(carried)}"
-
-
-def _on(run: Run) -> tuple[Camera, ...]:
-    """The cameras that are on, repeated for each copy."""
-    state = run.state
-    return tuple(c for name, c in vehicle().cameras.items() if state.on[name] for _ in range(state.copies.get(name, 1)))
 
 
 def _allowed(run: Run) -> Any:
