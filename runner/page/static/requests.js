@@ -22,7 +22,7 @@ let count = 0;
  * Send an event.
  * @param {string} control name of what it sets, "mode", "on:front_left": a newer request for it replaces an older one
  * @param {object} event without id
- * @param {string} description for the news if the request fails
+ * @param {string} description for the list of events if the request fails
  * @returns {string|undefined} its id; undefined: this page is not in control
  */
 export function request(control, event, description) {
@@ -51,7 +51,7 @@ export function showProblem(text) {
   publish("toast", { text, level: "problem" });
 }
 
-/** Show a problem in a toast, and keep it in the news. */
+/** Show a problem in a toast, and keep it in the list of events. */
 export function reportProblem(text) {
   note({ text, level: "problem" });
   showProblem(text);

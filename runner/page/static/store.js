@@ -181,7 +181,7 @@ function onHello(message) {
 }
 
 /**
- * Add a line of news, from the station or from the page itself; newest first.
+ * Add an event to the list, from the station or from the page itself; newest first.
  * @param {{time?: number, text: string, level?: string, own?: boolean}} note own: the page's
  */
 export function note({ time = Date.now() / 1000, text, level = "note", own = true }) {
