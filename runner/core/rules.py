@@ -249,7 +249,7 @@ def keep_operator_settings(vehicle: Vehicle, state: State, draft: Draft, memory:
     bitrates = {name: Kbps(state.manual[name].kbps) if name in on else allocation.ZERO for name in vehicle.cameras}
     factors = {name: state.manual[name].scaling for name in on}
     reasons = {name: f"{int(bitrates[name])} kbit/s and {plain(factors[name])} as set in mode single" for name in on}
-    total = sum((own * state.copies.get(name, 1) for name, own in bitrates.items()), allocation.ZERO)
+    total = _of_all(state, bitrates)
     return draft.replaced(total=total, bitrate=bitrates, scaling=factors, reasons=reasons), memory
 
 
@@ -264,7 +264,7 @@ def fit_to_total(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -
     """
     total = draft.total
     assert total is not None
-    if total >= sum(own * state.copies.get(name, 1) for name, own in draft.bitrate.items()):
+    if total >= _of_all(state, draft.bitrate):
         return draft, {**memory, "fit_to_total": ()} if memory.get("fit_to_total") else memory
     draft, given_up, memory = _give_up(vehicle, state, draft, draft.bitrate, memory, "fit_to_total")
     bitrates = _shared(vehicle, state, _without(given_up, draft.bitrate), total)
@@ -322,11 +322,11 @@ def fade_when_stale(
         overdue = min(overdue, max(allocation.ZERO, exact(state.t) - exact(cap.replaced)))
     halvings = int(overdue / halve_every_s) + 1
     # 64 halvings are below any floor; more would only produce long fractions.
-    cameras, least = sent_cameras(vehicle, state), min(floor_kbps, draft.total)
-    if draft.total < max(1, len(cameras)):
-        least = floor_kbps
+    cameras = sent_cameras(vehicle, state)
+    is_nothing = draft.total < max(1, len(cameras))
+    least = floor_kbps if is_nothing else min(floor_kbps, draft.total)
     uncapped = total = max(Fraction(draft.total) / 2 ** min(halvings, 64), least)
-    if draft.total < least and cap.kbps is not None:
+    if is_nothing and cap.kbps is not None:
         total = min(total, _tenths(video_kbps(cameras, _carried(cap, cameras))))
     why = f"no prediction for {float(age):.1f} s, limit {plain(limit)} s"
     note = f"total {_short(draft.total)} -> {_short(total)}: {why}"
@@ -367,7 +367,7 @@ def cap_by_link(
         return draft, memory  # never measured
     cameras = sent_cameras(vehicle, state)
     limit, least = wire_kbps(cameras, draft.total), _least(cameras)
-    cap = memory.get("cap_by_link", UNCAPPED)
+    cap = memory.get("cap_by_link", UNCAPPED)._replace(reserve=reserve_kbps)
     link = _of_all_copies(vehicle, state, draft, memory, cameras, limit)
     alone = alone_after_s is not None and _is_stale(state, alone_after_s) and link_cap.is_fresh(link, state.t)
     if not cameras or state.operator_lost is not None or (draft.total < max(1, len(cameras)) and not alone):
@@ -381,7 +381,7 @@ def cap_by_link(
             cap = cap._replace(alone=False)  # `follow` relates the known capacity to the limit
         cap = link_cap.follow(cap, limit, state.mode is Mode.AUTOMATIC and not alone)
         cap = link_cap.start_cap(cap, link, state.operator_since, limit, start)
-        cap = cap._replace(reserve=reserve_kbps, floors=_capped_floors(vehicle, state, draft, cameras, reserve_kbps))
+        cap = cap._replace(floors=_capped_floors(vehicle, state, draft, cameras, reserve_kbps))
         cap = link_cap.update_cap(cap, link, state.t, limit, least_trust, state.position)
         cap = link_cap.raise_cap(cap, least)  # with less, some cameras would not be sent, and so not measured
     memory = {**memory, "cap_by_link": cap}

@@ -27,12 +27,10 @@ KEPT_S, MAX_UNITS = 1.0, 5000  # units are stored for this long, and at most thi
 SAME_S = 0.001  # closer capture times, after rounding, belong to the same frame
 STEADY_S = 0.25  # the link's rate is the highest measured in this time: late units make it look lower
 LONGEST_INTERVAL_S = 1.0  # between two frames; a longer one is a pause
-EXPIRED_S = (
-    120.0  # without a unit for longer, path delays expire: clocks that drift apart by 50 ppm change them by 6 ms
-)
-ONE_CLOCK_S = (
-    10.0  # delays that differ by more are not of the same clock: over SRT the capture times of each camera begin anew
-)
+# Without a unit for longer, path delays expire: clocks that drift apart by 50 ppm change them by 6 ms.
+EXPIRED_S = 120.0
+# Delays that differ by more are not of the same clock: over SRT the capture times of each camera have their own origin.
+ONE_CLOCK_S = 10.0
 SILENT = 4  # a camera without a frame for this many of its intervals, while others send, no longer does
 RATE_S = 0.25  # the rate is averaged over this time or three frame intervals, whichever is longer
 # With a queue longer than the first of these, the rate of the link has probably dropped and earlier measurements are
@@ -302,9 +300,8 @@ def _add_units(uplink: UplinkMemory, units: Iterable[ReceivedUnit]) -> UplinkMem
         captured[unit.camera] = unit.captured
         path = paths.get(unit.camera)
         if unit.whole:  # without its last packets a unit seems to arrive sooner
-            path = (path or _new_path(unit, paths.values(), kept[-1].queue if kept else 0.0)).after(
-                unit, empty=uplink.onset is None
-            )
+            path = path or _new_path(unit, paths.values(), kept[-1].queue if kept else 0.0)
+            path = path.after(unit, empty=uplink.onset is None)
             paths[unit.camera] = path
         shortest = path.delay if path and path.own else _shortest(unit.arrived - unit.captured, paths.values())
         gap = unit.arrived - newest if newest else 0.0
