@@ -408,7 +408,8 @@ def _fill_value(value: Value, values: Mapping[str, Value | None], where: str) ->
 
 def _tokens(element: Element, quote: Callable[[str], str]) -> list[str]:
     pairs = (f"{key}={quote(text(value))}" for key, value in element.properties.items())
-    return [element.factory, f"name={element.name}", *pairs]
+    sink, src = ([f"{element.name}.{pad}"] if pad else [] for pad in (element.sink, element.src))
+    return [*sink, element.factory, f"name={element.name}", *pairs, *src]
 
 
 def text(value: Value) -> str:

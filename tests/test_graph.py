@@ -219,6 +219,15 @@ def test_frames_generated_in_python_are_printed_as_a_test_picture() -> None:
 AWKWARD = '/tmp/it\'s a "clip" with $HOME, `x`, a \\ and ü.mp4'
 
 
+def test_pads_that_are_named() -> None:
+    session = Element("session", "rtpsession", {"rtp-profile": "avpf"}, sink="send_rtp_sink", src="send_rtp_src")
+    line = launch([Element("pay0", "rtph264pay", {}), session, Element("sink", "fakesink", {})])
+    assert line == (
+        "rtph264pay name=pay0 ! session.send_rtp_sink "
+        "rtpsession name=session rtp-profile=avpf session.send_rtp_src ! fakesink name=sink"
+    )
+
+
 def test_quoting_for_a_shell() -> None:
     line = shell([Element("file", "filesrc", {"location": AWKWARD}), Element("sink", "fakesink", {"sync": False})])
     assert shlex.split(line) == [

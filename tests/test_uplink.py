@@ -117,7 +117,7 @@ def test_a_camera_that_starts_slowly_hides_no_queue() -> None:
 def test_a_slow_camera_that_is_left_alone_is_no_stall(fps: int, origin: float) -> None:
     """Two fast cameras are switched off after 4 s; reports go on, 25 a second.
 
-    origin  of the fast ones' capture times: over SRT those of each camera have one of their own
+    origin  of the fast ones' capture times: without such times each camera has one of its own
     """
     frames = [("slow", n / fps, 0.0) for n in range(8 * fps)]
     frames += [(name, n / 30, origin) for name in ("front", "rear") for n in range(4 * 30)]

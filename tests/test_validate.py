@@ -250,6 +250,20 @@ def test_against_the_registry(tod: Command, conf: UserConf, old: str, new: str, 
 
 @pytest.mark.gst
 @pytest.mark.skipif(importlib.util.find_spec("gi") is None, reason="PyGObject is not installed")
+def test_named_pads_against_the_registry(tod: Command, conf: UserConf) -> None:
+    conf.change("graph/h264_srt.yaml", {"{sink: send_rtp_sink, src: send_rtp_src}": "{sink: send_sink, src: src_1}"})
+    found = problems(tod, conf, *one(), "graph=h264_srt")
+    where = "~/graph/h264_srt.yaml: sender[2].pads"
+    assert found[:2] == [
+        f"{where}.sink: 'send_sink': rtpsession has no such sink pad; "
+        "expected one of recv_rtcp_sink, recv_rtp_sink, send_rtp_sink",
+        f"{where}.src: 'src_1': rtpsession has no such src pad; "
+        "expected one of recv_rtp_src, send_rtcp_src, send_rtp_src, sync_src",
+    ]
+
+
+@pytest.mark.gst
+@pytest.mark.skipif(importlib.util.find_spec("gi") is None, reason="PyGObject is not installed")
 @pytest.mark.parametrize(
     "old, new, expected",
     [

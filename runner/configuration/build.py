@@ -460,7 +460,7 @@ def _crop(native: Mapping[str, int], width: int, height: int) -> Roi:
 
 
 def _elements(data: Sequence[Mapping[str, Any]] | None) -> tuple[Element, ...]:
-    return tuple(Element(e["name"], e["element"], e.get("properties") or {}) for e in data or ())
+    return tuple(Element(e["name"], e["element"], e.get("properties") or {}, **e.get("pads") or {}) for e in data or ())
 
 
 def _effort(data: Mapping[str, Any]) -> dict[str, Any]:

@@ -156,11 +156,16 @@ class RateQualityModel:
 
 @dataclass(frozen=True, slots=True)
 class Element:
-    """One GStreamer element of a graph. A property value may hold {placeholders}, filled per camera by `graph.py`."""
+    """One GStreamer element of a graph. A property value may hold {placeholders}, filled per camera by `graph.py`.
+
+    sink, src  the pads to its neighbours, where GStreamer could not choose them; "": it chooses
+    """
 
     name: str
     factory: str
     properties: Mapping[str, Value]
+    sink: str = ""
+    src: str = ""
 
 
 @dataclass(frozen=True, slots=True)

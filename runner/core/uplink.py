@@ -29,7 +29,7 @@ STEADY_S = 0.25  # the link's rate is the highest measured in this time: late un
 LONGEST_INTERVAL_S = 1.0  # between two frames; a longer one is a pause
 # Without a unit for longer, path delays expire: clocks that drift apart by 50 ppm change them by 6 ms.
 EXPIRED_S = 120.0
-# Delays that differ by more are not of the same clock: over SRT the capture times of each camera have their own origin.
+# Delays that differ by more are not of the same clock: a graph without capture times has an origin for each camera.
 ONE_CLOCK_S = 10.0
 SILENT = 4  # a camera without a frame for this many of its intervals, while others send, no longer does
 RATE_S = 0.25  # the rate is averaged over this time or three frame intervals, whichever is longer

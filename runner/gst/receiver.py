@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from gi.repository import Gst, GstSdp
 
 from runner.graph import Plan, video_codec
-from runner.gst.arriving import MAX_FRAMES, NTP_EPOCH_S, RTP_HZ, MediaClock
+from runner.gst.arriving import NTP_EPOCH_S
 from runner.gst.caps import structure
 from runner.gst.packet_times import state_arrivals
 from runner.gst.probes import BufferProbe, PassingBuffer
@@ -111,12 +111,8 @@ class Receiver:
         self._arrivals: deque[tuple[float, float | None]] | None = deque() if arrivals else None
         self._sampled = 0  # arrivals that have been read
         self._late = LateCheck()
-        self._unread: deque[Arrival] = deque(maxlen=MAX_FRAMES)  # access units, if there is no jitter buffer
         self._packets = (0, 0)  # received and missing, as last read
         self._newest: Arrival | None = None
-        # Without RTSP, no element parses the capture time of a frame.
-        self._untimed = "" if plan.serves else next((e.name for e in plan.operator if e.factory.endswith("depay")), "")
-        self._media_clock = MediaClock(1 / RTP_HZ)
         settings = plan.camera.graph.settings
         self._reorder_ms = int(settings.get("jitter_buffer_ms", 0))
         self._repairs = bool(settings.get("retransmission_ms"))
@@ -203,10 +199,8 @@ class Receiver:
 
     def take_arrivals(self) -> list[Arrival]:
         """Frames that arrived since the last call, without waiting for missing packets. From any one thread."""
-        if self._buffers:
-            now = time.monotonic()
-            return [arrival for buffer in self._buffers for arrival in buffer.frames.take(now)]
-        return [self._unread.popleft() for _ in range(len(self._unread))]
+        now = time.monotonic()
+        return [arrival for buffer in self._buffers for arrival in buffer.frames.take(now)]
 
     @property
     def is_damaged(self) -> bool:
@@ -246,6 +240,8 @@ class Receiver:
         self._next_picture = BufferProbe(self._sink.get_static_pad("sink"), self._on_frame)
         self._begun = False
         self._buffers, self._over_udp, self._feedback = [], False, False
+        for element in pipeline.iterate_recurse():
+            self._on_element(pipeline, pipeline, element)
         pipeline.connect("deep-element-added", self._on_element)
         self._client = pipeline.get_by_name(self._client_name)
         if self._login and (problem := self._login.prepare(pipeline, self._client)):
@@ -262,11 +258,8 @@ class Receiver:
         if self._video:
             VideoFile(self._video, self._name, "operator", _captured, self._on_report).follow(pipeline)
         received = pipeline.get_by_name("received").get_static_pad("src")
-        self._probes = [BufferProbe(received, self._on_arrival)]
-        if self._untimed and (depayloader := pipeline.get_by_name(self._untimed)):
-            self._probes.append(BufferProbe(depayloader.get_static_pad("sink"), self._on_packet))
-        for probe in self._probes:
-            probe.arm()
+        self._arriving = BufferProbe(received, self._on_arrival)
+        self._arriving.arm()
         if self._on_picture:
             self._sink.connect("new-sample", self._on_sample)
         return received
@@ -347,14 +340,11 @@ class Receiver:
         return True
 
     def _on_arrival(self, pad: Gst.Pad, buffer: PassingBuffer) -> bool:
-        """An access unit has arrived; page and log share its times, and over SRT the reception report too."""
+        """An access unit has arrived; page and log share its times."""
         arrived, monotonic, size, captured = time.time(), time.monotonic(), buffer.size, _captured(pad, buffer)
         self._entered = (buffer.pts, monotonic)
-        if captured is not None or self._untimed:
-            sampled = self._media_clock.seconds if captured is None else captured
-            self._newest = Arrival(monotonic, sampled, size)
-            if not self._buffers:
-                self._unread.append(self._newest)
+        if captured is not None:
+            self._newest = Arrival(monotonic, captured, size)
         if self._arrivals is not None:
             self._arrivals.append((arrived, captured))
         self._bytes += size
@@ -367,11 +357,6 @@ class Receiver:
             unit = read_unit(buffer.extract(0, size), captured, arrived, damaged=incomplete, codec=self._codec)
             if unit:
                 self._on_unit(self._name, unit._replace(damaged=damaged))
-        return False
-
-    def _on_packet(self, _pad: Gst.Pad, packet: PassingBuffer) -> bool:
-        """Use the RTP timestamp (RFC 3550, section 5.1) in place of the capture time."""
-        self._media_clock.tick(int.from_bytes(packet.extract(4, 4), "big"))
         return False
 
     def _arrived(self, frames: int) -> tuple[tuple[float, float | None], ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache, lru_cache
@@ -102,6 +103,9 @@ def _check_elements(elements: tuple[Element, ...], where: str) -> Iterator[Model
                 rule = f"unknown element{suggest(element.factory, _factory_names(element.factory))}"
                 yield ModelError(f"{path}.element", repr(element.factory), rule)
             continue
+        for direction, pad in (("sink", element.sink), ("src", element.src)):
+            if pad and (problem := _pad_problem(element.factory, direction, pad)):
+                yield ModelError(f"{path}.pads.{direction}", repr(pad), problem)
         for key, value in element.properties.items():
             problem = _property_problem(element.factory, key, value)
             if problem:
@@ -195,6 +199,16 @@ def _property_problem(factory: str, key: str, value: Value) -> str | None:
     if hasattr(spec, "minimum") and not spec.minimum <= float(value) <= spec.maximum:
         return f"must be from {spec.minimum} to {spec.maximum}"
     return None
+
+
+def _pad_problem(factory: str, direction: str, pad: str) -> str | None:
+    """Why an element cannot have a pad of this name in this direction; None if it can."""
+    wanted = Gst.PadDirection.SINK if direction == "sink" else Gst.PadDirection.SRC
+    templates = Gst.ElementFactory.find(factory).get_static_pad_templates()
+    names = sorted(template.name_template for template in templates if template.direction == wanted)
+    if any(re.fullmatch(re.sub("%[ud]", "[0-9]+", name).replace("%s", ".+"), pad) for name in names):
+        return None
+    return f"{factory} has no such {direction} pad; expected one of {', '.join(names)}"
 
 
 def _readable(kind: str, value: str) -> bool:

@@ -58,7 +58,7 @@ def _measure_drive(path: Path) -> None:
     if not found:
         raise UserError(str(path), "", None, "no camera's video was kept on both sides: drive with log.video=true")
     if not any(quality.mssim for quality in found.values()):
-        rule = "no capture times were logged, so nothing can be compared; over SRT there are none"
+        rule = "no capture times were logged, so nothing can be compared"
         raise UserError(str(path), "", None, rule)
     if clips and len({quality.clip for quality in found.values()}) > 1:
         _warn(f"{path}: the clips of some cameras are missing: these are compared with the stream as sent")

@@ -20,9 +20,11 @@ RESULT = re.compile(
 )
 
 
-def test_the_reported_latency_matches_a_counter_in_the_picture(chromium, tmp_path: Path) -> None:
+@pytest.mark.parametrize("graph", ["h264_rtsp", pytest.param("h264_srt", marks=pytest.mark.soak)])
+def test_the_reported_latency_matches_a_counter_in_the_picture(chromium, tmp_path: Path, graph: str) -> None:
     port = free_port()
-    words = (*ROBOT, f"page.port={port}", f"media.port={free_port()}")
+    transport = (f"graph={graph}", f"media.port={free_port()}", f"graph.first_port={free_port(3)}")
+    words = (*ROBOT, f"page.port={port}", *transport)
     output, own = tmp_path / "output", ("camera=rear", "loop=true", "duration_s=5", f"control.port={free_port()}")
     with output.open("w") as file, process("latency", *own, *words, stdout=file.fileno()) as measuring:
         until(lambda: answers(port))

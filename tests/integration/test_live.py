@@ -24,6 +24,7 @@ from runner.records import Sample
 
 NAN = b'{"id": "n", "event": "total_set", "kbps": NaN}'
 HUGE = b'{"id": "h", "event": "total_set", "kbps": 1e999}'
+SRT_PLAYOUT_MS = 60
 
 
 @pytest.fixture
@@ -247,8 +248,10 @@ def seconds_short_of_frames(graph, tmp_path):
         assert len(arrivals) == count
         assert [t for t, _ in arrivals] == sorted(t for t, _ in arrivals)
         for sample in samples:
-            unknown = graph == "h264_srt" or sample.clock_ahead_ms is None
-            assert all((ms is None) == unknown for _, ms in sample.cameras[name].arrivals)
+            latencies = [ms for _, ms in sample.cameras[name].arrivals]
+            assert all((ms is None) == (sample.clock_ahead_ms is None) for ms in latencies)
+            if graph == "h264_srt" and sample.clock_bound_ms is not None:
+                assert all(ms > SRT_PLAYOUT_MS - 2 * sample.clock_bound_ms for ms in latencies)
     return short
 
 
