@@ -10,6 +10,7 @@ from dataclasses import replace
 from fractions import Fraction
 from itertools import pairwise
 from operator import attrgetter
+from statistics import fmean
 from typing import Any
 
 import pytest
@@ -462,7 +463,7 @@ def test_a_place_where_predictions_proved_too_high_is_remembered() -> None:
     assert known.lowest(9, 10) == unknown.lowest(59, 60) == RIGHT
     assert known.lowest(59, 60) < 0.8 * RIGHT
     assert known.lowest(50, 52) == known.lowest(95, 100) == RIGHT, "far from there all is believed"
-    assert known.wait_ms(0.99, since=60) < 0.8 * unknown.wait_ms(0.99, since=60)
+    assert known.wait_ms(0.999, since=60) < 0.7 * unknown.wait_ms(0.999, since=60)
 
 
 DOUBTED = Trust(places=(DoubtedPlace(laps(0), 0.0, Fraction(1, 2), near=False),))
@@ -647,6 +648,21 @@ def test_a_rate_that_was_measured_before_the_prediction_fell_does_not_raise_the_
     before = ((10.24, "draining", 4000, 40), (10.36, "draining", 3800, 30))
     clear = [(10.5 + n * 0.04, "clear", 2700, 0) for n in range(20)]
     assert max(reported(cap, 4275, *before, *clear)) <= 2760
+
+
+def test_what_arrives_without_a_queue_proves_that_the_link_carries_it() -> None:
+    clear = [(11.0 + n * 0.15, "clear", 4600, 8) for n in range(4)]
+    assert reported(capped(4000, 5700, 3680), 5700, *clear)[-1] == 4232, "0.92 of what arrived, soon"
+
+
+@pytest.mark.parametrize("seed", [1, 3, 5])
+def test_jitter_at_the_start_does_not_hold_a_right_prediction_down_for_long(seed: int) -> None:
+    """It is taken for an overuse, by which the link seems to carry less than predicted; each fall returned to that."""
+    kbps = varying(seed, 4200, 7800)
+    late = steps((0, 0), (0.4, 0.1), (0.55, 0), (0.8, 0.08), (0.95, 0), (1.2, 0.12), (1.35, 0))
+    link = Link(lambda t: 1.1 * kbps(t), delay_s=late)
+    right = drive(link, kbps, 20, fps=15, seed=seed, start=Fraction(1, 2), key_frame=3)
+    assert right.kbps(2, 15) >= 0.94 * fmean(kbps(t) for t in range(2, 15))
 
 
 def test_careful_increases_end_when_the_prediction_falls() -> None:

@@ -176,6 +176,8 @@ def _cut_by_jitter(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full
     """
     sent = cap.in_force(limit)
     known = cap.overuse.known(full) if cap.overuse else sent
+    if limit < full:  # the link is expected to carry no more
+        known = min(known, limit)
     if cap.overuse and sent <= capacity.RESERVE * known and is_short(link):
         return capacity.raise_known(cap, link, t, full)
     is_all_known = capacity.is_start(cap, t) and (link.kbps or 0) >= capacity.DEEPEST * sent
@@ -220,7 +222,7 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps, kn
 
 
 def _recover(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps) -> LinkCap:
-    cap = cap._replace(before=link.kbps or cap.before, queue_ms=0.0)
+    cap = capacity.raise_known(cap._replace(before=link.kbps or cap.before, queue_ms=0.0), link, t, full)
     if cap.kbps is None or cap.kbps >= limit or link.kbps == 0 or t - cap.changed < STEP_S + rtt_s(link):
         return cap  # a cap that is not in force, or under which nothing is sent, is untested, and so does not grow
     steps, factor, last = cap.steps, FAST, cap.overuse
