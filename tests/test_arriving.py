@@ -17,8 +17,8 @@ def header(*, extension: bytes = b"", sources: int = 0, last: bool = False) -> b
     return first + bytes.fromhex("12340000abcd") + bytes(4 + 4 * sources) + extension
 
 
-def extension(number: int = 1) -> bytes:
-    ntp = round((CAPTURED + NTP_EPOCH_S) * 2**32).to_bytes(8, "big")
+def extension(number: int = 1, captured: float = CAPTURED) -> bytes:
+    ntp = round((captured + NTP_EPOCH_S) * 2**32).to_bytes(8, "big")
     return b"\xbe\xde\x00\x03" + bytes([number << 4 | 7]) + ntp + bytes(3)
 
 
@@ -29,6 +29,7 @@ def extension(number: int = 1) -> bytes:
         (header(sources=2), 120, 100, None),
         (header(extension=extension()), 128, 100, CAPTURED),
         (header(extension=extension(number=2)), 128, 100, None),
+        (header(extension=extension(captured=-NTP_EPOCH_S)), 128, 100, None),  # not filled in
         (header(extension=b"\x10\x00\x00\x01\x00\x00\x00\x00"), 120, 100, None),  # of two bytes (RFC 8285, section 4.3)
         (header(), 12, 0, None),
     ],

@@ -10,7 +10,6 @@ from dataclasses import replace
 from fractions import Fraction
 from itertools import pairwise
 from operator import attrgetter
-from statistics import fmean
 from typing import Any
 
 import pytest
@@ -463,7 +462,7 @@ def test_a_place_where_predictions_proved_too_high_is_remembered() -> None:
     assert known.lowest(9, 10) == unknown.lowest(59, 60) == RIGHT
     assert known.lowest(59, 60) < 0.8 * RIGHT
     assert known.lowest(50, 52) == known.lowest(95, 100) == RIGHT, "far from there all is believed"
-    assert known.wait_ms(0.999, since=60) < 0.7 * unknown.wait_ms(0.999, since=60)
+    assert known.wait_ms(0.99, since=60) < 0.8 * unknown.wait_ms(0.99, since=60)
 
 
 DOUBTED = Trust(places=(DoubtedPlace(laps(0), 0.0, Fraction(1, 2), near=False),))
@@ -650,19 +649,12 @@ def test_a_rate_that_was_measured_before_the_prediction_fell_does_not_raise_the_
     assert max(reported(cap, 4275, *before, *clear)) <= 2760
 
 
-def test_what_arrives_without_a_queue_proves_that_the_link_carries_it() -> None:
-    clear = [(11.0 + n * 0.15, "clear", 4600, 8) for n in range(4)]
-    assert reported(capped(4000, 5700, 3680), 5700, *clear)[-1] == 4232, "0.92 of what arrived, soon"
-
-
-@pytest.mark.parametrize("seed", [1, 3, 5])
-def test_jitter_at_the_start_does_not_hold_a_right_prediction_down_for_long(seed: int) -> None:
-    """It is taken for an overuse, by which the link seems to carry less than predicted; each fall returned to that."""
-    kbps = varying(seed, 4200, 7800)
-    late = steps((0, 0), (0.4, 0.1), (0.55, 0), (0.8, 0.08), (0.95, 0), (1.2, 0.12), (1.35, 0))
-    link = Link(lambda t: 1.1 * kbps(t), delay_s=late)
-    right = drive(link, kbps, 20, fps=15, seed=seed, start=Fraction(1, 2), key_frame=3)
-    assert right.kbps(2, 15) >= 0.94 * fmean(kbps(t) for t in range(2, 15))
+@pytest.mark.parametrize(("queue_ms", "kbps"), [(21, 4800), (40, 2430)])
+def test_soon_after_the_prediction_rose_a_short_queue_proves_little(queue_ms: float, kbps: float) -> None:
+    """All cameras change their size with a large frame; the rate still includes the time before. 0.6 of the limit."""
+    rising = LastLimit(Fraction(8000), rose=9.95, before_rise=Fraction(2000))
+    cap = LinkCap(measured=9.9, short=9.9, began=0.0, predicted=True, limit=rising)
+    assert reported(cap, 8000, (10.04, "filling", 2700, queue_ms)) == [kbps]
 
 
 def test_careful_increases_end_when_the_prediction_falls() -> None:

@@ -15,7 +15,9 @@ from helpers import CONF, Command, UserConf, process
 from runner.configuration import yaml_file
 from runner.configuration.combinations import SECTIONS, Combinations, words_of
 from runner.configuration.compose import compose
+from runner.configuration.config import configuration
 from runner.configuration.files import GROUPS, options
+from runner.plans import compile_plans
 from runner.system import spawned
 from runner.verbs import validate
 
@@ -246,6 +248,20 @@ def test_against_the_registry(tod: Command, conf: UserConf, old: str, new: str, 
     conf.change("graph/h264_rtsp.yaml", {old: new})
     found = problems(tod, conf, *one())
     assert any(problem.startswith(f"~/graph/h264_rtsp.yaml: {expected}") for problem in found), found
+
+
+@pytest.mark.gst
+@pytest.mark.skipif(importlib.util.find_spec("gi") is None, reason="PyGObject is not installed")
+def test_elements_of_the_packaged_graphs_have_a_package() -> None:
+    """So that a machine that lacks one is told what to install."""
+    from runner.gst import Gst, registry
+
+    for graph in (file.stem for file in (CONF / "graph").glob("*.yaml")):
+        for plan in compile_plans(configuration([f"graph={graph}", "source=test"]).vehicle()):
+            for element in (*plan.vehicle, *plan.operator):
+                found = Gst.ElementFactory.find(element.factory)
+                is_core = found is not None and found.get_plugin_name() == "coreelements"
+                assert is_core or element.factory in registry.PACKAGE_OF, element.factory
 
 
 @pytest.mark.gst

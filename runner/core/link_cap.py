@@ -176,8 +176,6 @@ def _cut_by_jitter(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full
     """
     sent = cap.in_force(limit)
     known = cap.overuse.known(full) if cap.overuse else sent
-    if limit < full:  # the link is expected to carry no more
-        known = min(known, limit)
     if cap.overuse and sent <= capacity.RESERVE * known and is_short(link):
         return capacity.raise_known(cap, link, t, full)
     is_all_known = capacity.is_start(cap, t) and (link.kbps or 0) >= capacity.DEEPEST * sent
@@ -200,7 +198,8 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps, kn
         most = min(most, PROVEN * carried)
     target = max(_drained(link, carried), contention.yielded(cap, link, t) * most)
     in_outage = capacity.is_of_outage(cap, link, t, full)
-    if cap.provisional or in_outage:  # not all cameras may have started, so a low rate proves little
+    # If not all cameras may have started, or the rate was measured under a lower prediction, it proves little.
+    if cap.provisional or in_outage or (is_short(link) and capacity.just_rose(cap, link, t)):
         target = max(target, capacity.DEEPEST * cap.in_force(limit))
     if not (below := contention.is_below_floors(cap, link, t, limit)):
         target = max(target, cap.floors)
@@ -222,7 +221,7 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps, kn
 
 
 def _recover(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps) -> LinkCap:
-    cap = capacity.raise_known(cap._replace(before=link.kbps or cap.before, queue_ms=0.0), link, t, full)
+    cap = cap._replace(before=link.kbps or cap.before, queue_ms=0.0)
     if cap.kbps is None or cap.kbps >= limit or link.kbps == 0 or t - cap.changed < STEP_S + rtt_s(link):
         return cap  # a cap that is not in force, or under which nothing is sent, is untested, and so does not grow
     steps, factor, last = cap.steps, FAST, cap.overuse

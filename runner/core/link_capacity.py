@@ -12,7 +12,6 @@ from runner.core.events import LinkMeasured
 from runner.core.link_memory import SEEN_S, LinkCap, Lowering, Overuse, PredictedOutage, rtt_s, tenths
 from runner.core.model import Kbps, exact
 from runner.core.trust import FALL_S, LATE_S, relieve
-from runner.core.uplink import LinkState
 
 DRAIN_MS = 400  # a queue should drain within about this time ...
 DEEPEST, SHALLOWEST = Fraction(3, 5), Fraction(19, 20)  # ... by a cut to a share of what the link carries
@@ -165,7 +164,7 @@ def lower_known(cap: LinkCap, carried: Kbps, link: LinkMeasured, t: float, limit
 
 
 def raise_known(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> LinkCap:
-    """Raise the known capacity if more arrives than it without a queue, or in the queue of a recent overuse.
+    """Raise the known capacity soon after an overuse, while its queue lasts, if more arrives than it.
 
     Likewise soon after a measurement that lowered it, but not above the value before. After a stall units arrive in
     bursts, and a measurement may include a pause between them. Soon after the prediction fell, a rate may have been
@@ -176,7 +175,7 @@ def raise_known(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> Link
         limit = max(limit, cap.limit.before_fall)
     if last is None or link.kbps is None or link.kbps <= (known := last.known(limit)):
         return cap
-    if link.state is LinkState.CLEAR or _is_recent(last.t, link, t):
+    if _is_recent(last.t, link, t):
         return cap._replace(overuse=_known_now(last, link.kbps, limit))
     if _is_recent(cap.lowering.t, link, t):
         return cap._replace(overuse=_known_now(last, max(known, min(link.kbps, cap.lowering.known)), limit))
@@ -191,6 +190,11 @@ def is_start_over(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps) -> bo
 def just_fell(cap: LinkCap, link: LinkMeasured, t: float) -> bool:
     """Whether what arrives may have been sent before the prediction fell."""
     return cap.predicted and _is_recent(cap.limit.fell, link, t)
+
+
+def just_rose(cap: LinkCap, link: LinkMeasured, t: float) -> bool:
+    """Whether what arrives may have been sent before the prediction rose."""
+    return cap.predicted and _is_recent(cap.limit.rose, link, t)
 
 
 def _known_now(last: Overuse, carried: Kbps, limit: Kbps) -> Overuse:

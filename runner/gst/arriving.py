@@ -65,7 +65,7 @@ def _captured(extension: bytes) -> float | None:
     if extension[:2] != ONE_BYTE or extension[WORD_BYTES:start] != bytes([CAPTURE_ID << 4 | NTP_BYTES - 1]):
         return None
     ntp = int.from_bytes(extension[start : start + NTP_BYTES], "big")
-    return ntp / 2**32 - NTP_EPOCH_S
+    return ntp / 2**32 - NTP_EPOCH_S if ntp else None  # a payloader leaves 0, which only a session fills in
 
 
 class ArrivingFrames:

@@ -73,9 +73,10 @@ class CameraPipeline:
         entry = self._elements[0].get_static_pad("sink")
         self._repeats = RepeatDetector(entry, plan.camera.source.repeated_s, on_report)
         last = next(pad for element in reversed(self._elements) if (pad := element.get_static_pad("src")))
-        payloader = last.get_parent_element()
-        self._add_capture_time(payloader)
-        self.sent_frames = SentFrames(payloader) if isinstance(payloader, GstRtp.RTPBasePayload) else None
+        payloader = next((element for element in self._elements if isinstance(element, GstRtp.RTPBasePayload)), None)
+        self.sent_frames = SentFrames(payloader) if payloader else None
+        if payloader:
+            _add_capture_time(payloader)
         self.knobs.set_now(self._allowed(self._first))
         self.requests = RequestLimit(last, on_report)
         self._first_packet = BufferProbe(last, self._on_first_packet, in_lists=True)
@@ -185,12 +186,12 @@ class CameraPipeline:
             self.knobs.turn({"sending": wanted["sending"]})
         return True
 
-    def _add_capture_time(self, payloader: Gst.Element) -> None:
-        """Add the capture time of its frame to the header of every packet."""
-        if isinstance(payloader, GstRtp.RTPBasePayload):
-            extension = GstRtp.RTPHeaderExtension.create_from_uri(CAPTURE_TIME)
-            extension.set_id(CAPTURE_ID)
-            payloader.emit("add-extension", extension)
+
+def _add_capture_time(payloader: Gst.Element) -> None:
+    """Make room for the capture time in the first packet of each frame. An rtpsession after it fills in the time."""
+    extension = GstRtp.RTPHeaderExtension.create_from_uri(CAPTURE_TIME)
+    extension.set_id(CAPTURE_ID)
+    payloader.emit("add-extension", extension)
 
 
 def passed_counts(identity: Gst.Element) -> tuple[int, int]:

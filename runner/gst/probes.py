@@ -107,9 +107,9 @@ class PassingBuffer:
 
     @property
     def reference_ns(self) -> int | None:
-        """Its reference timestamp; None if it has none."""
+        """Its reference timestamp; None if it has none, or the sender left it 0."""
         meta = _get_reference(self._address, None)
-        return int(meta.contents.timestamp) if meta else None
+        return (int(meta.contents.timestamp) or None) if meta else None
 
     def extract(self, offset: int, count: int) -> bytes:
         """Up to `count` bytes from an offset."""

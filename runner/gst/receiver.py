@@ -240,10 +240,10 @@ class Receiver:
         self._next_picture = BufferProbe(self._sink.get_static_pad("sink"), self._on_frame)
         self._begun = False
         self._buffers, self._over_udp, self._feedback = [], False, False
+        self._client = pipeline.get_by_name(self._client_name)
         for element in pipeline.iterate_recurse():
             self._on_element(pipeline, pipeline, element)
         pipeline.connect("deep-element-added", self._on_element)
-        self._client = pipeline.get_by_name(self._client_name)
         if self._login and (problem := self._login.prepare(pipeline, self._client)):
             self._on_report(self._name, problem)
         if is_rtsp_client(self._client):
@@ -402,7 +402,7 @@ def prefer_feedback(client: Gst.Element, on_profile: Callable[[str], None] = lam
 def capture_time(buffer: Gst.Buffer) -> float | None:
     """Capture time of a frame, s since 1970 by the vehicle's clock; None if the transport does not carry it."""
     meta = buffer.get_reference_timestamp_meta(None)
-    return unix_s(meta.timestamp) if meta else None
+    return unix_s(meta.timestamp) if meta and meta.timestamp else None
 
 
 def unix_s(reference_ns: int) -> float:

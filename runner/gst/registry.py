@@ -16,7 +16,8 @@ from runner.graph import Plan, assignments, launch, text
 PACKAGES = {  # elements by Debian package; `doctor` and messages on missing plugins name the package
     "gstreamer1.0-plugins-base": "videoconvert videoscale videorate videotestsrc decodebin appsrc appsink",
     "gstreamer1.0-plugins-good": "videocrop aspectratiocrop rtph264pay rtph264depay rtpjitterbuffer rtspsrc udpsrc"
-    " udpsink v4l2src rtpbin jpegdec capssetter qtdemux matroskademux matroskamux vp8enc vp8dec rtpvp8pay rtpvp8depay",
+    " udpsink v4l2src rtpbin rtpsession jpegdec capssetter qtdemux matroskademux matroskamux vp8enc vp8dec rtpvp8pay"
+    " rtpvp8depay",
     "gstreamer1.0-plugins-bad": "h264parse h265parse mpegtsmux tsdemux openh264enc x265enc srtsrc srtsink"
     " vah264enc nvh264enc",
     "gstreamer1.0-plugins-ugly": "x264enc",
@@ -208,7 +209,7 @@ def _pad_problem(factory: str, direction: str, pad: str) -> str | None:
     names = sorted(template.name_template for template in templates if template.direction == wanted)
     if any(re.fullmatch(re.sub("%[ud]", "[0-9]+", name).replace("%s", ".+"), pad) for name in names):
         return None
-    return f"{factory} has no such {direction} pad; expected one of {', '.join(names)}"
+    return f"{factory} has no such {direction} pad; expected one of {', '.join(names) or '(none)'}"
 
 
 def _readable(kind: str, value: str) -> bool:
