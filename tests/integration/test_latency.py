@@ -10,7 +10,7 @@ from statistics import median
 import pytest
 from msgspec import UNSET
 
-from rig import ROBOT, Operator, clock_ahead, free_port, needs_compiler, process, run, set_clock, until
+from rig import ROBOT, Operator, clock_ahead, free_port, needs_compiler, needs_root, process, run, set_clock, until
 from runner.drive.read import read_drive
 from runner.mqtt.link import ControlLink
 from runner.mqtt.messages import topic
@@ -18,18 +18,26 @@ from runner.records import ReceptionReported, Sample, Telemetry, to_json
 from runner.schema import message_problem
 
 AHEAD_MS, ONE_WAY_MS = 3700, 80
-SLOW = ("link=relay", "link.share=3", "link.delay_ms=80", "link.reverse=null")  # from the vehicle; none back
+SLOW = ("link.share=3", "link.delay_ms=80", "link.reverse=null")  # from the vehicle; none back
+RTSP, SRT = ("link=relay",), ("link=netns", "graph=h264_srt")
 
 
 @needs_compiler
-@pytest.mark.parametrize(("verb", "sign"), [("vehicle", 1), pytest.param("operator", -1, marks=pytest.mark.soak)])
-def test_latencies_are_right_over_a_link_that_delays_one_direction(tmp_path, verb, sign):
+@pytest.mark.parametrize(
+    ("verb", "sign", "transport"),
+    [
+        ("vehicle", 1, RTSP),
+        pytest.param("operator", -1, RTSP, marks=pytest.mark.soak),
+        pytest.param("vehicle", 1, SRT, marks=[pytest.mark.soak, needs_root]),
+    ],
+)
+def test_latencies_are_right_over_a_link_that_delays_one_direction(tmp_path, verb, sign, transport):
     """One side's clock is set 3.7 s ahead; both are the same clock, so that the true difference is known."""
     env = clock_ahead(tmp_path, AHEAD_MS / 1000, verb)
     path, report = tmp_path / "drive", tmp_path / "report"
-    ports = (f"media.port={free_port()}", f"control.port={free_port()}")
+    ports = (f"media.port={free_port()}", f"control.port={free_port()}", f"graph.first_port={free_port(3)}")
     speed = ("latency.fixed_ms=60", "latency.limit_ms=150")
-    done = run("demo", *ROBOT, *SLOW, *ports, *speed, f"log={path}", "duration_s=9", env=env)
+    done = run("demo", *ROBOT, *SLOW, *transport, *ports, *speed, f"log={path}", "duration_s=9", env=env)
     assert done.returncode == 0, done.stdout + done.stderr
     drive = read_drive(path)
     every = [*drive.sides["operator"].of(Sample)]
