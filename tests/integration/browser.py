@@ -71,9 +71,10 @@ def checked(page, refused=False):
     wrong = _wrong[page.context]
     try:
         yield
-    finally:  # pytest prints it of a test that fails
+    except BaseException:
         with suppress(sync_api.Error):
             print(page.evaluate(f"Promise.race([{STATE}, new Promise((end) => setTimeout(end, 1000))])"))
+        raise
     expected = ["WebSocket connection", "net::ERR_" if refused else NETWORK_CHANGED]
     expected += ["'globalThis.boot' as it is undefined"] * any(NETWORK_CHANGED in text for text in wrong)
     unexpected = [text for text in wrong if not any(each in text for each in expected)]
