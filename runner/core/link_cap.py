@@ -198,12 +198,13 @@ def _cut(cap: LinkCap, link: LinkMeasured, t: float, limit: Kbps, full: Kbps, kn
         most = min(most, PROVEN * carried)
     target = max(_drained(link, carried), contention.yielded(cap, link, t) * most)
     in_outage = capacity.is_of_outage(cap, link, t, full)
+    seen = capacity.limit_seen(cap, link, t, full)
     # If not all cameras may have started, or the rate was measured under a lower prediction, it proves little.
-    if cap.provisional or in_outage or (is_short(link) and capacity.just_rose(cap, link, t)):
+    if cap.provisional or in_outage or (cap.predicted and seen < full and is_short(link)):
         target = max(target, capacity.DEEPEST * cap.in_force(limit))
     if not (below := contention.is_below_floors(cap, link, t, limit)):
         target = max(target, cap.floors)
-    settled, seen = t - cap.changed >= SETTLE_S + rtt_s(link), capacity.limit_seen(cap, link, t, full)
+    settled = t - cap.changed >= SETTLE_S + rtt_s(link)
     if target >= cap.in_force(limit) or not (settled or (link.queue_ms or 0) > cap.queue_ms):
         lowered = cap if in_outage else capacity.lower_known(cap, max(carried, known * seen / full), link, t, seen)
         return capacity.raise_known(lowered, link, t, full)

@@ -192,11 +192,6 @@ def just_fell(cap: LinkCap, link: LinkMeasured, t: float) -> bool:
     return cap.predicted and _is_recent(cap.limit.fell, link, t)
 
 
-def just_rose(cap: LinkCap, link: LinkMeasured, t: float) -> bool:
-    """Whether what arrives may have been sent before the prediction rose."""
-    return cap.predicted and _is_recent(cap.limit.rose, link, t)
-
-
 def _known_now(last: Overuse, carried: Kbps, limit: Kbps) -> Overuse:
     """The overuse with what the link carries under the current limit."""
     return last._replace(carried=tenths(carried), limit=limit)
