@@ -1,6 +1,6 @@
 """Long repetitions of faults that a drive must survive: signals, stalls, openings, kills, frozen cameras, slow readers,
-new sizes, garbage, reports of any kind, clocks that drift apart, outages with keys, addresses that change, and
-thousands of changes that must leak nothing.
+new sizes, garbage, reports of any kind, clocks that drift apart, outages with keys, addresses that change, variants of
+cameras, bags and players as people own them, and thousands of changes that must leak nothing.
 
     make soak                           everything, about 80 minutes on two cores
     SOAK=0.1 make soak                  a tenth of it
@@ -48,7 +48,7 @@ def _tests(seed: int, scale: float) -> list[str]:
     properties = ("-m", "pytest", "-m", "hypothesis and not soak", "-n", "auto", "--hypothesis-profile=random")
     draws = range(seed, seed + max(1, round(DRAWS * scale)))
     commands = {
-        "pytest": ("-m", "pytest", "-m", "soak"),
+        "pytest": ("-m", "pytest", "-m", "soak and not sources and not players"),
         **{f"properties with seed {draw}": (*properties, f"--hypothesis-seed={draw}") for draw in draws},
         "golden": ("tests/golden", "mutations"),
     }
@@ -59,6 +59,17 @@ def _tests(seed: int, scale: float) -> list[str]:
     return [f"{name} ended with {status}" for name, status in ended.items() if status]
 
 
+def _variants(mark: str) -> Part:
+    """Variants of one kind of source or player, each with a test of its own."""
+
+    def soak(_seed: int, _scale: float) -> list[str]:
+        words = (sys.executable, "-m", "pytest", "-m", f"soak and {mark}", "--durations=10")
+        status = subprocess.run(words, check=False, cwd=CHECKOUT).returncode
+        return [f"pytest of {mark} ended with {status}"] if status else []
+
+    return soak
+
+
 Part = Callable[[int, float], list[str]]  # seed, scale -> problems
 PARTS: dict[str, Part] = {
     "tests": _tests,
@@ -67,6 +78,8 @@ PARTS: dict[str, Part] = {
     "openings": openings.soak,
     "kills": kills.soak,
     "ip_camera": ip_camera.soak,
+    "sources": _variants("sources"),
+    "players": _variants("players"),
     "readers": readers.soak,
     "sizes": sizes.soak,
     "hostile": hostile.soak,
