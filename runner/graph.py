@@ -216,7 +216,9 @@ def compile_graph(
 def bag_topic(camera: Camera) -> BagTopic | None:
     """The bag and topic that a camera's source plays; None if it plays none or they are not configured."""
     path, topic = (camera.mount.get(key, camera.source.settings.get(key)) for key in ("bag", "topic"))
-    return BagTopic(str(path), str(topic)) if camera.source.plays_bags and path and topic else None
+    if not (camera.source.plays_bags and path and topic):
+        return None
+    return BagTopic(str(path), str(topic), camera.source.depth_m)
 
 
 def check_video(graph: Graph) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
@@ -30,11 +31,12 @@ def header(store: Any, ns: int, frame: str = "camera") -> Any:
 def image(store: Any, ns: int, picture: np.ndarray, encoding: str, padding: int = 0, big: bool = False) -> Any:
     """A message of type Image.
 
-    picture  height x width x bytes of a pixel
+    picture  height x width x bytes of a pixel; of NV12 and NV21 half as many more rows
     padding  bytes after each row
     """
     height, width, _ = picture.shape
     rows = picture.reshape(height, -1).view(np.uint8)
+    height = height * 2 // 3 if encoding.startswith("nv") else height
     data = np.pad(rows, ((0, 0), (0, padding)), constant_values=77)
     return store.types[IMAGE](header(store, ns), height, width, encoding, int(big), data.shape[1], data.ravel())
 
@@ -80,6 +82,78 @@ def write_bag(path: Path, kind: str, topics: Mapping[str, Sequence[tuple[int, An
         for ns, topic, message in logged:
             writer.write(connections[topic], ns, store.serialize_cdr(message, message.__msgtype__))
     return path
+
+
+def definition(kind: str, form: str = "ros2msg") -> tuple[str, str, bytes]:
+    """Name, format and text of the definition of a type, for `write_mcap`."""
+    version = 1 if form == "ros1msg" else 2
+    store = typestore("ros1" if version == 1 else "mcap")
+    name = kind.replace("/msg/", "/") if version == 1 else kind
+    return name, form, store.generate_msgdef(kind, ros_version=version)[0].encode()
+
+
+def packed(message: Any) -> bytes:
+    """A message in CDR."""
+    return bytes(typestore("mcap").serialize_cdr(message, message.__msgtype__))
+
+
+def write_mcap(
+    path: Path,
+    messages: Iterable[tuple[str, int, bytes]],
+    schemas: Mapping[str, tuple[str, str, bytes] | None],
+    *,
+    encodings: Mapping[str, str] = {},
+    qos: str = "",
+    profile: str = "ros2",
+    **options: Any,
+) -> Path:
+    """An MCAP by the format's own writer, as other programs write it.
+
+    messages   topic, time of recording and bytes, in the order of the file
+    schemas    by topic: name, format and text of the definition; None: without
+    encodings  of the messages, by topic; otherwise cdr
+    """
+    from mcap.writer import Writer
+
+    with path.open("wb") as file:
+        writer = Writer(file, **options)
+        writer.start(profile, "another program")
+        channels = {}
+        for topic, schema in schemas.items():
+            number = writer.register_schema(*schema) if schema else 0
+            metadata = {"offered_qos_profiles": qos} if qos else {}
+            channels[topic] = writer.register_channel(topic, encodings.get(topic, "cdr"), number, metadata)
+        for topic, ns, data in messages:
+            writer.add_message(channels[topic], ns, data, ns)
+        writer.finish()
+    return path
+
+
+def write_metadata(directory: Path, topic: str, kind: str, files: Sequence[str], count: int) -> Path:
+    """metadata.yaml as rosbag2 writes it, for files that lie in the directory."""
+    document = {
+        "version": 5,
+        "storage_identifier": "mcap",
+        "duration": {"nanoseconds": 10**9},
+        "starting_time": {"nanoseconds_since_epoch": BEGAN_NS},
+        "message_count": count,
+        "topics_with_message_count": [
+            {
+                "topic_metadata": {
+                    "name": topic,
+                    "type": kind,
+                    "serialization_format": "cdr",
+                    "offered_qos_profiles": "",
+                },
+                "message_count": count,
+            }
+        ],
+        "compression_format": "",
+        "compression_mode": "",
+        "relative_file_paths": list(files),
+    }
+    (directory / "metadata.yaml").write_text(json.dumps({"rosbag2_bagfile_information": document}))  # JSON is YAML
+    return directory
 
 
 def filmed(clip: Path, count: int, size: tuple[int, int]) -> list[np.ndarray]:

@@ -27,6 +27,17 @@ def number_of(picture: np.ndarray) -> int | None:
 
 def encoded(frame: np.ndarray, encoding: str) -> Any:
     """A frame of BGR in another encoding, and the RGB that it stands for."""
+    if encoding in ("16UC1", "32FC1"):
+        return _distances(frame, encoding)
+    if encoding.endswith("16") and encoding != "mono16":
+        narrow, rgb = encoded(frame, f"{encoding[:-2]}8")
+        return (narrow.astype("<u2") * 256 + 77).view(np.uint8), rgb
+    if encoding.startswith(("nv", "bayer")):
+        return _plain(frame, encoding)
+    return _simply_encoded(frame, {"8UC1": "mono8", "8UC3": "bgr8", "8UC4": "bgra8"}.get(encoding, encoding))
+
+
+def _simply_encoded(frame: np.ndarray, encoding: str) -> Any:
     import cv2
 
     rgb = frame[..., ::-1]
@@ -48,3 +59,33 @@ def encoded(frame: np.ndarray, encoding: str) -> Any:
     pairs = [chroma, luma] if encoding in ("yuv422", "uyvy") else [luma, chroma]
     bright = np.clip((luma.astype(float) - 16) * 255 / 219, 0, 255).round().astype(np.uint8)
     return np.concatenate(pairs, 2), np.repeat(bright, 3, 2)
+
+
+def _distances(frame: np.ndarray, encoding: str) -> Any:
+    """Brightness as distances of up to 25 m, of which 20 m are white; where it is darkest, none is known."""
+    grey = frame.max(axis=2, keepdims=True).astype(np.float32)
+    metres = np.where(grey < 20, 0, grey * np.float32(25 / 255))
+    shown = np.clip(metres * (255 / 20), 0, 255).astype(np.uint8)
+    if encoding == "16UC1":
+        data = (metres * 1000).round().astype("<u2")
+    else:
+        data = np.where(metres == 0, np.float32("nan"), metres).astype("<f4")
+    return data.view(np.uint8), np.repeat(shown, 3, 2)
+
+
+def _plain(frame: np.ndarray, encoding: str) -> Any:
+    """The mean colour of a frame, everywhere: what a converter does between two colours does not matter."""
+    import cv2
+
+    height, width, _ = frame.shape
+    colour = frame.reshape(-1, 3).mean(axis=0).round().astype(np.uint8) + np.array([90, 0, 40], np.uint8)
+    plain = np.broadcast_to(colour, frame.shape).copy()
+    if encoding.startswith("bayer"):
+        data = np.zeros((height, width, 1), np.uint8)
+        for index, name in enumerate(encoding[6:10]):
+            data[index // 2 :: 2, index % 2 :: 2, 0] = colour["bgr".index(name)]
+        return data, plain[..., ::-1]
+    planar = cv2.cvtColor(plain, cv2.COLOR_BGR2YUV_I420)
+    u, v = planar[height:].reshape(2, -1)
+    chroma = np.stack([u, v] if encoding == "nv12" else [v, u], 1).reshape(height // 2, width)
+    return np.concatenate([planar[:height], chroma])[..., None], plain[..., ::-1]

@@ -9,7 +9,22 @@ import pytest
 
 pytest.importorskip("rosbags")
 
-from bags import BEGAN_NS, KINDS, camera_bag, compressed, filmed, fix, image, typestore, write_bag
+from bags import (
+    BEGAN_NS,
+    IMAGE,
+    KINDS,
+    camera_bag,
+    compressed,
+    definition,
+    filmed,
+    fix,
+    image,
+    packed,
+    typestore,
+    write_bag,
+    write_mcap,
+    write_metadata,
+)
 from shared_data import shared
 
 from runner.bag import POSITIONS, Bag, PictureForm, is_bag
@@ -111,7 +126,7 @@ def test_a_picture_without_stamp_has_the_time_of_its_recording(tmp_path):
 @pytest.mark.parametrize(
     ("message", "rule"),
     [
-        (image(STORE, 1, PIXELS, "32FC1"), "encoding '32FC1' is not supported; expected one of mono8, mono16, "),
+        (image(STORE, 1, PIXELS, "64FC1"), "encoding '64FC1' is not supported; expected one of mono8, mono16, "),
         (compressed(STORE, 1, b"xyz", "tiff"), "format 'tiff' is not supported; expected JPEG or PNG"),
         (compressed(STORE, 1, b"\xff\xd8\xff\xd9", "jpeg"), "a JPEG picture without frame header"),
         (
@@ -126,7 +141,7 @@ def test_pictures_that_cannot_be_shown_are_named(tmp_path, message, rule):
     with Bag(path) as opened, pytest.raises(ModelError) as raised:
         list(opened.pictures("/a"))
     assert raised.value.found == f"{path}: /a"
-    assert raised.value.rule.startswith(rule)
+    assert raised.value.rule.startswith(f"picture 1: {rule}")
 
 
 def test_a_picture_that_lacks_bytes_is_refused():
@@ -150,11 +165,200 @@ def test_sizes_of_compressed_pictures(tmp_path, frames):
 @pytest.mark.parametrize("kind", KINDS)
 def test_positions_are_those_with_a_fix(tmp_path, kind):
     store = typestore(kind)
-    fixes = [(48.1, 11.5, 0), (48.2, 11.6, -1), (float("nan"), 11.6, 0), (48.3, 11.7, 2)]
+    fixes = [(48.1, 11.5, 0), (48.2, 11.6, -1), (float("nan"), 11.6, 0), (48.3, 11.7, 2), (0.0, 0.0, -2)]
     messages = [(BEGAN_NS + n, fix(store, BEGAN_NS + n, *one)) for n, one in enumerate(fixes)]
     with Bag(write_bag(tmp_path / "b", kind, {"/gps": messages})) as opened:
         topic = opened.find(POSITIONS, None, "positions")
         assert list(opened.positions(topic)) == [(BEGAN_NS, 48.1, 11.5), (BEGAN_NS + 3, 48.3, 11.7)]
+
+
+# --- files of other writers -------------------------------------------------------------------------------------------
+
+COUNT = 20
+QOS = "- history: 1\n  depth: 5\n  reliability: 1\n  durability: 2\n"
+
+
+def recorded(count=COUNT):
+    """Small pictures, 10 a second: topic, time and bytes; each shows its number."""
+    times = [BEGAN_NS + n * 100_000_000 for n in range(count)]
+    return [("/a", ns, packed(image(STORE, ns, PIXELS + n, "mono8"))) for n, ns in enumerate(times)]
+
+
+def numbers(path, topic="/a"):
+    """The numbers that the pictures of a topic show."""
+    with Bag(path) as opened:
+        assert topic in opened.topics
+        return [picture.data[0] for picture in opened.pictures(topic)]
+
+
+def mcap_options(name):
+    from mcap.writer import CompressionType, IndexType
+
+    return {
+        "no message index": {"index_types": IndexType.CHUNK, "chunk_size": 200},
+        "no index": {"index_types": IndexType.NONE, "chunk_size": 200},
+        "no summary": {
+            **{"index_types": IndexType.NONE, "repeat_channels": False, "repeat_schemas": False},
+            **{"use_statistics": False, "use_summary_offsets": False, "chunk_size": 200},
+        },
+        "no statistics": {"use_statistics": False, "chunk_size": 200},
+        "nothing repeated": {"repeat_channels": False, "repeat_schemas": False, "chunk_size": 200},
+        "lz4": {"compression": CompressionType.LZ4},
+        "no chunks": {"use_chunking": False},
+        "another profile": {"profile": ""},
+    }[name]
+
+
+MCAP_KINDS = (
+    *("no message index", "no index", "no summary", "no statistics", "nothing repeated", "lz4", "no chunks"),
+    "another profile",
+)
+
+
+@pytest.mark.parametrize("name", MCAP_KINDS)
+def test_an_mcap_of_any_writer_is_read_whole_and_in_order(tmp_path, name):
+    messages = recorded()
+    messages[3:5] = messages[4], messages[3]  # as recorders with several threads write
+    messages[11:16] = reversed(messages[11:16])
+    path = write_mcap(tmp_path / "b.mcap", messages, {"/a": definition(IMAGE)}, **mcap_options(name))
+    assert numbers(path) == list(range(COUNT))
+
+
+@pytest.mark.parametrize("other", ["jsonschema", "protobuf", "flatbuffer", "", None, "service"])
+def test_other_messages_beside_pictures_do_not_matter(tmp_path, other):
+    schemas = {"/a": definition(IMAGE), "/other": None if other is None else ("event", other, b"{}" if other else b"")}
+    if other == "service":
+        schemas["/other"] = ("example_interfaces/srv/AddTwoInts_Event", "ros2msg", b"a definition of no such form {")
+    both = [each for pair in zip(recorded(), [("/other", BEGAN_NS, b"{}")] * COUNT, strict=True) for each in pair]
+    path = write_mcap(tmp_path / "b.mcap", both, schemas, encodings={"/other": "json"})
+    assert numbers(path) == list(range(COUNT))
+
+
+@pytest.mark.parametrize("qos", ["", QOS])
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1)])
+def test_metadata_may_say_other_qos_and_list_files_in_any_order(tmp_path, qos, order):
+    for n in range(3):
+        part = recorded(21)[7 * n : 7 * n + 7]
+        write_mcap(tmp_path / f"b_{n}.mcap", part, {"/a": definition(IMAGE)}, qos=qos)
+    names = [f"b_{n}.mcap" for n in order]
+    assert numbers(write_metadata(tmp_path, "/a", IMAGE, names, 21)) == list(range(21))
+    (tmp_path / names[1]).unlink()
+    with pytest.raises(ModelError, match=f"cannot be read: metadata.yaml names {names[1]}, which must be in the same"):
+        Bag(tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["sqlite3", "mcap"])
+@pytest.mark.parametrize("mode", ["MESSAGE", "FILE"])
+def test_a_compressed_bag_is_read_by_its_directory_and_by_its_file(tmp_path, kind, mode):
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+
+    plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
+    writer = Writer(tmp_path / "b", version=9, storage_plugin=plugin)
+    writer.set_compression(CompressionMode[mode], CompressionFormat.ZSTD)
+    with writer:
+        connection = writer.add_connection("/a", IMAGE, typestore=STORE)
+        for _, ns, data in recorded():
+            writer.write(connection, ns, data)
+    (file,) = (path for path in (tmp_path / "b").iterdir() if path.suffix != ".yaml")
+    alone = tmp_path / file.name
+    alone.write_bytes(file.read_bytes())
+    assert numbers(tmp_path / "b") == numbers(file) == numbers(alone) == list(range(COUNT))
+
+
+def test_a_database_whose_recorder_was_killed_is_read_whole(tmp_path):
+    import shutil
+    import sqlite3
+
+    from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
+
+    recorder = sqlite3.connect(tmp_path / "b.db3", isolation_level=None)
+    recorder.executescript(Sqlite3Writer.SQLITE_SCHEMA)
+    recorder.execute(f"INSERT INTO topics VALUES(1, '/a', '{IMAGE}', 'cdr', '', '')")
+    recorder.execute("PRAGMA journal_mode=WAL")
+    recorder.execute("PRAGMA wal_autocheckpoint=0")
+    for number, (_, ns, data) in enumerate(recorded(), 1):
+        recorder.execute("INSERT INTO messages VALUES(?, 1, ?, ?)", (number, ns, data))
+        if number == 8:
+            recorder.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    (tmp_path / "killed").mkdir()
+    for file in tmp_path.glob("b.db3*"):
+        shutil.copy(file, tmp_path / "killed")
+    recorder.close()
+    assert numbers(tmp_path / "killed" / "b.db3") == list(range(COUNT))
+    with pytest.raises(ModelError, match=r"has no metadata.yaml.*: name its file, b.db3$"):
+        Bag(tmp_path / "killed")
+
+
+def test_only_damaged_files_are_called_damaged(tmp_path):
+    whole = write_mcap(tmp_path / "b.mcap", recorded(), {"/a": definition(IMAGE)})
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(whole.read_bytes()[:-100])
+    with pytest.raises(ModelError, match="cannot be read, damaged or cut off: it ends without the end of an MCAP file"):
+        Bag(cut)
+    schema = {"/a": ("sensor_msgs/msg/Image", "ros2msg", b"uint8[ data")}
+    with (
+        pytest.raises(ModelError, match="cannot be read: the definition of sensor_msgs/msg/Image cannot be read: "),
+        Bag(write_mcap(tmp_path / "d.mcap", recorded(), schema)) as opened,
+    ):
+        list(opened.pictures("/a"))
+
+
+def test_a_file_that_lacks_what_it_states_is_reported(tmp_path):
+    """Its summary counts a message that no chunk has: no picture is missing without a word."""
+    from mcap.writer import Writer
+
+    class Forgetful(Writer):
+        def finish(self):
+            self._Writer__statistics.channel_message_counts[1] += 1
+            self._Writer__statistics.message_count += 1
+            super().finish()
+
+    path = tmp_path / "b.mcap"
+    with path.open("wb") as file:
+        writer = Forgetful(file)
+        writer.start("ros2", "another program")
+        channel = writer.register_channel("/a", "cdr", writer.register_schema(*definition(IMAGE)))
+        for _, ns, data in recorded():
+            writer.add_message(channel, ns, data, ns)
+        writer.finish()
+    with pytest.raises(ModelError, match="it states 21 messages of this topic, and has 20"):
+        numbers(path)
+
+
+def test_pictures_that_cannot_be_shown_do_not_hide_the_others(tmp_path, frames):
+    import cv2
+
+    jpeg, png = (cv2.imencode(f".{kind}", frames[0])[1].tobytes() for kind in ("jpg", "png"))
+    thumbnail = jpeg[:2] + b"\xff\xe1" + (len(jpeg) + 2).to_bytes(2) + jpeg + jpeg[2:]  # a JPEG in its EXIF
+    pictures = {
+        "whole": (jpeg, thumbnail, jpeg + bytes(50), png),
+        "an empty picture": (b"",),
+        "format 'jpeg' is not supported": (b"GIF89a", bytes(1000)),
+        "a JPEG picture that is cut off or damaged": (
+            *(jpeg[: len(jpeg) // 3], jpeg[:-2], thumbnail[:-30]),
+            jpeg[:200] + bytes(300) + jpeg[500:],
+        ),
+        "a PNG picture that is cut off or damaged": (png[: len(png) // 2], png[:-5], png[:60] + b"\0" + png[61:]),
+    }
+    topics = [(data, why) for why, them in pictures.items() for data in them]
+    messages = [(BEGAN_NS + n, compressed(STORE, BEGAN_NS + n, data, "jpeg")) for n, (data, _) in enumerate(topics)]
+    with Bag(write_bag(tmp_path / "b", "mcap", {"/a": messages})) as opened:
+        for picture, (data, why) in zip(opened.all_pictures("/a"), topics, strict=True):
+            if why == "whole":
+                assert (picture.data, picture.width, picture.height) == (data, *SIZE)
+            else:
+                assert picture.why.startswith(why)
+        with pytest.raises(ModelError, match="/a: picture 5: an empty picture"):
+            list(opened.pictures("/a"))
+
+
+def test_a_damaged_message_is_a_picture_that_cannot_be_shown(tmp_path):
+    messages = recorded()
+    messages[4] = ("/a", messages[4][1], messages[4][2][:30])
+    with Bag(write_mcap(tmp_path / "b.mcap", messages, {"/a": definition(IMAGE)})) as opened:
+        found = list(opened.all_pictures("/a"))
+    assert [number for number, each in enumerate(found) if not hasattr(each, "data")] == [4]
+    assert found[4].why.startswith("a damaged message of 30 bytes: ")
 
 
 # --- the command line -------------------------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ import re
 import threading
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from runner.bag.pictures import SECOND_NS
@@ -78,7 +79,7 @@ def test_each_size_and_format_is_reported_once():
 @pytest.mark.parametrize(
     "wrong, rule",
     [
-        ({"encoding": "32FC1"}, "encoding '32FC1' is not supported; expected one of mono8, "),
+        ({"encoding": "64FC1"}, "encoding '64FC1' is not supported; expected one of mono8, "),
         ({"step": 100}, "a picture of 1920x1080 with rows of 100 bytes, must be at least 5760"),
         ({"size": 100}, "a picture of 100 bytes, must have 6220800: 1080 rows of 5760"),
         ({"height": 0}, "a picture of 1920x0 with rows of 5760 bytes, must be at least 5760"),
@@ -98,13 +99,21 @@ def test_pictures_that_cannot_be_shown_are_left_out(wrong, rule):
 
 
 def test_bytes_determine_the_type_of_compressed_pictures():
+    cv2 = pytest.importorskip("cv2")
     topic = Topic()
     os.write(topic._memory, b"GIF89a")
     assert topic.get(1, size=6, stated="jpeg") is None
     assert topic.take_reports() == ["format 'jpeg' is not supported; expected JPEG or PNG: such pictures are skipped"]
-    os.pwrite(topic._memory, b"\x89PNG\r\n\x1a\n" + bytes(8) + (1280).to_bytes(4) + (960).to_bytes(4), 0)
-    assert topic.get(2, size=24, stated="jpeg") == 2
+    png = cv2.imencode(".png", np.zeros((960, 1280), np.uint8))[1].tobytes()
+    os.pwrite(topic._memory, png, 0)
+    assert topic.get(2, size=len(png), stated="jpeg") == 2
     assert topic.take_reports() == ["pictures are png 1280x960"]
+    assert topic.get(3, size=len(png) - 9, stated="jpeg") is None
+    assert topic.get(4, size=0, stated="jpeg") is None
+    assert topic.take_reports() == [
+        "a PNG picture that is cut off or damaged: such pictures are skipped",
+        "an empty picture: such pictures are skipped",
+    ]
 
 
 def test_a_rate_below_the_cameras_is_reported_once():

@@ -12,22 +12,29 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from runner.bag.pictures import SECOND_NS, Picture, read_compressed, read_image, stamp_ns
+from runner.bag.files import METADATA, BagFiles
+from runner.bag.messages import Decoder, decoder
+from runner.bag.pictures import DEPTH_M, SECOND_NS, BadPicture, Picture, read_compressed, read_image, stamp_ns
+from runner.bag.storage import Channel, UnreadableError
 from runner.core.model import ModelError, suggest
+from runner.errors import reason
 
 if TYPE_CHECKING:
     from typing import Self
 
-    from rosbags.highlevel import AnyReader
-
-METADATA = "metadata.yaml"  # makes a directory a ROS 2 bag
 SUFFIXES = (".bag", ".mcap", ".db3")
-PICTURES: dict[str, Callable[[Any], Picture]] = {  # by type of message, also of ROS 1
+PICTURES: dict[str, Callable[[Any, float], Picture]] = {  # by type of message, also of ROS 1
     "sensor_msgs/msg/Image": read_image,
+    "foxglove.RawImage": read_image,
+    "foxglove_msgs/msg/RawImage": read_image,
     "sensor_msgs/msg/CompressedImage": read_compressed,
+    "foxglove.CompressedImage": read_compressed,
+    "foxglove_msgs/msg/CompressedImage": read_compressed,
+    "foxglove.CompressedVideo": read_compressed,
+    "foxglove_msgs/msg/CompressedVideo": read_compressed,
+    "ffmpeg_image_transport_msgs/msg/FFMPEGPacket": read_compressed,
 }
-POSITIONS = ("sensor_msgs/msg/NavSatFix",)
-NO_FIX = -1  # STATUS_NO_FIX of sensor_msgs/NavSatStatus
+POSITIONS = ("sensor_msgs/msg/NavSatFix", "foxglove.LocationFix", "foxglove_msgs/msg/LocationFix")
 SURVEYED = 100  # pictures from whose times a rate is estimated
 ROUND = 0.01  # a measured rate this close to a whole number, as a share, is rounded to it
 
@@ -61,7 +68,7 @@ class PictureForm:
 
 def is_bag(path: Path) -> bool:
     """Whether a path names a bag: its files' suffixes, or the directory of a ROS 2 bag."""
-    return path.suffix in SUFFIXES if path.is_file() else (path / METADATA).is_file()
+    return _is_named_like_a_bag(path) if path.is_file() else (path / METADATA).is_file()
 
 
 class Bag:
@@ -73,22 +80,21 @@ class Bag:
     """
 
     def __init__(self, path: Path) -> None:
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
-
         self.path = path
         _check_path(path)
         with _readable("bag", str(path)):
-            # Bags of older ROS 2 versions do not contain the definitions of their messages.
-            self._reader: AnyReader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
-            self._reader.open()
-            self.topics = {c.topic: c.msgtype for c in self._reader.connections if c.msgcount}
+            self._files = BagFiles(path)
+        self.topics: dict[str, str] = {}
+        for channel in self._files.counts:  # of several types, the one that can be shown
+            if channel.kind in (*PICTURES, *POSITIONS) or channel.topic not in self.topics:
+                self.topics[channel.topic] = channel.kind
+        self._decoders: dict[Channel, Decoder] = {}
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._reader.close()
+        self._files.close()
 
     def of(self, kinds: Collection[str]) -> list[str]:
         """Topics with messages of these types."""
@@ -109,21 +115,44 @@ class Bag:
             raise ModelError("topic", self.names(topic), f"no such topic with {what}{suggest(topic, known)}")
         return topic or known[0]
 
-    def pictures(self, topic: str) -> Iterator[Picture]:
-        """The pictures of a topic, in recording order."""
+    def pictures(self, topic: str, depth_m: float = DEPTH_M) -> Iterator[Picture]:
+        """The pictures of a topic, in the order of recording.
+
+        depth_m  distance that is white in a picture of distances
+        raises   ModelError at the first one that cannot be shown
+        """
+        for picture in self.all_pictures(topic, depth_m):
+            if isinstance(picture, BadPicture):
+                raise ModelError("topic", self.names(topic), f"picture {picture.number}: {picture.why}")
+            yield picture
+
+    def all_pictures(self, topic: str, depth_m: float = DEPTH_M) -> Iterator[Picture | BadPicture]:
+        """The same, with those that cannot be shown: the others can be, with their times."""
         read = PICTURES[self.topics[topic]]
-        for ns, message in self._messages(topic):
+        started = False  # whether a picture of video has come with which decoding can start
+        for number, (ns, message) in enumerate(self._messages(topic), 1):
             try:
-                picture = read(message)
+                if isinstance(message, ValueError):
+                    raise message
+                picture = read(message, depth_m)
             except ValueError as error:
-                raise ModelError("topic", self.names(topic), str(error)) from None
+                yield BadPicture(number, str(error))
+                continue
+            started = started or picture.key
+            if not started:
+                yield BadPicture(number, f"a picture of {picture.format} before the first key picture")
+                continue
             yield picture if picture.ns else picture.at(ns)
 
     def positions(self, topic: str) -> Iterator[Fix]:
         """The positions of a topic, in recording order, except those without a fix."""
         for logged, message in self._messages(topic):
+            if isinstance(message, ValueError):
+                raise ModelError("topic", self.names(topic), str(message))
             fix = Fix(stamp_ns(message) or logged, message.latitude, message.longitude)
-            if message.status.status != NO_FIX and math.isfinite(fix.lat) and math.isfinite(fix.lon):
+            # Below 0 are STATUS_NO_FIX and STATUS_UNKNOWN of sensor_msgs/NavSatStatus; Foxglove's type has no status.
+            fixed = not hasattr(message, "status") or message.status.status >= 0
+            if fixed and math.isfinite(fix.lat) and math.isfinite(fix.lon):
                 yield fix
 
     def form(self, topic: str) -> PictureForm:
@@ -131,7 +160,7 @@ class Bag:
 
         raises  ModelError, also if there are fewer than two
         """
-        first = list(islice(self.pictures(topic), SURVEYED))
+        first = list(islice((p for p in self.all_pictures(topic) if isinstance(p, Picture)), SURVEYED))
         steps = [later.ns - earlier.ns for earlier, later in pairwise(first) if later.ns > earlier.ns]
         if not steps:
             raise ModelError("topic", self.names(topic), "must have two pictures with different times")
@@ -142,47 +171,77 @@ class Bag:
         return f"{self.path}: {topic}"
 
     def _messages(self, topic: str) -> Iterator[tuple[int, Any]]:
-        """Messages of a topic, with the times at which they were recorded, ns since 1970."""
+        """Messages of a topic, with the times at which they were recorded, ns since 1970; a ValueError: it is damaged.
+
+        raises  ModelError also if the file has fewer than it says
+        """
+        kind, read = self.topics[topic], 0
+        expected = sum(count for c, count in self._files.counts.items() if (c.topic, c.kind) == (topic, kind))
         with _readable("topic", self.names(topic)):
-            connections = [connection for connection in self._reader.connections if connection.topic == topic]
-            for connection, ns, data in self._reader.messages(connections):
-                yield ns, self._reader.deserialize(data, connection.msgtype)
+            for ns, channel, data in self._files.messages(topic):
+                if channel.kind == kind:
+                    read += 1
+                    yield ns, self._decoded(channel, data)
+            if read != expected:
+                raise ValueError(f"it states {expected} messages of this topic, and has {read}")
+
+    def _decoded(self, channel: Channel, data: bytes) -> Any:
+        if channel not in self._decoders:
+            self._decoders[channel] = decoder(channel)
+        try:
+            return self._decoders[channel](data)
+        except ValueError as error:
+            return error
 
 
 def check_topic(path: Path, topic: str | None) -> None:
-    """Check, by its first picture, that a topic of a bag has pictures of a supported kind.
+    """Check, by its first pictures, that a topic of a bag has pictures of a supported kind.
 
-    raises  ModelError with the key `bag` or `topic`
+    raises  ModelError with the key `bag` or `topic`, if none of them can be shown
     """
     with Bag(path) as bag:
         known = bag.of(PICTURES)
         if topic is None and known:
             raise ModelError("topic", str(path), f"must be given, a topic with pictures: {', '.join(known)}")
-        next(bag.pictures(bag.find(PICTURES, topic, "pictures")))
+        found = bag.find(PICTURES, topic, "pictures")
+        first = list(islice(bag.all_pictures(found), SURVEYED))
+        bad = [picture for picture in first if isinstance(picture, BadPicture)]
+        if len(bad) == len(first):
+            raise ModelError("topic", bag.names(found), f"picture {bad[0].number}: {bad[0].why}")
+
+
+def _is_named_like_a_bag(path: Path) -> bool:
+    return path.with_suffix("").suffix in SUFFIXES if path.suffix == ".zstd" else path.suffix in SUFFIXES
 
 
 def _check_path(path: Path) -> None:
     if not path.exists():
         raise ModelError("bag", str(path), "no such file")
     if path.is_dir() and not (path / METADATA).is_file():
-        raise ModelError("bag", str(path), f"has no {METADATA}, which makes a directory a ROS 2 bag")
-    if path.is_file() and path.suffix not in SUFFIXES:
+        files = sorted(file.name for file in path.iterdir() if _is_named_like_a_bag(file))
+        name = f"; a recorder that was killed writes none: name its file, {', '.join(files)}" if files else ""
+        raise ModelError("bag", str(path), f"has no {METADATA}, which makes a directory a ROS 2 bag{name}")
+    if path.is_file() and not _is_named_like_a_bag(path):
         kinds = f"a file *{', *'.join(SUFFIXES)}, or the directory of a ROS 2 bag"
         raise ModelError("bag", str(path), f"must be a bag: {kinds}")
 
 
 @contextmanager
 def _readable(key: str, found: str) -> Iterator[None]:
-    """Convert errors of damaged files: the library's parsers raise many kinds of exceptions."""
+    """Convert errors of files: the libraries' parsers raise many kinds of exceptions at damaged ones."""
     try:
         yield
     except (ImportError, ModelError):
         raise
+    except UnreadableError as error:
+        raise ModelError(key, found, f"cannot be read: {error}") from None
+    except OSError as error:
+        raise ModelError(key, found, f"cannot be read: {reason(error)}") from None
     except Exception as error:
-        raise ModelError(key, found, f"cannot be read, damaged or cut off: {_reason(error)}") from None
+        raise ModelError(key, found, f"cannot be read, damaged or cut off: {_first_line(error)}") from None
 
 
-def _reason(error: Exception) -> str:
+def _first_line(error: Exception) -> str:
     return " ".join(str(error).split()).rstrip(".") or type(error).__name__
 
 

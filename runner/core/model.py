@@ -243,6 +243,7 @@ class Source:
     render_s    length of that drive, s
     plays_bags  frames are the pictures of a topic of a bag, which are pushed into its first element
     subscribes  the same for a ROS topic
+    depth_m     distance that is shown white in pictures of distances, m, in both
     stand_in    elements that `print` shows if gst-launch cannot produce the frames (from Python, or not yet rendered)
     """
 
@@ -257,6 +258,7 @@ class Source:
     render_s: float = 0
     plays_bags: bool = False
     subscribes: bool = False
+    depth_m: float = 20.0
     stand_in: tuple[Element, ...] = ()
 
     def __post_init__(self) -> None:
@@ -274,10 +276,14 @@ class Source:
 
 @dataclass(frozen=True, slots=True)
 class BagTopic:
-    """Pictures of a bag: the path of the bag, and their topic."""
+    """Pictures of a bag: the path of the bag, and their topic.
+
+    depth_m  distance that is shown white in pictures of distances, m
+    """
 
     path: str
     topic: str
+    depth_m: float = 20.0
 
 
 @dataclass(frozen=True, slots=True)

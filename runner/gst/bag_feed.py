@@ -10,14 +10,17 @@ from pathlib import Path
 from gi.repository import GLib, Gst
 
 from runner.bag import PICTURES, Bag
-from runner.bag.pictures import Picture
+from runner.bag.pictures import BAYER, BadPicture, Picture
 from runner.core.model import BagTopic, ModelError
 from runner.graph import Plan
 from runner.gst.source import BEHIND_S
 
 POLL_S = 0.5  # while waiting for the next picture, how often the thread checks that its pipeline still runs
-ENCODED = {"jpeg": "image/jpeg", "png": "image/png"}
-UNPACED = {"is-live": False, "leaky-type": 0, "block": True}  # of an appsrc that blocks until each picture is consumed
+VIDEO = {codec: f"video/x-{codec},stream-format=byte-stream,alignment=au" for codec in ("h264", "h265")}
+ENCODED = {"jpeg": "image/jpeg", "png": "image/png", **VIDEO}
+BAYER_NAME = "bayer"  # of the element that converts Bayer patterns
+NO_BAYER = "pictures in Bayer patterns need bayer2rgb; on Debian: apt-get install gstreamer1.0-plugins-bad"
+BLOCKING = {"leaky-type": 0, "block": True}  # of an appsrc that drops nothing and blocks until a picture is consumed
 
 
 def play_bag(pipeline: Gst.Bin, plan: Plan, bag: BagTopic, on_report: Callable[[str], None]) -> None:
@@ -28,8 +31,8 @@ def play_bag(pipeline: Gst.Bin, plan: Plan, bag: BagTopic, on_report: Callable[[
 
 def read_bag(source: Gst.Element, bag: BagTopic, fps: Fraction, loop: bool = False) -> BagFeed:
     """Let an appsrc of a new pipeline pass a bag's pictures as fast as they are consumed; none may be skipped."""
-    for key, value in UNPACED.items():
-        source.set_property(key, value)
+    source.set_property("is-live", False)
+    _block(source)
     return BagFeed(source, bag, fps, loop)
 
 
@@ -44,7 +47,7 @@ class BagFeed:
     on_report  called with a line about skipped pictures; playback is in real time. None: pictures are pushed as fast
                as they are consumed, and a picture that would be skipped is an error
 
-    `first` is the stamp of the first picture, ns since 1970; None before it.
+    `first` is the stamp of the first picture, ns since 1970; None before it. `pushed` counts pictures.
     """
 
     def __init__(
@@ -57,11 +60,13 @@ class BagFeed:
     ) -> None:
         self._source, self._bag, self._fps, self._loop, self._on_report = source, bag, fps, loop, on_report
         self.first: int | None = None
+        self.pushed = 0
         self._interval = round(Gst.SECOND / fps)  # between two rounds, ns
         self._shift = 0  # from stamps to running time, ns
         self._last = -1  # running time of the last picture, ns
         self._form: Picture | None = None  # the picture whose size and format the others must have
-        self._skip_reported = False
+        self._skipped = 0  # pictures of this round
+        self._told = False  # of the first skipped picture
         self._waiting = threading.Event()  # never set: the daemon thread itself checks that its pipeline still runs
         self._starting = source.connect("need-data", self._on_need_data)
 
@@ -82,25 +87,33 @@ class BagFeed:
 
     def _play_once(self, bag: Bag) -> bool:
         """Play the bag once; returns False if the pipeline is gone."""
-        began, count = 0, 0
-        for number, picture in enumerate(bag.pictures(self._bag.topic), 1):
-            if number == 1:
-                self._begin(picture)
-            if why := self._mismatch(picture):
-                self._skip(bag, why.format(number))
+        began, count, number = 0, 0, 0
+        for number, picture in enumerate(bag.all_pictures(self._bag.topic, self._bag.depth_m), 1):
+            if why := self._problem(picture, first=not count):
+                self._skip(bag, number, why)
                 continue
-            self._last = picture.ns + self._shift
+            assert isinstance(picture, Picture)
+            if not count:
+                self._begin(picture)
+            self._last = max(picture.ns + self._shift, self._last + 1)
             if not self._push(picture):
                 return False
             began, count = began if count else self._last, count + 1
+        if not count:
+            raise ModelError("topic", bag.names(self._bag.topic), f"none of its {number} pictures can be shown")
         if count > 1:
             self._interval = (self._last - began) // (count - 1)
-        return count > 0
+        self._count_skipped(bag, number)
+        return True
 
     def _begin(self, picture: Picture) -> None:
         """Start a round with this picture."""
         if self._form is None:
             self._form, self.first = picture, picture.ns
+            if picture.format in VIDEO:
+                _block(self._source)  # those that follow need each of them
+            if picture.format in BAYER:
+                accept_bayer(self._source)
             form = caps(picture.format, picture.width, picture.height, self._fps)
             self._source.set_property("caps", Gst.Caps.from_string(form))
             start = self._now() if self._on_report else 0
@@ -108,26 +121,39 @@ class BagFeed:
             start = self._last + self._interval
         self._shift = start - picture.ns
 
-    def _mismatch(self, picture: Picture) -> str | None:
-        """Why a picture cannot follow the previous ones; None: it can."""
-        first = self._form
-        assert first is not None
-        if (picture.width, picture.height) != (first.width, first.height):
-            return f"picture {{}} is {picture.width}x{picture.height}, the first one {first.width}x{first.height}"
-        if picture.format != first.format:
-            return f"picture {{}} is {picture.format}, the first one {first.format}"
-        if picture.ns + self._shift <= self._last:
+    def _problem(self, picture: Picture | BadPicture, first: bool) -> str | None:
+        """Why a picture cannot be shown after the previous ones; None: it can.
+
+        first  of its round
+        """
+        if isinstance(picture, BadPicture):
+            return f"picture {{}}: {picture.why}"
+        form = self._form
+        if form is None:
+            return None
+        is_video = picture.format in VIDEO  # whose decoder follows its size, and which has no picture to spare
+        if not is_video and (picture.width, picture.height) != (form.width, form.height):
+            return f"picture {{}} is {picture.size}, the first one {form.size}"
+        if picture.format != form.format:
+            return f"picture {{}} is {picture.format}, the first one {form.format}"
+        if not is_video and not first and picture.ns + self._shift <= self._last:
             return "picture {} is not later than the one before"
         return None
 
-    def _skip(self, bag: Bag, why: str) -> None:
-        """Report the first skipped picture; raises ModelError if none may be skipped."""
-        where = bag.names(self._bag.topic)
+    def _skip(self, bag: Bag, number: int, why: str) -> None:
+        """Count a skipped picture and report the first one; raises ModelError if none may be skipped."""
+        where, why = bag.names(self._bag.topic), why.format(number)
         if self._on_report is None:
             raise ModelError("topic", where, why)
-        if not self._skip_reported:
-            self._skip_reported = True
+        self._skipped += 1
+        if not self._told:
+            self._told = True
             self._on_report(f"{where}: {why}: such pictures are skipped")
+
+    def _count_skipped(self, bag: Bag, of: int) -> None:
+        """After the first round, report how many pictures were skipped."""
+        if self._skipped and self._on_report and self.pushed + self._skipped == of:
+            self._on_report(f"{bag.names(self._bag.topic)}: {self._skipped} of {of} pictures were skipped")
 
     def _push(self, picture: Picture) -> bool:
         """Push a picture when it is due; returns False if the pipeline is gone."""
@@ -141,6 +167,7 @@ class BagFeed:
                 self._last -= early
         buffer = Gst.Buffer.new_wrapped(picture.data)
         buffer.pts = self._last
+        self.pushed += 1
         return bool(self._source.emit("push-buffer", buffer) == Gst.FlowReturn.OK)
 
     def _now(self) -> int:
@@ -153,9 +180,37 @@ class BagFeed:
         self._source.post_message(Gst.Message.new_error(self._source, error, ""))
 
 
+def _block(source: Gst.Element) -> None:
+    for key, value in BLOCKING.items():
+        source.set_property(key, value)
+
+
+def accept_bayer(source: Gst.Element) -> None:
+    """Let the pictures of an appsrc be Bayer patterns: decodebin itself plugs no element that converts them.
+
+    To be called before the first picture is pushed; has no effect afterwards.
+    """
+    out = source.get_static_pad("src")
+    below = out.get_peer()
+    if below.get_parent_element().get_name() == BAYER_NAME:
+        return
+    convert = Gst.ElementFactory.make("bayer2rgb", BAYER_NAME)
+    if convert is None:
+        error = GLib.Error.new_literal(Gst.CoreError.quark(), NO_BAYER, Gst.CoreError.MISSING_PLUGIN)
+        source.post_message(Gst.Message.new_error(source, error, ""))
+        return
+    source.get_parent().add(convert)
+    out.unlink(below)
+    convert.get_static_pad("src").link(below)
+    convert.sync_state_with_parent()
+    out.link(convert.get_static_pad("sink"))
+
+
 def caps(form: str, width: int, height: int, fps: Fraction) -> str:
     """Caps for a format named as in `Picture`."""
     rate = f"framerate={fps.numerator}/{fps.denominator}"
     if form in ENCODED:
         return f"{ENCODED[form]},{rate}"
+    if form in BAYER:
+        return f"video/x-bayer,format={form},width={width},height={height},{rate}"
     return f"video/x-raw,format={form},width={width},height={height},pixel-aspect-ratio=1/1,{rate}"

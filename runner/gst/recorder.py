@@ -244,5 +244,13 @@ class Recorder:
         """The muxer has written its index, and the file is complete."""
         if self._first == Gst.CLOCK_TIME_NONE:
             self._close(Stage.FAILED, "its source ended before its first frame")
+        elif undecoded := self._undecoded():
+            self._close(Stage.FAILED, f"{undecoded} of its bag's pictures could not be decoded")
         else:
             self._close(Stage.FINISHED)
+
+    def _undecoded(self) -> int:
+        """Pictures of a whole bag that its decoder has left out, as it does with damaged ones."""
+        if not (self._feed and self._rated) or self._finishing or self._end:
+            return 0
+        return int(self._feed.pushed - self._rated[0].get_property("in"))

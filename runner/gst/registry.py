@@ -18,7 +18,7 @@ PACKAGES = {  # elements by Debian package; `doctor` and messages on missing plu
     "gstreamer1.0-plugins-good": "videocrop aspectratiocrop rtph264pay rtph264depay rtpjitterbuffer rtspsrc udpsrc"
     " udpsink v4l2src rtpbin rtpsession jpegdec capssetter qtdemux matroskademux matroskamux vp8enc vp8dec rtpvp8pay"
     " rtpvp8depay",
-    "gstreamer1.0-plugins-bad": "h264parse h265parse mpegtsmux tsdemux openh264enc x265enc srtsrc srtsink"
+    "gstreamer1.0-plugins-bad": "h264parse h265parse mpegtsmux tsdemux openh264enc x265enc srtsrc srtsink bayer2rgb"
     " vah264enc nvh264enc",
     "gstreamer1.0-plugins-ugly": "x264enc",
     "gstreamer1.0-libav": "avdec_h264 avdec_ffv1 avenc_ffv1",

@@ -8,7 +8,8 @@ from fractions import Fraction
 
 from gi.repository import Gst, GstAllocators, GstVideo
 
-from runner.gst.bag_feed import caps
+from runner.bag.pictures import BAYER, SUBSAMPLED
+from runner.gst.bag_feed import accept_bayer, caps
 from runner.ros.cameras import SharedPicture
 from runner.system.kernel_clock import ahead_of
 
@@ -26,9 +27,12 @@ def push_shared(source: Gst.Element | None, picture: SharedPicture, fps: Fractio
     if pts < 0:
         os.close(picture.memory)
         return False
+    assert source is not None
+    if picture.type.format in BAYER:
+        accept_bayer(source)
     form = Gst.Caps.from_string(caps(*picture.type, fps))
     sample = Gst.Sample.new(_buffer(picture, pts), form, None, None)
-    return bool(source.emit("push-sample", sample) == Gst.FlowReturn.OK)  # type: ignore[union-attr]
+    return bool(source.emit("push-sample", sample) == Gst.FlowReturn.OK)
 
 
 def _buffer(picture: SharedPicture, pts: int) -> Gst.Buffer:
@@ -37,8 +41,10 @@ def _buffer(picture: SharedPicture, pts: int) -> Gst.Buffer:
     flags = GstAllocators.FdMemoryFlags.NONE  # the memory closes its descriptor
     buffer.append_memory(GstAllocators.FdAllocator.alloc(allocator, picture.memory, picture.size, flags))
     buffer.pts = pts
-    if picture.step:
-        raw, width, height = picture.type
+    raw, width, height = picture.type
+    if picture.step and raw not in BAYER:  # of which GstVideo knows nothing
         form, none = GstVideo.VideoFormat.from_string(raw), GstVideo.VideoFrameFlags.NONE
-        GstVideo.buffer_add_video_meta_full(buffer, none, form, width, height, 1, [0] * 4, [picture.step, 0, 0, 0])
+        offsets, strides = [0, picture.step * height, 0, 0], [picture.step] * 2 + [0, 0]
+        planes = 2 if raw in SUBSAMPLED else 1
+        GstVideo.buffer_add_video_meta_full(buffer, none, form, width, height, planes, offsets, strides)
     return buffer

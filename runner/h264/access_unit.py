@@ -56,7 +56,7 @@ def read_unit(
     if codec == "h265":
         return None if damaged else _read_h265(data, captured, arrived)
     recovery = None
-    for header, at in _nal_units(data):
+    for header, at in nal_units(data):
         kind = header & 0x1F
         if kind == IDR and damaged:
             grey = grey_idr(data)
@@ -76,7 +76,7 @@ def starts(data: bytes, codec: str) -> tuple[bool, int | None]:
 
 def coded_picture(data: bytes, codec: str) -> bytes:
     """The part of an access unit that codes its picture: without parameter sets, with start codes of three bytes."""
-    for header, at in _nal_units(data):
+    for header, at in nal_units(data):
         if (header >> 1 & 0x3F) in H265_VCL if codec == "h265" else SLICE <= (header & 0x1F) <= IDR:
             return data[at - 1 :].replace(b"\0\0\0\1", b"\0\0\1").rstrip(b"\0")
     return b""
@@ -84,14 +84,14 @@ def coded_picture(data: bytes, codec: str) -> bytes:
 
 def _read_h265(data: bytes, captured: float | None, arrived: float) -> AccessUnit | None:
     """`read_unit` for H.265. Recovery points are ignored: a late viewer waits for the next IRAP picture."""
-    for header, _ in _nal_units(data):
+    for header, _ in nal_units(data):
         kind = header >> 1 & 0x3F
         if kind in H265_VCL:
             return AccessUnit(data, captured, arrived, kind in H265_IRAP)
     return None
 
 
-def _nal_units(data: bytes) -> Iterator[tuple[int, int]]:
+def nal_units(data: bytes) -> Iterator[tuple[int, int]]:
     """First byte of the header of each NAL unit, and the offset after it."""
     at = data.find(b"\0\0\1")
     while 0 <= at < len(data) - 3:

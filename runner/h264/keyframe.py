@@ -11,7 +11,7 @@ from typing import NamedTuple
 NAL_IDR, NAL_SPS, NAL_PPS = 0x65, 0x67, 0x68  # with nal_ref_idc 3
 OWN_PPS = 31  # id of the parameter set generated here; encoders use the lowest ones
 # Profiles whose parameter set contains chroma format and bit depths (7.3.2.1.1).
-_HIGH_PROFILES = frozenset({100, 110, 122, 244, 44, 83, 86, 118, 128, 138, 139, 134, 135})
+HIGH_PROFILES = frozenset({100, 110, 122, 244, 44, 83, 86, 118, 128, 138, 139, 134, 135})
 # CAVLC: ue(3) I_16x16 with DC prediction and nothing coded, ue(0) DC chroma prediction, se(0) QP, no DC coefficients.
 _GREY_MACROBLOCK = "00100111"
 
@@ -50,7 +50,7 @@ def _parse(payload: bytes) -> _Sps | None:
     read = Bits(payload)
     profile = read.u(24) >> 16
     identity = read.ue()
-    if profile in _HIGH_PROFILES:
+    if profile in HIGH_PROFILES:
         chroma_format = read.ue()
         if chroma_format != 1 or read.ue() or read.ue():  # browsers decode 4:2:0 with 8 bits
             return None

@@ -5,15 +5,17 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from mmap import PROT_READ, mmap
+from types import SimpleNamespace
 from typing import NamedTuple
 
-from runner.bag.pictures import SECOND_NS, compressed_form, image_format
+from runner.bag.compressed import compressed_form
+from runner.bag.pictures import SECOND_NS, image_format, must_be_packed, packed_rows
 from runner.core.model import Camera, RosSettings
 from runner.ros.process import Message, NodeProcess
 
 OLD_NS = SECOND_NS  # a stamp that is older, or further in the future than FUTURE_NS, is from another clock
 FUTURE_NS = 20_000_000
-HEAD_BYTES = 65_536  # of a compressed picture, which contain its headers
 RATE_WINDOW_S = 5.0  # over which rates are measured
 ENOUGH = 0.8  # share of the camera's rate
 
@@ -92,7 +94,7 @@ class RosCameras:
         try:
             for stream in self._streams[message["topic"]]:
                 if picture := stream.add(message, memory):
-                    self._push(stream.name, picture.copy())
+                    self._push(stream.name, picture.copy() if picture.memory == memory else picture)
         finally:
             os.close(memory)
 
@@ -114,7 +116,7 @@ class CameraStream:
         self._on_report(self.name, f"{self._camera.topic}: {what}")
 
     def add(self, message: Message, memory: int) -> SharedPicture | None:
-        """The picture of a message; None if it must be left out, which is reported."""
+        """The picture of a message, in its memory or in that of a copy; None if it is left out, which is reported."""
         try:
             kind = _picture_type(message, memory)
         except ValueError as error:
@@ -128,7 +130,10 @@ class CameraStream:
         self._captured = captured
         self._faults.clear()
         self._note_type(kind)
-        return SharedPicture(memory, message["size"], kind, message.get("step", 0), captured, self._untimed)
+        size, step = message["size"], message.get("step", 0)
+        if step and must_be_packed(_raw_form(message)):
+            memory, size, step = _packed(message, memory, self._camera.source.depth_m)
+        return SharedPicture(memory, size, kind, step, captured, self._untimed)
 
     def _leave_out(self, why: str) -> None:
         if why not in self._faults:
@@ -169,11 +174,28 @@ class CameraStream:
 
 def _picture_type(message: Message, memory: int) -> PictureType:
     """raises ValueError with the rule that a picture breaks"""
-    if "encoding" not in message:
-        return PictureType(*compressed_form(os.pread(memory, HEAD_BYTES, 0), message["stated"]))
-    encoding, width, height = message["encoding"], message["width"], message["height"]
-    form = image_format(encoding, width, height, message["step"], message["big"], message["size"])
-    return PictureType(form, width, height)
+    if "encoding" in message:
+        form = _raw_form(message)
+        return PictureType(image_format(form, message["size"]), form.width, form.height)
+    if not message["size"]:
+        raise ValueError("an empty picture")
+    with mmap(memory, message["size"], prot=PROT_READ) as data:
+        return PictureType(*compressed_form(data, message["stated"]))
+
+
+def _raw_form(message: Message) -> SimpleNamespace:
+    """As `RawForm`."""
+    form = {key: message[key] for key in ("encoding", "width", "height", "step")}
+    return SimpleNamespace(**form, is_bigendian=message["big"])
+
+
+def _packed(message: Message, memory: int, depth_m: float) -> tuple[int, int, int]:
+    """A copy with rows that GStreamer reads: its memory, bytes, and bytes from one row to the next."""
+    rows = packed_rows(_raw_form(message), mmap(memory, message["size"], prot=PROT_READ), depth_m)
+    copy = os.memfd_create("picture")
+    with os.fdopen(copy, "wb", closefd=False) as file:
+        file.write(rows.tobytes())
+    return copy, rows.nbytes, rows.shape[1]
 
 
 def _stamp_problem(age: int | None) -> str:

@@ -15,7 +15,7 @@ EXTRAS = {  # top-level modules by extra, as in pyproject.toml
     "vmaf": ("imageio_ffmpeg",),
     "cluster": ("distributed",),
     "mcap": ("foxglove",),
-    "bag": ("rosbags",),
+    "bag": ("rosbags", "mcap"),
     "security": ("cryptography",),
     "metrics": ("prometheus_client",),
 }

@@ -27,7 +27,7 @@ from ros_domain import MARKS, ROS2_PYTHON, SCRIPT, running
 from shared_data import shared
 
 from rig import children_named, free_port, run, streaming, until, watching
-from runner.bag.pictures import FORMATS
+from runner.bag.pictures import ENCODINGS
 from runner.core.commands import Command
 from runner.operator.frames import live_frames
 
@@ -143,7 +143,7 @@ def road():
 def published(tmp_path, encoding, padding, big=False):
     """Settings for a publisher of a road in an encoding, and the RGB that it represents."""
     data, rgb = encoded(road(), encoding)
-    rows = data.reshape(54, -1)
+    rows = data.reshape(len(data), -1)
     if big:
         rows = rows.reshape(54, -1, 2)[..., ::-1].reshape(54, -1)
     rows = np.pad(rows, ((0, 0), (0, padding)))
@@ -159,7 +159,7 @@ def test_pixels_of_each_encoding(ros, tmp_path):
 
     wanted = {}
     with publishing(ros) as publisher:
-        for number, encoding in enumerate(FORMATS):
+        for number, encoding in enumerate(ENCODINGS):
             settings, rgb = published(tmp_path, encoding, padding=number % 4 * 3)
             wanted[encoding] = rgb
             publisher.publish(f"/{encoding}/image", fps=5, **settings)
@@ -252,7 +252,7 @@ def test_faults_of_a_topic_are_reported_once_and_others_continue(ros):
     lines = [line.removeprefix("front: /front/image: ") for line in reported if "/front/image" in line]
     assert [re.sub(r"[0-9.]+ s", "N s", line) for line in calm(lines)] == [
         "pictures are BGR 384x216",
-        f"{unknown}; expected one of {', '.join(FORMATS)}: such pictures are skipped",
+        f"{unknown}; expected one of {', '.join(ENCODINGS)}: such pictures are skipped",
         f"{size}, scaled up to the camera's 384x216; they were BGR 384x216",
         "a stamp is N s old: the latency of these pictures is unknown",
         "pictures are BGR 384x216; they were BGR 192x108",
