@@ -75,6 +75,7 @@ __all__ = [
     "discover",
     "missing_plugins",
     "missing_recorders",
+    "read_again",
     "read_video",
     "run_lanes",
     "versions",
@@ -545,6 +546,13 @@ def read_video(path: Path) -> Iterator[Unit]:
     from runner.gst import video_reader
 
     return video_reader.read_video(path)
+
+
+def read_again(path: Path, interval_s: float, on_warning: Callable[[str], None]) -> Iterator[Unit]:
+    """The same encoded again with key frames, see `runner.gst.encoded_again.read_again`."""
+    from runner.gst import encoded_again
+
+    return encoded_again.read_again(path, interval_s, on_warning)
 
 
 def decode_video(path: Path, width: int, height: int) -> Iterator[tuple[int, LumaPlane]]:

@@ -44,10 +44,11 @@ def missing_recorders(plan: Plan) -> list[str]:
 
 def _missing(elements: Iterable[Element]) -> list[str]:
     names = dict.fromkeys(element.factory for element in elements)
-    return [_why_missing(name) for name in names if name in PACKAGE_OF and Gst.ElementFactory.find(name) is None]
+    return [why_missing(name) for name in names if name in PACKAGE_OF and Gst.ElementFactory.find(name) is None]
 
 
-def _why_missing(name: str) -> str:
+def why_missing(name: str) -> str:
+    """The remedy for a known element that this machine lacks."""
     plugin = HARDWARE.get(name)
     if plugin and Gst.Registry.get().find_plugin(plugin):
         return f"the GStreamer element {name} needs hardware and a driver that its plugin {plugin} does not find here"

@@ -103,7 +103,7 @@ VERBS = {
     "export": Verb(
         "a drive as MCAP or ROS 2 bag",
         "runner.verbs.export",
-        ("output", "format"),
+        ("output", "format", "key_interval_s"),
         DRIVE,
         composes=False,
         choices={"format": ("mcap", "rosbag2")},

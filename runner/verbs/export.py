@@ -1,5 +1,5 @@
-"""usage: tod-runner export DRIVE [format=mcap] [output=FILE.mcap]
-       tod-runner export DRIVE format=rosbag2 [output=DIR]
+"""usage: tod-runner export DRIVE [format=mcap] [output=FILE.mcap] [key_interval_s=N]
+       tod-runner export DRIVE format=rosbag2 [output=DIR] [key_interval_s=N]
 
 Exports a drive as MCAP, for Foxglove and any other MCAP reader, or as a ROS 2 bag. DRIVE is a directory that log=DIR
 wrote; all of its logs (vehicle, operator, link) are exported to DRIVE/drive.mcap, or DRIVE/rosbag2, unless output=
@@ -14,10 +14,14 @@ names another path.
 In a ROS 2 bag positions are sensor_msgs/NavSatFix, video is sensor_msgs/CompressedImage, one access unit per message in
 the format h264 or h265, and everything else is std_msgs/String with the line of JSON.
 
+Video is exported as it was sent, mostly with one key frame, its first. Players that seek, such as Foxglove, need more:
+with key_interval_s=1 pictures are decoded and encoded again in H.264, with a key frame at least every second. Exports
+of either format are read by source=bag.
+
   tod-runner demo log=monday log.video=true
   tod-runner export monday
   tod-runner export monday format=rosbag2
-  tod-runner export monday output=monday.mcap
+  tod-runner export monday output=monday.mcap key_interval_s=1
 """
 
 from __future__ import annotations
@@ -31,6 +35,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from runner.drive.captures import ReadVideo
 from runner.drive.read import Drive, read_drive
 from runner.errors import ArgumentError, RunError, UserError, os_errors_as
 from runner.records import VideoBegan
@@ -56,9 +61,9 @@ def run(arguments: Arguments) -> int:
     for warning in drive.warnings:
         print(warning, file=sys.stderr)
     has_video = any(True for side in drive.sides.values() for _ in side.of(VideoBegan))
-    read_video = streaming().read_video if has_video else _no_video
+    read_video = _reader(arguments) if has_video else _no_video
     with _delayed_progress(f"{output}") as progress:
-        count = WRITERS[form](drive, output, read_video, lambda what: print(what, file=sys.stderr), progress)
+        count = WRITERS[form](drive, output, read_video, _warn, progress)
     size = sum(path.stat().st_size for path in (output.iterdir() if output.is_dir() else [output]))
     print(f"{output}: {count} messages, {size / 1e6:.1f} MB")
     return 0
@@ -79,6 +84,22 @@ def _write_rosbag2(drive: Drive, output: Path, *more: Any) -> int:
 
 
 WRITERS = {"mcap": _write_mcap, "rosbag2": _write_rosbag2}
+
+
+def _reader(arguments: Arguments) -> ReadVideo:
+    """What reads the video: as it was sent, or encoded again."""
+    apply, interval_s = streaming(), arguments.number("key_interval_s")
+    as_sent: ReadVideo = apply.read_video
+    if interval_s is None:
+        return as_sent
+    if interval_s == 0:
+        raise ArgumentError("key_interval_s", repr(arguments.values["key_interval_s"]), "must be above 0")
+    _warn(f"video is encoded again, with a key frame at least every {interval_s:g} s: it is not what was sent")
+    return lambda path: apply.read_again(path, interval_s, _warn)
+
+
+def _warn(what: str) -> None:
+    print(what, file=sys.stderr)
 
 
 def _no_video(_path: Path) -> Iterator[Any]:

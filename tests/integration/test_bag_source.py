@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("rosbags")
 
-from bags import BEGAN_NS, KINDS, camera_bag, compressed, filmed, image, typestore, write_bag
+from bags import BEGAN_NS, KINDS, camera_bag, compressed, filmed, header, image, typestore, write_bag, write_mcap
 from numbered import HEIGHT, WIDTH, encoded, number_of, numbered
 from shared_data import shared
 
@@ -99,6 +99,133 @@ def test_compressed_pictures_are_decoded(tmp_path):
     assert (png == frame[..., ::-1]).all()
     reference = cv2.imdecode(np.frombuffer(files["jpg"], np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
     assert np.abs(jpeg.astype(int) - reference).mean() < 3
+
+
+# --- video ------------------------------------------------------------------------------------------------------------
+
+
+def units(frames, codec, keys="key-int-max=5"):
+    """Access units of frames, without pictures that come later than they are shown."""
+    from runner.gst import Gst
+
+    height, width, _ = frames[0].shape
+    encode = f"{codec.replace('h', 'x')}enc tune=zerolatency speed-preset=superfast bitrate=2000 {keys}"
+    pipeline = Gst.parse_launch(
+        f"appsrc name=in format=time caps=video/x-raw,format=BGR,width={width},height={height},framerate=25/1"
+        f" ! videoconvert ! video/x-raw,format=I420 ! {encode} ! {codec}parse config-interval=-1"
+        f" ! video/x-{codec},stream-format=byte-stream,alignment=au ! appsink name=out sync=false"
+    )
+    pipeline.set_state(Gst.State.PLAYING)
+    for number, frame in enumerate(frames):
+        buffer = Gst.Buffer.new_wrapped(frame.tobytes())
+        buffer.pts = number * 40_000_000
+        pipeline.get_by_name("in").emit("push-buffer", buffer)
+    pipeline.get_by_name("in").emit("end-of-stream")
+    found = []
+    while sample := pipeline.get_by_name("out").emit("try-pull-sample", 20 * Gst.SECOND):
+        found.append(sample.get_buffer().extract_dup(0, sample.get_buffer().get_size()))
+    pipeline.set_state(Gst.State.NULL)
+    assert len(found) == len(frames)
+    return found
+
+
+def video_bag(path, writer, coded, codec):
+    """A bag with these units on /video, as different programs write them."""
+    import base64
+    import json
+
+    from rosbags.typesys import get_types_from_msg
+
+    stamps = [BEGAN_NS + n * 40_000_000 for n in range(len(coded))]
+    if writer == "CompressedImage":
+        messages = [(ns, compressed(STORE, ns, data, codec)) for ns, data in zip(stamps, coded, strict=True)]
+        return write_bag(path, "mcap", {"/video": messages})
+    if writer == "foxglove":
+        import foxglove
+        from foxglove.channels import CompressedVideoChannel
+        from foxglove.messages import CompressedVideo, Timestamp
+
+        context, path = foxglove.Context(), path.with_suffix(".mcap")
+        with foxglove.open_mcap(str(path), context=context):
+            channel = CompressedVideoChannel("/video", context=context)
+            for ns, data in zip(stamps, coded, strict=True):
+                at = Timestamp(*divmod(ns, 10**9))
+                channel.log(CompressedVideo(timestamp=at, frame_id="a", data=data, format=codec), log_time=ns)
+        return path
+    if writer == "json":
+        lines = [
+            {
+                "timestamp": dict(zip(("sec", "nsec"), divmod(ns, 10**9), strict=True)),
+                "data": base64.b64encode(data).decode(),
+                "format": codec,
+            }
+            for ns, data in zip(stamps, coded, strict=True)
+        ]
+        messages = [("/video", ns, json.dumps(line).encode()) for ns, line in zip(stamps, lines, strict=True)]
+        schema = ("foxglove.CompressedVideo", "jsonschema", b"{}")
+        options = {"encodings": {"/video": "json"}, "profile": ""}
+        return write_mcap(path.with_suffix(".mcap"), messages, {"/video": schema}, **options)
+    kind, text, name = {
+        "FFMPEGPacket": (
+            "ffmpeg_image_transport_msgs/msg/FFMPEGPacket",
+            "std_msgs/Header header\nint32 width\nint32 height\nstring encoding\nuint64 pts\nuint8 flags\n"
+            "bool is_bigendian\nuint8[] data",
+            {"h264": "libx264", "h265": "hevc"}[codec],
+        ),
+        "foxglove_msgs": (
+            "foxglove_msgs/msg/CompressedVideo",
+            "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format",
+            codec,
+        ),
+    }[writer]
+    store = typestore("mcap")
+    store.register(get_types_from_msg(text, kind))
+    make, messages = store.types[kind], []
+    for ns, data in zip(stamps, coded, strict=True):
+        bytes_ = np.frombuffer(data, np.uint8)
+        if writer == "FFMPEGPacket":
+            message = make(header(store, ns), 96, 54, name, 0, 0, False, bytes_)
+        else:
+            message = make(store.types["builtin_interfaces/msg/Time"](*divmod(ns, 10**9)), "a", bytes_, name)
+        messages.append(("/video", ns, bytes(store.serialize_cdr(message, kind))))
+    schema = (kind, "ros2msg", store.generate_msgdef(kind, ros_version=2)[0].encode())
+    return write_mcap(path.with_suffix(".mcap"), messages, {"/video": schema})
+
+
+VIDEO_WRITERS = ("CompressedImage", "foxglove", "json", "FFMPEGPacket", "foxglove_msgs")
+
+
+@pytest.mark.parametrize(
+    ("writer", "codec"),
+    [
+        pytest.param(writer, codec, marks=() if codec == "h264" else (pytest.mark.soak, pytest.mark.sources))
+        for codec in ("h264", "h265")
+        for writer in VIDEO_WRITERS
+    ],
+)
+def test_video_of_each_type_is_a_source(tmp_path, writer, codec):
+    if writer == "foxglove":
+        pytest.importorskip("foxglove")
+    frames = road(12)
+    bag = video_bag(tmp_path / "b", writer, units(frames, codec), codec)
+    with Bag(bag) as opened:
+        form = opened.form("/video")
+        assert (form.format, form.width, form.height, form.fps) == (codec, 96, 54, 25)
+    pictures, times = shown(bag, "/video")
+    assert times == [n * 40_000_000 for n in range(12)]
+    for picture, frame in zip(pictures, frames, strict=True):
+        assert np.abs(picture.astype(int) - frame[..., ::-1]).mean() < 6
+
+
+def test_video_that_begins_without_a_key_picture_says_so(tmp_path):
+    coded = units(road(12), "h264")
+    bag = video_bag(tmp_path / "b", "CompressedImage", coded[2:], "h264")
+    times, reported = played(bag, "/video")
+    assert times == [n * 40_000_000 for n in range(7)]  # from the next key picture, the sixth, on
+    assert reported == [
+        f"{bag}: /video: picture 1: a picture of h264 before the first key picture: such pictures are skipped",
+        f"{bag}: /video: 3 of 10 pictures were skipped",
+    ]
 
 
 # --- pictures that cannot be shown ------------------------------------------------------------------------------------

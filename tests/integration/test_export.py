@@ -252,6 +252,60 @@ def test_each_message_is_one_picture_and_keyframes_bring_their_parameters(filmed
     assert 5 in [part[0] & 31 for part in fields(pictures[0].data)[3].split(b"\0\0\1")[1:]]
 
 
+def keys_of(units):
+    """Which access units are key frames."""
+    return [5 in [part[0] & 31 for part in unit.split(b"\0\0\1")[1:]] for unit in units]
+
+
+def test_video_is_encoded_again_with_key_frames(filmed, tmp_path):
+    """Each picture at its own time; over the change of size within a file."""
+    drive, _ = filmed
+    plain, again = tmp_path / "plain.mcap", tmp_path / "again.mcap"
+    assert run("export", str(drive), f"output={plain}").returncode == 0
+    done = run("export", str(drive), f"output={again}", "key_interval_s=0.5")
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.splitlines() == [
+        "video is encoded again, with a key frame at least every 0.5 s: it is not what was sent"
+    ]
+    for topic, (_, _, pictures) in messages(plain).items():
+        if not topic.endswith("/video"):
+            continue
+        _, _, encoded = messages(again)[topic]
+        times = [picture.log_time for picture in pictures]
+        assert [picture.log_time for picture in encoded] == pytest.approx(times, abs=20_000)
+        units = [fields(picture.data)[3] for picture in encoded]
+        keys = [at for at, key in zip(times, keys_of(units), strict=True) if key]
+        gaps = [later - earlier for earlier, later in pairwise([*keys, times[-1]])]
+        frame_ns = max(later - earlier for earlier, later in pairwise(times))
+        assert max(gaps) < 500_000_000 + frame_ns
+        assert len(keys) > sum(keys_of(fields(picture.data)[3] for picture in pictures))
+        written = tmp_path / "again.h264"
+        written.write_bytes(b"".join(units))
+        assert counted(written) == (len(units), len(units))
+
+
+@pytest.mark.parametrize("form", ["mcap", "rosbag2"])
+def test_an_export_is_a_source(filmed, tmp_path, form):
+    """Its video in either format, played as recorded: all pictures, and the position."""
+    from runner.bag import POSITIONS, Bag, PictureForm
+
+    drive, _ = filmed
+    output = tmp_path / ("out.mcap" if form == "mcap" else "out")
+    assert run("export", str(drive), f"output={output}", f"format={form}").returncode == 0
+    with Bag(output) as bag:
+        pictures = list(bag.pictures("/front/video"))
+        found = bag.form("/front/video")
+        assert isinstance(found, PictureForm)
+        assert (found.format, found.width, found.height) == ("h264", 320, 180)
+        assert bag.of(POSITIONS) == []
+    kept = sum(counted(drive / f"video/front.vehicle.{n}.ts")[0] for n in range(2))
+    assert len(pictures) == kept
+    words = ["vehicle=delivery_robot", "source=bag", "~cameras.rear", "~cameras.mast", f"source.bag={output}"]
+    done = run("record", *words, "cameras.front.topic=/front/video", f"output={tmp_path}/rec", timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert f" {kept} frames in " in done.stdout
+
+
 def test_a_video_that_is_missing_or_damaged_is_reported_and_the_rest_exported(filmed, tmp_path):
     drive = tmp_path / "drive"
     shutil.copytree(filmed[0], drive)
