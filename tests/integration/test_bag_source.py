@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import time
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -86,6 +88,47 @@ def test_pixels_of_each_encoding(tmp_path, kind):
             assert np.abs(picture.astype(int) - wanted).max() <= TOLERANCES.get(encoding, 2), encoding
     ((picture,), _) = shown(bag, "/big")
     assert np.abs(picture.astype(int) - encoded(frames[0], "mono16")[1]).max() <= 2
+
+
+@pytest.mark.parametrize("padding", [0, 6])
+def test_a_topic_of_ros_is_converted_as_in_a_bag(padding):
+    """Without ROS: what its node passes on, pushed from shared memory."""
+    from fractions import Fraction
+
+    from runner.configuration.config import configuration
+    from runner.gst import Gst
+    from runner.gst.shared import push_shared
+    from runner.ros.cameras import CameraStream
+
+    (frame,) = road(1)
+    words = [
+        "vehicle=delivery_robot",
+        "source=ros",
+        *(f"cameras.{name}.topic=/a" for name in ("front", "rear", "mast")),
+    ]
+    camera = configuration(words).vehicle().cameras["front"]
+    for encoding in ENCODINGS:
+        data, wanted = encoded(frame, encoding)
+        message = image(STORE, BEGAN_NS, data, encoding, padding)
+        memory = os.memfd_create("picture")
+        os.write(memory, message.data.tobytes())
+        form = {key: getattr(message, key) for key in ("encoding", "width", "height", "step")}
+        reported = []
+        stream = CameraStream(camera, lambda *what: reported.append(what))  # noqa: B023
+        picture = stream.add({"at": 1, "age": 0, "size": len(message.data), "big": False, **form}, memory)
+        assert picture, reported
+        pipeline = Gst.parse_launch(
+            "appsrc name=in format=time is-live=true ! decodebin ! videoconvert ! video/x-raw,format=RGB"
+            " ! appsink name=out sync=false"
+        )
+        pipeline.set_state(Gst.State.PLAYING)
+        assert push_shared(pipeline.get_by_name("in"), replace(picture, captured=time.monotonic_ns()), Fraction(25))
+        sample = pipeline.get_by_name("out").emit("try-pull-sample", 20 * Gst.SECOND)
+        buffer = sample.get_buffer()
+        rows = np.frombuffer(buffer.extract_dup(0, buffer.get_size()), np.uint8).reshape(54, -1)
+        found = rows[:, : 96 * 3].reshape(54, 96, 3)  # RGB passes with the padding of its rows
+        pipeline.set_state(Gst.State.NULL)
+        assert np.abs(found.astype(int) - wanted).max() <= TOLERANCES.get(encoding, 2), encoding
 
 
 def test_compressed_pictures_are_decoded(tmp_path):
