@@ -175,6 +175,18 @@ def test_positions_are_those_with_a_fix(tmp_path, kind):
 # --- files of other writers -------------------------------------------------------------------------------------------
 
 COUNT = 20
+IDL = f"""{"=" * 80}
+IDL: sensor_msgs/msg/Image
+module sensor_msgs {{ module msg {{ struct Image {{
+  std_msgs::msg::Header header; uint32 height; uint32 width; string encoding; uint8 is_bigendian; uint32 step;
+  sequence<uint8> data; }}; }}; }};
+{"=" * 80}
+IDL: std_msgs/msg/Header
+module std_msgs {{ module msg {{ struct Header {{ builtin_interfaces::msg::Time stamp; string frame_id; }}; }}; }};
+{"=" * 80}
+IDL: builtin_interfaces/msg/Time
+module builtin_interfaces {{ module msg {{ struct Time {{ int32 sec; uint32 nanosec; }}; }}; }};
+"""
 QOS = "- history: 1\n  depth: 5\n  reliability: 1\n  durability: 2\n"
 
 
@@ -222,6 +234,22 @@ def test_an_mcap_of_any_writer_is_read_whole_and_in_order(tmp_path, name):
     messages[11:16] = reversed(messages[11:16])
     path = write_mcap(tmp_path / "b.mcap", messages, {"/a": definition(IMAGE)}, **mcap_options(name))
     assert numbers(path) == list(range(COUNT))
+
+
+@pytest.mark.parametrize("form", ["ros1msg", "ros2idl", "none"])
+def test_definitions_of_each_kind_are_read(tmp_path, form):
+    """Of ROS 1 in MCAP, of ROS 2 in IDL, and without one."""
+    store = typestore("ros1" if form == "ros1msg" else "mcap")
+    messages = [("/a", BEGAN_NS + n, image(store, BEGAN_NS + n, PIXELS + n, "mono8")) for n in range(3)]
+    if form == "ros1msg":
+        coded = [(topic, ns, bytes(store.serialize_ros1(m, IMAGE))) for topic, ns, m in messages]
+        schema, encoding = definition(IMAGE, "ros1msg"), "ros1"
+    else:
+        coded = [(topic, ns, packed(m)) for topic, ns, m in messages]
+        schema = (IMAGE, form, IDL.encode()) if form == "ros2idl" else (IMAGE, "", b"")
+        encoding = "cdr"
+    path = write_mcap(tmp_path / "b.mcap", coded, {"/a": schema}, encodings={"/a": encoding}, profile=form[:4])
+    assert numbers(path) == [0, 1, 2]
 
 
 @pytest.mark.parametrize("other", ["jsonschema", "protobuf", "flatbuffer", "", None, "service"])

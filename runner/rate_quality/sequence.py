@@ -17,6 +17,7 @@ from runner.rate_quality.recordings import INDEX
 
 SURVEY_VERSION = 1
 FEWEST_FRAMES = 25
+LOSSY = ("jpeg", "h264", "h265")  # formats of pictures in bags
 ARGUMENT = "sequence"  # of the command line, for messages
 Footage = Path | BagTopic  # a clip, or pictures of a bag
 
@@ -108,7 +109,7 @@ def _bag_form(footage: BagTopic) -> dict[str, Any]:
     except ModelError as error:
         raise ArgumentError(ARGUMENT, str(error.found), error.rule) from None
     size = {"width": form.width, "height": form.height, "fps": form.fps}
-    return {**size, "codec": form.format, "lossless": form.format != "jpeg"}
+    return {**size, "codec": form.format, "lossless": form.format not in LOSSY}
 
 
 def _is_recording(path: Path) -> bool:

@@ -329,6 +329,44 @@ def test_bad_pictures_are_skipped_counted_and_reported_once(tmp_path):
     assert failure(bag, "/a") == f"{bag}: /a: picture 1: an empty picture"
 
 
+def damaged(data, random):
+    """A picture that lost its end, or some of whose bytes changed."""
+    at = random.randrange(len(data))
+    if random.random() < 0.3:
+        return data[:at]
+    return data[:at] + random.randbytes(random.randrange(1, 40)) + data[at + random.randrange(40) :]
+
+
+@pytest.mark.soak
+@pytest.mark.sources
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("kind", ["jpg", "png", "h264", "h265"])
+def test_no_damaged_picture_ends_a_camera(tmp_path, kind, seed):
+    """Whole ones between them are shown; a decoder may leave out what is damaged."""
+    import random
+
+    import cv2
+
+    draw = random.Random(seed)
+    frames = road(30) * 4
+    if kind in ("h264", "h265"):
+        whole = units(frames, kind)
+    else:
+        whole = [cv2.imencode(f".{kind}", frame)[1].tobytes() for frame in frames]
+    wrong = {n: damaged(data, draw) for n, data in enumerate(whole) if draw.random() < 0.25}
+    messages = [
+        (BEGAN_NS + n, compressed(STORE, BEGAN_NS + n * 10_000_000, wrong.get(n, data), kind))
+        for n, data in enumerate(whole)
+    ]
+    times, reported = played(write_bag(tmp_path / "b", "mcap", {"/a": messages}), "/a")
+    assert len(reported) <= 2
+    assert len(times) <= len(whole)
+    if kind in ("jpg", "png"):
+        assert len(times) >= len(whole) - len(wrong)
+    else:
+        assert len(times) > len(whole) / 2
+
+
 # --- a vehicle --------------------------------------------------------------------------------------------------------
 
 
