@@ -133,7 +133,7 @@ def write_metadata(directory: Path, topic: str, kind: str, files: Sequence[str],
     """metadata.yaml as rosbag2 writes it, for files that lie in the directory."""
     document = {
         "version": 5,
-        "storage_identifier": "mcap",
+        "storage_identifier": "",  # as `ros2 bag reindex` left it
         "duration": {"nanoseconds": 10**9},
         "starting_time": {"nanoseconds_since_epoch": BEGAN_NS},
         "message_count": count,

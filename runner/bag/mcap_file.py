@@ -166,7 +166,9 @@ def _records(file: BinaryIO) -> Iterator[tuple[int, int, int]]:
 
 def _chunk_records(file: BinaryIO, at: int) -> list[McapRecord]:
     file.seek(at)
-    return breakup_chunk(Chunk.read(ReadDataStream(file)), validate_crc=True)
+    chunk = Chunk.read(ReadDataStream(file))
+    # Some writers leave an empty one before a message that is larger than a chunk.
+    return breakup_chunk(chunk, validate_crc=True) if chunk.uncompressed_size else []
 
 
 def _channel(index: _Index, number: int) -> Channel:
