@@ -252,6 +252,42 @@ def test_definitions_of_each_kind_are_read(tmp_path, form):
     assert numbers(path) == [0, 1, 2]
 
 
+@pytest.mark.parametrize("encoding", ["protobuf", "json"])
+def test_types_of_foxglove_are_read(tmp_path, encoding):
+    import base64
+    import json
+
+    pixels = bytes(range(6))
+    at = {"sec": BEGAN_NS // 10**9, "nsec": BEGAN_NS % 10**9}
+    if encoding == "protobuf":
+        foxglove = pytest.importorskip("foxglove")
+        from foxglove.channels import LocationFixChannel, RawImageChannel
+        from foxglove.messages import LocationFix, RawImage, Timestamp
+
+        path, context, stamp = tmp_path / "b.mcap", foxglove.Context(), Timestamp(**at)
+        with foxglove.open_mcap(str(path), context=context):
+            image_of = {"width": 2, "height": 1, "encoding": "rgb8", "step": 6, "data": pixels}
+            RawImageChannel("/a", context=context).log(RawImage(timestamp=stamp, **image_of), log_time=BEGAN_NS)
+            fix_of = {"latitude": 48.1, "longitude": 0.0}
+            LocationFixChannel("/gps", context=context).log(LocationFix(timestamp=stamp, **fix_of), log_time=BEGAN_NS)
+    else:
+        image_of = {"width": 2, "height": 1, "encoding": "rgb8", "step": 6, "data": base64.b64encode(pixels).decode()}
+        lines = [
+            ("/a", {"timestamp": at, **image_of}),
+            ("/a", {"timestamp": at, "width": "wide"}),
+            ("/gps", {"timestamp": at, "latitude": 48.1, "longitude": 0}),
+        ]
+        messages = [(topic, BEGAN_NS + n, json.dumps(line).encode()) for n, (topic, line) in enumerate(lines)]
+        schemas = {"/a": ("foxglove.RawImage", "jsonschema", b""), "/gps": ("foxglove.LocationFix", "jsonschema", b"")}
+        path = write_mcap(tmp_path / "b.mcap", messages, schemas, encodings=dict.fromkeys(schemas, "json"))
+    with Bag(path) as opened:
+        picture, *bad = opened.all_pictures("/a")
+        assert (picture.ns, picture.format, picture.size) == (BEGAN_NS, "RGB", "2x1")
+        assert picture.data == pixels + bytes(2)
+        assert [each.why[:20] for each in bad] == ([] if encoding == "protobuf" else ["a damaged message of"])
+        assert list(opened.positions("/gps")) == [(BEGAN_NS, 48.1, 0.0)]
+
+
 @pytest.mark.parametrize("other", ["jsonschema", "protobuf", "flatbuffer", "", None, "service"])
 def test_other_messages_beside_pictures_do_not_matter(tmp_path, other):
     schemas = {"/a": definition(IMAGE), "/other": None if other is None else ("event", other, b"{}" if other else b"")}

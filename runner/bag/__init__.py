@@ -138,6 +138,9 @@ class Bag:
             except ValueError as error:
                 yield BadPicture(number, str(error))
                 continue
+            except AttributeError as error:  # a type of the same name with other fields
+                yield BadPicture(number, f"a message of type {self.topics[topic]} without the field {error.name}")
+                continue
             started = started or picture.key
             if not started:
                 yield BadPicture(number, f"a picture of {picture.format} before the first key picture")
@@ -160,11 +163,13 @@ class Bag:
 
         raises  ModelError, also if there are fewer than two
         """
-        first = list(islice((p for p in self.all_pictures(topic) if isinstance(p, Picture)), SURVEYED))
-        steps = [later.ns - earlier.ns for earlier, later in pairwise(first) if later.ns > earlier.ns]
-        if not steps:
+        shown = (picture for picture in self.all_pictures(topic) if isinstance(picture, Picture))
+        first = next(shown, None)
+        times = [first.ns, *(picture.ns for picture in islice(shown, SURVEYED - 1))] if first else []
+        steps = [later - earlier for earlier, later in pairwise(times) if later > earlier]
+        if first is None or not steps:
             raise ModelError("topic", self.names(topic), "must have two pictures with different times")
-        return PictureForm(first[0].format, first[0].width, first[0].height, _rate(SECOND_NS / median(steps)))
+        return PictureForm(first.format, first.width, first.height, _rate(SECOND_NS / median(steps)))
 
     def names(self, topic: str) -> str:
         """File and topic, for error messages."""
@@ -204,10 +209,13 @@ def check_topic(path: Path, topic: str | None) -> None:
         if topic is None and known:
             raise ModelError("topic", str(path), f"must be given, a topic with pictures: {', '.join(known)}")
         found = bag.find(PICTURES, topic, "pictures")
-        first = list(islice(bag.all_pictures(found), SURVEYED))
-        bad = [picture for picture in first if isinstance(picture, BadPicture)]
-        if len(bad) == len(first):
-            raise ModelError("topic", bag.names(found), f"picture {bad[0].number}: {bad[0].why}")
+        bad: BadPicture | None = None
+        for picture in islice(bag.all_pictures(found), SURVEYED):
+            if isinstance(picture, Picture):
+                return
+            bad = bad or picture
+        assert bad  # a topic of a bag has messages
+        raise ModelError("topic", bag.names(found), f"picture {bad.number}: {bad.why}")
 
 
 def _is_named_like_a_bag(path: Path) -> bool:

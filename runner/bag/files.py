@@ -9,11 +9,11 @@ from functools import partial
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
 
-from runner.bag import ros1_file, sqlite_file
-from runner.bag.storage import Message, Part, Storage, UnreadableError, merged, total
+from runner.bag.ros1_file import Ros1File
+from runner.bag.sqlite_file import SqliteFile
+from runner.bag.storage import MCAP, ROS1, SQLITE, Message, Part, Storage, UnreadableError, merged, total
 
 METADATA = "metadata.yaml"  # makes a directory a ROS 2 bag
-MCAP_MAGIC = b"\x89MCAP0\r\n"
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 
@@ -62,18 +62,18 @@ def files_of(path: Path) -> list[Path]:
 def _opened(path: Path, opened: ExitStack) -> Storage:
     """A file, which is closed with the stack."""
     with path.open("rb") as file:
-        begin = file.read(len(sqlite_file.MAGIC))
+        begin = file.read(max(map(len, (MCAP, SQLITE, ROS1))))
     if begin.startswith(ZSTD_MAGIC):
         return _opened(_unpacked_file(path, Path(opened.enter_context(TemporaryDirectory()))), opened)
     storage: Storage
-    if begin.startswith(MCAP_MAGIC):
+    if begin.startswith(MCAP):
         from runner.bag.mcap_file import McapFile
 
         storage = McapFile(path)
-    elif begin.startswith(sqlite_file.MAGIC):
-        storage = sqlite_file.SqliteFile(path)
-    elif begin.startswith(ros1_file.MAGIC):
-        storage = ros1_file.Ros1File(path)
+    elif begin.startswith(SQLITE):
+        storage = SqliteFile(path)
+    elif begin.startswith(ROS1):
+        storage = Ros1File(path)
     else:
         raise ValueError(f"{path.name} begins like no bag")
     opened.callback(storage.close)

@@ -18,9 +18,8 @@ from mcap.records import Chunk, McapRecord, Schema
 from mcap.records import Message as MessageRecord
 from mcap.stream_reader import breakup_chunk
 
-from runner.bag.storage import Channel, Message, Part, merged, normal, total
+from runner.bag.storage import MCAP, Channel, Message, Part, merged, normal, total
 
-MAGIC = b"\x89MCAP0\r\n"
 HEADER_BYTES = 9  # of a record: its kind and its length
 MESSAGE_HEADER = struct.Struct("<HIQQ")  # channel, sequence, time of recording, time of publication
 
@@ -98,8 +97,8 @@ class McapFile:
 
 def _summarised(file: BinaryIO) -> _Index | None:
     """The index by the file's summary; None if that lacks something, which writers may leave out."""
-    file.seek(-len(MAGIC), 2)
-    if file.read() != MAGIC:
+    file.seek(-len(MCAP), 2)
+    if file.read() != MCAP:
         raise ValueError("it ends without the end of an MCAP file; `mcap recover` saves what it holds")
     file.seek(0)
     summary = SeekingReader(file).get_summary()
@@ -150,7 +149,7 @@ def _records(file: BinaryIO) -> Iterator[tuple[int, int, int]]:
 
     raises  ValueError if the file ends before its footer
     """
-    at = len(MAGIC)
+    at = len(MCAP)
     while True:
         file.seek(at)
         head = file.read(HEADER_BYTES)

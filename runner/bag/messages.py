@@ -47,9 +47,11 @@ def decoder(channel: Channel) -> Decoder:
         case "protobuf" if channel.kind in PROTOBUF:
             fields = PROTOBUF[channel.kind]
             return lambda data: _from_protobuf(data, fields)
-        case "json":
-            return _from_json
-    raise UnreadableError(f"its messages are encoded as {channel.encoding!r}, must be cdr, ros1, protobuf or json")
+        case "json" if channel.kind in PROTOBUF:
+            likes = dict(PROTOBUF[channel.kind].values())
+            return lambda data: _from_json(data, likes)
+    what = f"its messages of type {channel.kind} are encoded as {channel.encoding!r}"
+    raise UnreadableError(f"{what}; known are types of ROS in cdr and ros1, and Foxglove's in protobuf and json")
 
 
 def _ros_decoder(channel: Channel) -> Decoder:
@@ -88,12 +90,17 @@ def _register_idl(store: Any, text: str) -> None:
         store.register(get_types_from_idl(part.partition("\n")[2]))
 
 
-def _from_json(data: bytes) -> Any:
+def _from_json(data: bytes, likes: Mapping[str, Any]) -> Any:
+    """likes: the fields, each with a value of its type; one that is missing has that value"""
     try:
-        message = json.loads(data, object_hook=lambda fields: SimpleNamespace(**fields))
-        if isinstance(getattr(message, "data", None), str):  # bytes in JSON
-            message.data = base64.b64decode(message.data)
-    except ValueError as error:
+        given = json.loads(data)
+        at = given.get("timestamp", {})
+        message = SimpleNamespace(timestamp=SimpleNamespace(**{part: int(at.get(part, 0)) for part in ("sec", "nsec")}))
+        for name, like in likes.items():
+            if name != "timestamp":
+                value = given.get(name, like)
+                setattr(message, name, base64.b64decode(value) if isinstance(like, bytes) else type(like)(value))
+    except (ValueError, TypeError, AttributeError) as error:
         raise ValueError(f"a damaged message of {len(data)} bytes: {error}") from None
     return message
 

@@ -11,8 +11,6 @@ from runner.bag.storage import Channel, Message, total
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
-MAGIC = b"#ROSBAG V"
-
 
 class Ros1File:
     """An open bag of ROS 1, see `Storage`.

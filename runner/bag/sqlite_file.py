@@ -9,7 +9,6 @@ from urllib.parse import quote
 
 from runner.bag.storage import Channel, Message, UnreadableError, normal, total
 
-MAGIC = b"SQLite format 3\0"
 BESIDE = ("-wal", "-journal")  # suffixes of files that a killed recorder leaves; without them messages are missing
 
 

@@ -90,7 +90,7 @@ class BagFeed:
         began, count, number = 0, 0, 0
         for number, picture in enumerate(bag.all_pictures(self._bag.topic, self._bag.depth_m), 1):
             if why := self._problem(picture, first=not count):
-                self._skip(bag, number, why)
+                self._skip(bag, f"picture {number}{why}")
                 continue
             assert isinstance(picture, Picture)
             if not count:
@@ -122,27 +122,27 @@ class BagFeed:
         self._shift = start - picture.ns
 
     def _problem(self, picture: Picture | BadPicture, first: bool) -> str | None:
-        """Why a picture cannot be shown after the previous ones; None: it can.
+        """Why a picture cannot be shown after the previous ones, to follow its number; None: it can.
 
         first  of its round
         """
         if isinstance(picture, BadPicture):
-            return f"picture {{}}: {picture.why}"
+            return f": {picture.why}"
         form = self._form
         if form is None:
             return None
         is_video = picture.format in VIDEO  # whose decoder follows its size, and which has no picture to spare
         if not is_video and (picture.width, picture.height) != (form.width, form.height):
-            return f"picture {{}} is {picture.size}, the first one {form.size}"
+            return f" is {picture.size}, the first one {form.size}"
         if picture.format != form.format:
-            return f"picture {{}} is {picture.format}, the first one {form.format}"
+            return f" is {picture.format}, the first one {form.format}"
         if not is_video and not first and picture.ns + self._shift <= self._last:
-            return "picture {} is not later than the one before"
+            return " is not later than the one before"
         return None
 
-    def _skip(self, bag: Bag, number: int, why: str) -> None:
+    def _skip(self, bag: Bag, why: str) -> None:
         """Count a skipped picture and report the first one; raises ModelError if none may be skipped."""
-        where, why = bag.names(self._bag.topic), why.format(number)
+        where = bag.names(self._bag.topic)
         if self._on_report is None:
             raise ModelError("topic", where, why)
         self._skipped += 1
