@@ -22,7 +22,7 @@ WAIT_NS = 20 * Gst.SECOND  # for the last pictures
 
 
 def read_again(path: Path, interval_s: float, on_warning: Callable[[str], None]) -> Iterator[Unit]:
-    """The pictures of a file encoded in H.264 again, each at its own time, with key frames at most `interval_s` apart.
+    """The pictures of a file encoded in H.264 again, each at its own time, with key frames `interval_s` apart.
 
     on_warning  called with a line if pictures could not be decoded
     raises      RunError as `read_video` does, or if nothing encodes
@@ -54,7 +54,7 @@ def read_again(path: Path, interval_s: float, on_warning: Callable[[str], None])
 
 
 class _Keys:
-    """Requests a key frame whenever the next picture is an interval after the last one."""
+    """Requests a key frame for the first picture, and for each that is an interval later than the last key frame."""
 
     def __init__(self, encoder: Gst.Element, interval_s: float) -> None:
         self._pad, self._interval = encoder.get_static_pad("src"), interval_s * Gst.SECOND

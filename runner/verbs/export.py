@@ -15,7 +15,7 @@ In a ROS 2 bag positions are sensor_msgs/NavSatFix, video is sensor_msgs/Compres
 the format h264 or h265, and everything else is std_msgs/String with the line of JSON.
 
 Video is exported as it was sent, mostly with one key frame, its first. Players that seek, such as Foxglove, need more:
-with key_interval_s=1 pictures are decoded and encoded again in H.264, with a key frame at least every second. Exports
+with key_interval_s=1 pictures are decoded and encoded again in H.264, with a key frame every second. Exports
 of either format are read by source=bag.
 
   tod-runner demo log=monday log.video=true
@@ -94,7 +94,7 @@ def _reader(arguments: Arguments) -> ReadVideo:
         return as_sent
     if interval_s == 0:
         raise ArgumentError("key_interval_s", repr(arguments.values["key_interval_s"]), "must be above 0")
-    _warn(f"video is encoded again, with a key frame at least every {interval_s:g} s: it is not what was sent")
+    _warn(f"video is encoded again, with a key frame every {interval_s:g} s: it is not what was sent")
     return lambda path: apply.read_again(path, interval_s, _warn)
 
 
