@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,8 @@ def file_digest(path: Path) -> str:
 
 
 class Cache:
-    """JSON documents by digest, one small file each, written atomically.
+    """JSON documents by digest, one small file each, written atomically, with a digest of its own: whatever has
+    happened to a file, its content is used only if it is what was stored.
 
     on_warning  called with a line about a file that cannot be used and will be replaced
     """
@@ -38,20 +40,26 @@ class Cache:
     def load(self, key: str) -> dict[str, Any] | None:
         path = self._path(key)
         try:
-            document = json.loads(path.read_text(encoding="utf-8"))
+            stored = json.loads(path.read_text(encoding="utf-8"))
         except FileNotFoundError:
             return None
-        except (ValueError, OSError) as error:
-            self._on_warning(f"{path}: cannot be read ({error}), measured again")
-            return None
-        if not isinstance(document, dict):
-            self._on_warning(f"{path}: is not a cache file, measured again")
-            return None
-        return document
+        except (ValueError, RecursionError, OSError) as error:
+            return self._give_up(path, f"cannot be read ({error})")
+        match stored:
+            case {"digest": found, "document": dict(document)} if found == digest(document):
+                return document
+        return self._give_up(path, "is damaged")
 
     def store(self, key: str, document: Mapping[str, Any]) -> None:
         """raises RunError if it cannot be written"""
-        write_whole(self._path(key), json.dumps(document).encode())
+        content = {"digest": digest(document), "document": document}
+        write_whole(self._path(key), json.dumps(content).encode())
+
+    def _give_up(self, path: Path, why: str) -> None:
+        """Remove a file, so that it is reported once."""
+        self._on_warning(f"{path}: {why}, measured again")
+        with suppress(OSError):
+            path.unlink()
 
     def _path(self, key: str) -> Path:
         return self._directory / f"{key}.json"
@@ -70,8 +78,7 @@ def point_from_json(
     scaling: Fraction, kbps: int, data: Mapping[str, Any], identities: Mapping[str, str]
 ) -> Point | None:
     """The point, if it was scored with all of these metrics."""
-    try:
-        scores = {name: tuple(map(float, data["scores"][identity])) for name, identity in identities.items()}
-        return Point(scaling, kbps, float(data["actual_kbps"]), float(data["encode_ms"]), scores)
-    except (KeyError, TypeError, ValueError):
+    if any(identity not in data["scores"] for identity in identities.values()):
         return None
+    scores = {name: tuple(data["scores"][identity]) for name, identity in identities.items()}
+    return Point(scaling, kbps, data["actual_kbps"], data["encode_ms"], scores)

@@ -15,7 +15,7 @@ from runner.lanes import BAG, FRAMES, LaneSet
 from runner.rate_quality.cache import Cache, digest, file_digest
 from runner.rate_quality.recordings import INDEX
 
-SURVEY_VERSION = 1
+SURVEY_VERSION = 2
 FEWEST_FRAMES = 25
 LOSSY = ("jpeg", "h264", "h265")  # formats of pictures in bags
 ARGUMENT = "sequence"  # of the command line, for messages

@@ -210,6 +210,24 @@ def test_a_cache_file_that_is_cut_in_half_is_reported_and_measured_again(clip, t
     assert points_of(tmp_path) == before
 
 
+@pytest.mark.parametrize("survey", [False, True])
+def test_a_cache_file_with_other_content_is_reported_once_and_measured_again(clip, tmp_path, cache, survey):
+    """It is valid JSON, of the survey of the clip or of one of the points."""
+    words = ("camera=front_center", f"sequence={clip}", f"output={tmp_path}", "plan=full", *TINY)
+    model(*words, cache=cache)
+    before = (tmp_path / "front_center.model.json").read_bytes()
+    files = sorted(Path(cache["XDG_CACHE_HOME"]).rglob("points/*.json"), key=lambda path: path.stat().st_size)
+    damaged = files[0 if survey else -1]
+    damaged.write_text(damaged.read_text().replace('"frames"', '"names"').replace('"scores"', '"stores"'))
+    done = model(*words, cache=cache)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count(f"{damaged}: is damaged, measured again") == 1
+    assert f"({0 if survey else 1} encoded, {4 if survey else 3} known)" in done.stdout
+    assert model(*words, cache=cache).stderr.count("measured again") == 0
+    if survey:
+        assert (tmp_path / "front_center.model.json").read_bytes() == before
+
+
 def points_of(directory: Path) -> list[dict]:
     """All points without their encoding times."""
     document = json.loads((directory / "front_center.model.json").read_text())
