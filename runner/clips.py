@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import hashlib
 import os
+import struct
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 
 from runner.core.model import Camera, ModelError, Pose
 
-RENDERER_VERSION = 2  # increment with every change to pictures or files
+RENDERER_VERSION = 3  # increment with every change to pictures or files
+_DIGEST_BYTES = 32
+_SEAL = struct.pack(">I4s", 8 + _DIGEST_BYTES, b"free")
+_BLOCK_BYTES = 1 << 20
 # A camera without a pose looks ahead from the height of a driver's eyes.
 DRIVER = Pose(0.0, 0.0, 1.5, 0.0, 5.0, 0.0)
 
@@ -67,9 +71,39 @@ def clip_path(view: View, seconds: float, cache: Path) -> Path:
     return cache / f"drive-{digest[:20]}.mp4"
 
 
+def seal(path: Path) -> None:
+    """End a finished MP4 file with its digest, in a box that players skip (ISO/IEC 14496-12, `free`).
+
+    raises  OSError
+    """
+    digest = _digest(path, path.stat().st_size)
+    with path.open("ab") as file:
+        file.write(_SEAL + digest)
+
+
+def is_whole(path: Path) -> bool:
+    """Whether a file exists and is as it was sealed. An older run may have left it cut off, or the disk damaged it."""
+    try:
+        end = path.stat().st_size - len(_SEAL) - _DIGEST_BYTES
+        with path.open("rb") as file:
+            file.seek(max(0, end))
+            return end > 0 and file.read() == _SEAL + _digest(path, end)
+    except OSError:
+        return False
+
+
+def _digest(path: Path, end: int) -> bytes:
+    """Of the bytes of a file before `end`."""
+    digest = hashlib.blake2b(digest_size=_DIGEST_BYTES)
+    with path.open("rb") as file:
+        while block := file.read(min(_BLOCK_BYTES, end - file.tell())):
+            digest.update(block)
+    return digest.digest()
+
+
 def rendered(camera: Camera) -> str | None:
-    """Path of the camera's rendered clip; None if its source renders none or it is not in the cache."""
+    """Path of the camera's rendered clip; None if its source renders none, or it is missing or damaged in the cache."""
     if not camera.source.render:
         return None
     path = clip_path(view(camera), camera.source.render_s, cache_directory())
-    return str(path) if path.exists() else None
+    return str(path) if is_whole(path) else None

@@ -17,7 +17,7 @@ def compile_plans(vehicle: Vehicle) -> list[Plan]:
 
 
 def render_missing(vehicle: Vehicle, progress: Progress) -> None:
-    """Render the clips that are not in the cache yet.
+    """Render the clips that are not in the cache yet, or damaged there.
 
     raises  RunError
     """

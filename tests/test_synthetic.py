@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 
 from runner import clips, synthetic
-from runner.clips import View, clip_path
+from runner.clips import View, clip_path, is_whole, seal
 from runner.core.model import Pose
 from runner.synthetic import render
 
@@ -229,6 +229,36 @@ def test_second_call_does_nothing(cache: tuple[Path, list[tuple[str, float]]], m
     render([TOP, FORWARD], SECONDS, folder, lambda what, share: reports.append((what, share)))
     assert reports == [("drive rendered", 1.0)]
     assert {path: path.stat().st_mtime_ns for path in folder.glob("*.mp4")} == before
+
+
+@pytest.mark.gst
+def test_a_damaged_clip_is_rendered_again_once(
+    world: Path, tmp_path: Path, cache: tuple[Path, list[tuple[str, float]]]
+) -> None:
+    path = clip_path(TOP, SECONDS, tmp_path)
+    whole = (cache[0] / path.name).read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    reports: list[str] = []
+    with built(world):
+        for _ in range(2):
+            render([TOP], SECONDS, tmp_path, lambda what, _: reports.append(what))
+    assert reports.count(f"{path} is damaged, rendered again") == 1
+    assert path.stat().st_size == len(whole)
+    assert decode(path)[1] == decode(cache[0] / path.name)[1]
+
+
+@pytest.mark.parametrize("size", [1, 39, 40, 1000, 3_000_000])
+def test_whatever_changes_in_a_sealed_file_is_noticed(size: int, tmp_path: Path) -> None:
+    path = tmp_path / "clip.mp4"
+    assert not is_whole(path)
+    path.write_bytes(bytes(size))
+    assert not is_whole(path)
+    seal(path)
+    assert is_whole(path)
+    whole = path.read_bytes()
+    for changed in (whole[:-1], whole[1:], whole + b"\0", b"\1" + whole[1:], whole[: size // 2], b""):
+        path.write_bytes(changed)
+        assert not is_whole(path)
 
 
 @pytest.mark.gst

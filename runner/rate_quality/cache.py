@@ -44,11 +44,13 @@ class Cache:
         except FileNotFoundError:
             return None
         except (ValueError, RecursionError, OSError) as error:
-            return self._give_up(path, f"cannot be read ({error})")
+            self._give_up(path, f"cannot be read ({error})")
+            return None
         match stored:
             case {"digest": found, "document": dict(document)} if found == digest(document):
                 return document
-        return self._give_up(path, "is damaged")
+        self._give_up(path, "is damaged")
+        return None
 
     def store(self, key: str, document: Mapping[str, Any]) -> None:
         """raises RunError if it cannot be written"""

@@ -18,7 +18,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
-from runner.clips import View, clip_path
+from runner.clips import View, clip_path, is_whole, seal
 from runner.core.model import Progress
 from runner.system import signals
 from runner.system.extras import how_to_install
@@ -34,7 +34,7 @@ KILLED_S = 1.0  # a killed worker ends within this time, unless it is blocked in
 
 
 def render(views: Sequence[View], seconds: float, cache: Path, progress: Progress) -> None:
-    """Render the clips that are missing from the cache, with one process per core.
+    """Render the clips that are missing from the cache or damaged there, with one process per core.
 
     seconds   length of the drive, at least 4
     progress  called with the current step and the share of all pixels done, from 0 to 1 and never decreasing
@@ -48,7 +48,10 @@ def render(views: Sequence[View], seconds: float, cache: Path, progress: Progres
     _refuse_in_unguarded_script()
     with _only_renderer(cache, progress):
         _remove_unfinished(cache)  # left by a killed run
-        missing = [view for view in dict.fromkeys(views) if not clip_path(view, seconds, cache).exists()]
+        missing = [view for view in dict.fromkeys(views) if not is_whole(clip_path(view, seconds, cache))]
+        for path in (clip_path(view, seconds, cache) for view in missing):
+            if path.exists():
+                progress(f"{path} is damaged, rendered again", 0.0)
         if missing:
             _need_numba()
             _need_space(missing, seconds, cache)
@@ -200,4 +203,5 @@ def _render_clip(view: View, seconds: float, cache: Path, world: Path, report: C
                 report(view.width * view.height * ((number - 1) % every + 1))
 
     write_clip(unfinished, counted(), view.width, view.height, view.fps)
+    seal(unfinished)
     put_in_place(unfinished, clip)
