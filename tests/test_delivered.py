@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runner.drive.captures import SAME_NS, RecordedVideo, UnitTimes, arrivals, matched
+from runner.drive.captures import SAME_NS, RecordedVideo, UnitTimes, arrivals, matched, unfiled
 from runner.drive.delivered import _nearest, _thumbnail, displayed_units
 from runner.h264.access_unit import coded_picture
 
@@ -67,6 +67,15 @@ def test_arrivals_are_found_despite_an_apparent_clock_difference() -> None:
         UnitTimes(ns, ns + 200 * MS) for n, ns in enumerate(captured) if n not in (0, 12)
     ]
     assert arrivals(captured, []) == []
+
+
+def test_pictures_that_arrived_and_are_in_no_file_are_found() -> None:
+    """The clocks seem 40 ms apart; the file lacks a picture, and its end."""
+    log = [UnitTimes(100 * n * MS + 40 * MS, 100 * n * MS + 90 * MS) for n in range(30)]
+    filed = [100 * n * MS for n in range(20) if n != 7]
+    absent = [UnitTimes(100 * n * MS, 100 * n * MS + 90 * MS) for n in (7, *range(20, 30))]
+    assert unfiled(arrivals(filed, log), log) == absent
+    assert unfiled(log, log) == unfiled([], []) == []
 
 
 def test_times_of_a_file_are_those_of_its_last_shift() -> None:

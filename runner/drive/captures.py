@@ -119,3 +119,21 @@ def arrivals(captured: Sequence[int], log: Sequence[UnitTimes]) -> list[UnitTime
             off = nearest.captured - ns
             found.append(UnitTimes(ns, nearest.arrived))
     return found
+
+
+def unfiled(units: Sequence[UnitTimes], log: Sequence[UnitTimes]) -> list[UnitTimes]:
+    """Pictures that arrived according to the log, and are in no file: it was cut off, or the disk was too slow.
+
+    units  of the files, as `arrivals` found them in the log
+    log    in the order of capture
+    """
+    filed = {unit.arrived: unit.captured for unit in units}
+    captured, off, found = [unit.captured for unit in units], 0, []
+    for unit in log:
+        if unit.arrived in filed:
+            off = unit.captured - filed[unit.arrived]
+            continue
+        at = bisect_left(captured, unit.captured - off)
+        if all(abs(ns - unit.captured + off) > SAME_NS for ns in captured[max(0, at - 1) : at + 1]):
+            found.append(UnitTimes(unit.captured - off, unit.arrived))
+    return found

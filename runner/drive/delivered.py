@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from hashlib import blake2b
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -34,6 +35,7 @@ from runner.drive.captures import (
     files,
     matched,
     received,
+    unfiled,
 )
 from runner.drive.quality_file import DeliveredQuality
 from runner.drive.read import Drive, Side
@@ -70,7 +72,8 @@ def measure(
 
     clips       by camera, the clip that its source played; cameras not listed are compared with the stream as sent
     on_progress called a few times a second, from this thread, with the share of the cameras done
-    on_warning  called with a line about each camera that is left out: nothing was received, or files cannot be read
+    on_warning  called with a line about each camera that is left out, since nothing was received or files cannot be
+                read, and about each whose files lack pictures, so that it is scored only where they do not
     """
     vehicle, operator = drive.sides["vehicle"], drive.sides["operator"]
     sent, received_files = files(vehicle), files(operator)
@@ -79,7 +82,7 @@ def measure(
         on_warning(f"{name} is left out: no picture of it was received, so mean and worst are too high")
     videos = _Videos(drive.path, read_video, decode_video)
 
-    def one(name: str) -> DeliveredQuality:
+    def one(name: str) -> tuple[DeliveredQuality, list[str]]:
         return _camera(cameras[name], videos, vehicle, operator, sent[name], received_files[name], clips.get(name))
 
     pool = ThreadPoolExecutor(os.cpu_count())
@@ -90,10 +93,15 @@ def measure(
             wait(work.values(), REPORT_S)
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
+    found: dict[str, DeliveredQuality] = {}
     for name, each in work.items():
         if isinstance(error := each.exception(), RunError):
             on_warning(f"{name} is left out: {error}")
-    return {name: each.result() for name, each in work.items() if not isinstance(each.exception(), RunError)}
+            continue
+        found[name], lacking = each.result()
+        for line in lacking:
+            on_warning(f"{name}: {line}")
+    return found
 
 
 def displayed_units(moments: Sequence[int], units: Sequence[UnitTimes], deadline_ns: int) -> list[int]:
@@ -149,21 +157,31 @@ def _matched(
     videos: _Videos, sent: Sequence[RecordedVideo], received_files: Sequence[RecordedVideo], log: Sequence[UnitTimes]
 ) -> tuple[list[FileTimes], list[FileTimes], list[UnitTimes]]:
     """Files as sent and as received, with capture times by the vehicle, and when each received unit arrived."""
-    exact: list[FileTimes] = []
+    sent_units = [videos.units(file) for file in sent]
+    received_units = [videos.units(file) for file in received_files]
+    _drop_cut_off(sent_units, received_units)
+    exact: list[FileTimes] = [
+        (file, {unit.after: unit.captured for unit in found}) for file, found in zip(sent, sent_units, strict=True)
+    ]
     capture_times: dict[bytes, list[int]] = {}
-    for file in sent:
-        found = videos.units(file)
-        exact.append((file, {unit.after: unit.captured for unit in found}))
-        for unit in found:
-            capture_times.setdefault(unit.coded, []).append(unit.captured)
+    for unit in chain.from_iterable(sent_units):
+        capture_times.setdefault(unit.coded, []).append(unit.captured)
     shown: list[FileTimes] = []
     own: list[int] = []
-    for file in received_files:
-        found = videos.units(file)
+    for file, found in zip(received_files, received_units, strict=True):
         times = list(matched(capture_times, [unit.coded for unit in found], [unit.captured for unit in found]))
         shown.append((file, {unit.after: ns for unit, ns in zip(found, times, strict=True)}))
         own += times
     return exact, shown, arrivals(sorted(own), log)
+
+
+def _drop_cut_off(*sides: Sequence[list[_FileUnit]]) -> None:
+    """Drop the last unit of a file, which may have been cut off, unless the other side has the same."""
+    known = [{unit.coded for units in side for unit in units} for side in sides]
+    for side, other in zip(sides, reversed(known), strict=True):
+        for units in side:
+            if units and units[-1].coded not in other:
+                units.pop()
 
 
 def _camera(
@@ -174,12 +192,18 @@ def _camera(
     sent: Sequence[RecordedVideo],
     received_files: Sequence[RecordedVideo],
     clip: Path | None,
-) -> DeliveredQuality:
-    exact, shown, units = _matched(videos, sent, received_files, received(operator, camera.name))
+) -> tuple[DeliveredQuality, list[str]]:
+    """The quality of one camera, and lines about what its files lack."""
+    log = received(operator, camera.name)
+    exact, shown, units = _matched(videos, sent, received_files, log)
     is_whole = _sends_whole(vehicle, camera)
-    moments = _moments([ns for _, times in exact for ns in times.values()], units, _last_sample_ns(operator), is_whole)
+    captured = [ns for _, times in exact for ns in times.values()]
+    moments = _moments(captured, units, _last_sample_ns(operator), is_whole)
+    absent = set(unfiled(units, log))
+    units = sorted([*units, *absent])
     numbers = displayed_units(moments, units, round(DEADLINE_S * SECOND_NS))
-    pairs = [(moment, units[number].captured) for moment, number in zip(moments, numbers, strict=True) if number >= 0]
+    displayed = [(moment, units[number]) for moment, number in zip(moments, numbers, strict=True) if number >= 0]
+    pairs = [(moment, unit.captured) for moment, unit in displayed if unit not in absent]
     pairs = [(moment, displayed) for moment, displayed in pairs if is_whole(displayed)]
     scene_at = _lookup(_scenes(camera, videos, exact, [moment for moment, _ in pairs], clip))
     size = (camera.width, camera.height)
@@ -189,13 +213,30 @@ def _camera(
             meter.add(number, scene, picture)
     scores = meter.close()
     began = round(vehicle.began.time * SECOND_NS)
+    unknown = [(moment - began) / SECOND_NS for moment, unit in displayed if unit in absent]
+    ends = [(times[-1] - began) / SECOND_NS for times in (captured, [unit.captured for unit in units]) if times]
     stale = [moment - displayed > SAME_NS for moment, displayed in pairs]
-    return DeliveredQuality(
+    found = DeliveredQuality(
         t=tuple((pairs[number][0] - began) / SECOND_NS for number in scores),
         mssim=tuple(scores.values()),
         stale=sum(stale) / len(stale) if stale else 0.0,
         clip=clip is not None,
     )
+    return found, list(_lacking(len(displayed), unknown, *ends))
+
+
+def _lacking(moments: int, unknown: Sequence[float], sent_end: float = 0.0, received_end: float = 0.0) -> Iterator[str]:
+    """What the files lack, in lines.
+
+    unknown                 moments at which a picture was displayed that is in no file, s
+    sent_end, received_end  the last pictures in the vehicle's files, and of those that arrived, s
+    """
+    if unknown:
+        lacks = f"the operator's video lacks pictures that arrived, from {unknown[0]:.1f} to {unknown[-1]:.1f} s"
+        yield f"{lacks}: {len(unknown)} of {moments} moments are left out"
+    if received_end - sent_end > EVERY_S:
+        ends = f"the vehicle's video ends at {sent_end:.1f} s, what arrived at {received_end:.1f} s"
+        yield f"{ends}: scored up to its end"
 
 
 def _displayed(pairs: Sequence[tuple[int, int]], pictures: Iterable[tuple[int, Luma]]) -> Iterator[tuple[int, Luma]]:

@@ -100,6 +100,28 @@ def test_a_camera_whose_file_cannot_be_read_is_left_out(tod, drive, tmp_path):
     assert "front_center is left out: " in result.err
 
 
+@pytest.mark.parametrize(
+    ("side", "said"),
+    [
+        ("operator", "front_center: the operator's video lacks pictures that arrived, from "),
+        ("vehicle", "front_center: the vehicle's video ends at "),
+    ],
+)
+def test_a_file_that_is_cut_off_is_scored_up_to_its_end(tod, drive, tmp_path, side, said):
+    """What came later is not counted as an older picture, and the torn last picture is not compared."""
+    path = tmp_path / side
+    shutil.copytree(drive, path)
+    file = path / "video" / f"front_center.{side}.0.ts"
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    whole = measured(tod, drive)["cameras"]["front_center"]
+    result = tod("quality", str(path))
+    assert said in result.err
+    cut_off = json.loads((path / "quality.json").read_text())["cameras"]["front_center"]
+    assert 2 <= len(cut_off["mssim"]) < len(whole["mssim"])
+    assert cut_off["mssim"] == pytest.approx(whole["mssim"][: len(cut_off["mssim"])], abs=1e-6)
+    assert cut_off["stale"] == 0
+
+
 def test_a_camera_of_which_nothing_was_received_is_reported(tod, drive, tmp_path):
     path = tmp_path / "blind"
     shutil.copytree(drive, path)
