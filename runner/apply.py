@@ -215,6 +215,15 @@ def _captured(pad: Gst.Pad, unit: PassingBuffer) -> float | None:
     return None if unit.pts is None else captured_at(pad, unit.pts)
 
 
+def _with_clip_range(plans: Sequence[Plan]) -> Sequence[Plan]:
+    """The plans, those of full-range clips with the conversion to limited range."""
+    if not any(element.factory == "filesrc" for plan in plans for element in plan.source):
+        return plans
+    from runner.gst import sequence  # cameras need none of it
+
+    return [sequence.with_clip_range(plan) for plan in plans]
+
+
 class VehicleSide:
     """All cameras of the vehicle, streaming. Stores the wanted value of each knob, to set it again after a rebuild.
 
@@ -236,7 +245,7 @@ class VehicleSide:
     ) -> None:
         self._on_report, self._video = on_report, video
         passphrase = keyring.watched_passphrase(lambda what: on_report("keys", what)).get if keyring else None
-        plans = _with_video(plans, video, "vehicle")
+        plans = _with_clip_range(_with_video(plans, video, "vehicle"))
         self._lock = threading.Lock()
         self._wanted: dict[str, dict[str, KnobValue]] = {plan.camera.name: {} for plan in plans}
         self.on_turned: Callable[[], None] = lambda: None
@@ -497,6 +506,7 @@ class RecordingSide:
 
     def __init__(self, plans: Sequence[Plan], files: Mapping[str, Path], duration_s: float | None) -> None:
         self._glib = _Glib()
+        plans = _with_clip_range(plans)
         self._recorders = {p.camera.name: Recorder(p, str(files[p.camera.name]), duration_s) for p in plans}
         self._for_each("starting the recorders", Recorder.start)
 

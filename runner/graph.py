@@ -34,7 +34,14 @@ _PER_FRAME_RATE: dict[str, tuple[str, Callable[[float, float], float]]] = {
     "vbv_frames": ("vbv_ms", lambda frames, fps: 1000 * frames / fps),
 }
 # Without colorimetry, decoders derive it from the picture size: colours would change when a picture is scaled.
-_PICTURE = "pixel-aspect-ratio=1/1,colorimetry=bt709"
+COLORIMETRY = "colorimetry=bt709"
+_PICTURE = f"pixel-aspect-ratio=1/1,{COLORIMETRY}"
+# From luma 0..255 to 16..235, chroma accordingly; videobalance computes 16 + (y - 16) * contrast + 255 * brightness.
+_TO_LIMITED: dict[str, Value] = {
+    "contrast": 219 / 255,
+    "brightness": 16 * 219 / 255**2,
+    "saturation": 224 / 255,
+}
 # Caps of encoded formats that a camera delivers; raw formats are named directly.
 _ENCODED = {"mjpeg": "image/jpeg", "h264": "video/x-h264", "h265": "video/x-h265"}
 SRT_MOST_BYTES = 1316  # of a packet; srtsink cuts longer ones unless its URI states a `payloadsize`
@@ -259,6 +266,20 @@ def turn_elements(camera: Camera, elements: Iterable[Element], knobs: Mapping[st
         for name, key, filled in assignments(camera, knob, value):
             by_element.setdefault(name, {})[key] = filled
     return tuple(replace(e, properties={**e.properties, **by_element.get(e.name, {})}) for e in elements)
+
+
+def to_limited_range(colorimetry: str) -> tuple[Element, ...]:
+    """Elements behind the decoder of a full-range clip, whose names cannot be those of a graph.
+
+    colorimetry  in limited range: videoconvert, which mistakes the range, only sees the result; "": none are needed
+    """
+    if not colorimetry:
+        return ()
+    return (
+        Element("range-stated", "capssetter", {"caps": f"video/x-raw,colorimetry=(string){colorimetry}"}),
+        Element("range-format", "videoconvert", {}),  # videobalance has 8 bits
+        Element("range-limited", "videobalance", _TO_LIMITED),
+    )
 
 
 def launch(elements: Iterable[Element]) -> str:

@@ -99,6 +99,8 @@ class Recorder:
         if not self._feed:  # a bag's feed waits for the queue
             self._queue.connect("overrun", self._on_overrun)
         self._out.add_probe(Gst.PadProbeType.BUFFER, self._on_first_frame)
+        if self._feed and self._duration_s is not None:  # it may pass the end between two looks
+            self._count_down()
         for element in self._rated:
             element.set_property("skip-to-first", True)  # otherwise the first frame is repeated for the time before it
         limit_teardown(self._pipeline)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 
 from gi.repository import GLib, Gst, GstPbutils
 
 from runner.errors import ArgumentError
+from runner.graph import Plan, to_limited_range
 from runner.gst.caps import structure
+from runner.gst.clip_range import full_range
 from runner.system.files import file_problem
 
 TIMEOUT_S = 20
@@ -21,10 +23,11 @@ LOSSLESS = ("video/x-raw", "video/x-huffyuv", "video/x-ffv", "video/x-ffvhuff", 
 class Form:
     """Format of a clip.
 
-    width, height  px
+    width, height  px, upright
     fps            frames per second, as stated by the container
     codec          as GStreamer describes it
     lossless       whether the codec keeps every sample
+    colorimetry    of a full-range clip once it is converted to limited range; "" for any other clip
     """
 
     width: int
@@ -32,6 +35,20 @@ class Form:
     fps: Fraction
     codec: str
     lossless: bool
+    colorimetry: str = ""
+
+
+def with_clip_range(plan: Plan) -> Plan:
+    """The plan of a camera, with the elements that convert its clip if that has full range."""
+    clip = next((Path(str(e.properties["location"])) for e in plan.source if e.factory == "filesrc"), None)
+    at = next((n for n, e in enumerate(plan.source, 1) if e.factory == "decodebin"), None)
+    if clip is None or at is None:
+        return plan
+    try:
+        added = to_limited_range(discover(clip, "clip").colorimetry)
+    except ArgumentError:  # reported when it is played
+        return plan
+    return replace(plan, source=(*plan.source[:at], *added, *plan.source[at:]))
 
 
 def discover(path: Path, where: str) -> Form:
@@ -56,10 +73,20 @@ def discover(path: Path, where: str) -> Form:
     if stream.get_framerate_num() <= 0:
         raise ArgumentError(where, path, "has no frame rate")
     caps = stream.get_caps()
+    sides = stream.get_width(), stream.get_height()
+    width, height = reversed(sides) if _is_on_its_side(stream) else sides
     return Form(
-        width=stream.get_width(),
-        height=stream.get_height(),
+        width=width,
+        height=height,
         fps=Fraction(stream.get_framerate_num(), stream.get_framerate_denom()),
         codec=str(GstPbutils.pb_utils_get_codec_description(caps)),
         lossless=structure(caps).get_name() in LOSSLESS,
+        colorimetry=full_range(str(path), caps),
     )
+
+
+def _is_on_its_side(stream: GstPbutils.DiscovererStreamInfo) -> bool:
+    """Whether the display matrix of a phone's clip turns it by a quarter."""
+    tags = stream.get_tags()
+    found, orientation = tags.get_string(Gst.TAG_IMAGE_ORIENTATION) if tags else (False, None)
+    return bool(found and str(orientation).endswith(("90", "270")))

@@ -15,7 +15,7 @@ from runner.system.files import file_problem
 
 WAIT_NS = 100 * Gst.MSECOND
 SILENT = 100  # consecutive waits without a unit, EOS or error before the file is given up
-_PARSED = {  # by codec, the parser: whole pictures as Annex B, parameter sets with each keyframe
+PARSED = {  # by codec, the parser: whole pictures as Annex B, parameter sets with each keyframe
     codec: f"{codec}parse config-interval=-1 ! capsfilter caps=video/x-{codec},stream-format=byte-stream,alignment=au"
     for codec in ("h264", "h265")
 }
@@ -58,9 +58,9 @@ def read_video(path: Path) -> Iterator[Unit]:
 def _on_stream(_demux: Gst.Element, pad: Gst.Pad, out: Gst.Element) -> None:
     """The demuxer has found the stream: insert the parser for its codec before the sink. Not called per frame."""
     codec = structure(pad.get_current_caps()).get_name().removeprefix("video/x-")
-    if codec not in _PARSED or out.get_static_pad("sink").is_linked():
+    if codec not in PARSED or out.get_static_pad("sink").is_linked():
         return  # no units are output
-    parse = Gst.parse_bin_from_description(_PARSED[codec], True)
+    parse = Gst.parse_bin_from_description(PARSED[codec], True)
     out.get_parent().add(parse)
     parse.link(out)
     pad.link(parse.get_static_pad("sink"))

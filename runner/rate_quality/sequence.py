@@ -11,6 +11,7 @@ from typing import Any
 
 from runner.core.model import BagTopic, Camera, ModelError
 from runner.errors import ArgumentError, RunError
+from runner.graph import COLORIMETRY, launch, to_limited_range
 from runner.lanes import BAG, FRAMES, LaneSet
 from runner.rate_quality.cache import Cache, digest, file_digest
 from runner.rate_quality.recordings import INDEX
@@ -31,6 +32,7 @@ class Sequence:
     fps            frames per second
     lossless       whether its codec keeps every sample
     topic          of the bag; "" for a clip
+    colorimetry    of a full-range clip, in limited range; "" for any other one
     si, ti         spatial and temporal information, the maximum over all frames (ITU-T P.910); si_mean, ti_mean: mean
     """
 
@@ -47,6 +49,7 @@ class Sequence:
     si_mean: float
     ti_mean: float
     topic: str = ""
+    colorimetry: str = ""
 
     @property
     def bag(self) -> BagTopic | None:
@@ -55,19 +58,26 @@ class Sequence:
     @property
     def decode(self) -> str:
         """The pipeline that decodes its frames."""
-        return decoding(self.bag or Path(self.path), self.fps)
+        return decoding(self.bag or Path(self.path), self.fps, self.colorimetry)
 
 
-def decoding(footage: Footage, fps: Fraction) -> str:
-    """The GStreamer pipeline that decodes a clip, or the pictures of a bag, to I420 frames at a constant rate."""
+def decoding(footage: Footage, fps: Fraction, colorimetry: str = "") -> str:
+    """The GStreamer pipeline that decodes a clip, or the pictures of a bag, to I420 frames at a constant rate.
+
+    These are the pictures that conf/source/file.yaml and bag.yaml send, before they are fitted to the camera's size.
+
+    colorimetry  see `Sequence`
+    """
     rate = f"video/x-raw,framerate={fps.numerator}/{fps.denominator}"
-    raw = "videoconvert ! video/x-raw,format=I420"
+    upright = "videoconvert ! videoflip video-direction=auto"
+    parts = [launch(to_limited_range(colorimetry)), upright, f"video/x-raw,format=I420,{COLORIMETRY}"]
+    raw = " ! ".join(filter(None, parts))
     if isinstance(footage, BagTopic):
         begin = f"appsrc name={BAG} format=time max-buffers=2"
     else:
         quoted = str(footage).replace("\\", "\\\\").replace('"', '\\"')
         begin = f'filesrc location="{quoted}"'
-    return f"{begin} ! decodebin ! {raw} ! videorate skip-to-first=true ! {rate}"
+    return f"{begin} ! decodebin force-sw-decoders=true ! {raw} ! videorate skip-to-first=true ! {rate}"
 
 
 def survey(footage: Footage, cache: Cache, on_note: Callable[[str], None]) -> Sequence:
@@ -84,7 +94,9 @@ def survey(footage: Footage, cache: Cache, on_note: Callable[[str], None]) -> Se
     known = cache.load(key)
     if known is None:
         on_note(f"analysing {path} {topic}".rstrip())
-        known = _analyse(whole, properties["fps"])
+        known = _analyse(
+            whole, decoding(whole, properties["fps"], properties.get("colorimetry", "")), properties["fps"]
+        )
         cache.store(key, known)
     sequence = Sequence(path=str(path.resolve()), sha256=sha256, topic=topic, **properties, **known)
     if sequence.frames < FEWEST_FRAMES:
@@ -121,12 +133,12 @@ def _is_recording(path: Path) -> bool:
         return False
 
 
-def _analyse(footage: Footage, fps: Fraction) -> dict[str, Any]:
+def _analyse(footage: Footage, decode: str, fps: Fraction) -> dict[str, Any]:
     from runner.apply import run_lanes
     from runner.rate_quality.siti import SiTi
 
     found = SiTi()
-    line = f"{decoding(footage, fps)} ! identity name={FRAMES} ! fakesink sync=false"
+    line = f"{decode} ! identity name={FRAMES} ! fakesink sync=false"
     bag = footage if isinstance(footage, BagTopic) else None
     try:
         run_lanes(LaneSet(line, fps, (), bag), lambda _, luma: found.add(luma), lambda *_: None, lambda _: None)

@@ -482,6 +482,15 @@ def test_a_bag_is_recorded_picture_by_picture_faster_than_it_plays(tmp_path):
     assert f'"began": {first.ns / 1e9:.2f}' in (tmp_path / "rec" / "recording.json").read_text()
 
 
+def test_a_short_recording_of_a_bag_ends_at_the_right_picture(tmp_path):
+    """Its pictures are read within a few milliseconds, but the recorder looks only ten times a second."""
+    bag = camera_bag(tmp_path / "bag", "mcap", {"/front/image": [np.zeros((96, 96, 3), np.uint8)] * 200}, RATE)
+    words = (*robot(bag, topics=["front"]), "~cameras.rear")
+    done = run("record", *words, f"output={tmp_path}/rec", "duration_s=0.4")
+    assert done.returncode == 0, done.stderr
+    assert ", 6 frames in 0.40 s" in done.stdout
+
+
 def test_a_recording_fails_where_a_picture_would_be_left_out(tmp_path):
     pictures = [numbered(n) if n < 8 else numbered(n)[::2, ::2] for n in range(20)]
     bag = camera_bag(tmp_path / "drive", "mcap", {"/front/image": pictures}, RATE)
