@@ -403,6 +403,14 @@ def test_vmaf_without_the_model(vmaf: Metric, model: str, message: str) -> None:
     assert str(raised.value) == message
 
 
+@pytest.mark.parametrize("model", ["vmaf_v1.0.16_3d0h", "vmaf_v1.0.16_hfr", "vmaf_4k_v2.0.0"])
+def test_vmaf_refuses_models_that_score_more_than_luma(model: str) -> None:
+    rule = "scores chroma and the encoded size, which are not measured: choose one of version 0, such as vmaf_v0.6.1"
+    with pytest.raises(UserError) as raised:
+        find_metric("vmaf", vmaf_model=model)
+    assert str(raised.value) == f"vmaf_model: {model!r}: {rule}"
+
+
 # --- BRISQUE ----------------------------------------------------------------------------------------------------------
 
 

@@ -27,7 +27,9 @@ from runner.system.extras import how_to_install
 TIMEOUT_S = 120.0  # even a busy machine scores a picture faster
 PIPE_BYTES = 1 << 20  # the most that a user may request; fewer, larger writes
 SMALLEST_PX = 32  # libvmaf crashes with 16; newer models need more and report it
-GREY = 128  # chroma, which VMAF ignores
+GREY = 128  # chroma, which models of version 0 ignore
+# Models of version 1 also score chroma, and banding (CAMBI) by the size of the encoding.
+LATER_VERSION = re.compile(r"v[1-9]")
 LOG, STDERR_FILE = "scores.json", "stderr"
 
 
@@ -65,9 +67,17 @@ READER = msgspec.json.Decoder(VmafLog)  # created once: msgspec 0.22 crashes if 
 
 
 def metric(model: str) -> Metric:
-    """VMAF with a model that is built into libvmaf. Raises UserError for an unknown model, RunError without a tool."""
+    """VMAF with a model that is built into libvmaf.
+
+    raises  UserError for an unknown model or one that needs more than luma, RunError without a tool
+    """
     if not re.fullmatch(r"[\w.]+", model):
         raise UserError("", "vmaf_model", repr(model), "must be the name of a model, such as vmaf_v0.6.1")
+    if LATER_VERSION.search(model):
+        rule = (
+            "scores chroma and the encoded size, which are not measured: choose one of version 0, such as vmaf_v0.6.1"
+        )
+        raise UserError("", "vmaf_model", repr(model), rule)
     tool = find_tool()
     return Metric(
         name="vmaf",
