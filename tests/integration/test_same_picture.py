@@ -163,6 +163,7 @@ def test_footage_its_recording_and_the_live_stream_have_the_same_quality(
     kind, footage, frames, tod, tmp_path, monkeypatch
 ):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr("runner.rate_quality.plots.plot", lambda *_: None)
     path, source = footage(kind)
     others = [f"~cameras.{name}" for name in ("front_left", "front_right", "rear_center")]
     others += [f"~cameras.top_{side}" for side in ("front", "left", "right", "rear")]
