@@ -387,10 +387,10 @@ class VehicleSide:
         )
 
     def _look(self) -> None:
-        """Look which frame each camera has sent last."""
+        """Look which pictures of each camera have passed since it looked last."""
         for name in self._wanted:
-            if (pipeline := self._pipeline(name)) and pipeline.sent_frames:
-                pipeline.sent_frames.look()
+            if pipeline := self._pipeline(name):
+                pipeline.look()
 
     def _on_knobs_turned(self) -> None:
         self.on_turned()  # looked up now: it may have been set after the pipeline was built

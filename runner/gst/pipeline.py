@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ from runner.graph import Plan
 from runner.gst.arriving import CAPTURE_ID
 from runner.gst.knobs import KnobPanel
 from runner.gst.probes import BufferProbe, PassingBuffer, TypeProbe
+from runner.gst.rate_limit import RateLimits
 from runner.gst.repeats import RepeatDetector
 from runner.gst.requests import RequestLimit
 from runner.gst.sender_stages import EncoderWatch, SenderStages
@@ -68,6 +70,9 @@ class CameraPipeline:
 
             play_bag(pipeline, plan, plan.bag, on_report)
         self._started = False
+        self._limits = source.limits if source else RateLimits(float(plan.camera.fps))
+        if source is None:
+            self._limits.follow(pipeline)
         self._elements = [pipeline.get_by_name(element.name) for element in plan.vehicle]
         self._encoder = EncoderWatch(self._elements)
         entry = self._elements[0].get_static_pad("sink")
@@ -139,6 +144,12 @@ class CameraPipeline:
 
         self.untimed = picture.untimed
         return push_shared(self._pipeline.get_by_name(self._plan.source[0].name), picture, self._plan.camera.fps)
+
+    def look(self) -> None:
+        """Look what has passed; many times a second, from one thread."""
+        self._limits.look(time.monotonic())
+        if self.sent_frames:
+            self.sent_frames.look()
 
     def counters(self) -> tuple[int, int]:
         """Frames and bytes that the encoder has output so far, counted in C."""

@@ -13,6 +13,7 @@ from runner.gst.aside import HUNG, HUNG_STARTING, change_in_thread, set_state_in
 from runner.gst.credentials import log_in
 from runner.gst.outage import Outage
 from runner.gst.probes import EventProbe, IdleProbe
+from runner.gst.rate_limit import RateLimits
 from runner.gst.rtspsrc import STREAM_ENDED, Opening, handle_stream_end, is_rtsp_client, limit_teardown
 from runner.gst.source import fixed_rate
 from runner.gst.timers import Delayed, later
@@ -37,6 +38,8 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
     Before the first frame nothing is replaced: errors fail the whole pipeline, and the client gets an error.
 
     on_report  called with what happened
+
+    `limits` hold it at the camera's rate.
     """
 
     def __init__(self, plan: Plan, on_report: Callable[[str], None]) -> None:
@@ -46,6 +49,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         self._launch, self._last = launch(plan.source), plan.source[-1].name
         self._on_report = on_report
         self.outage = Outage(on_report)
+        self.limits = RateLimits(float(plan.camera.fps))
         self._opening = Opening()  # of its RTSP client; messages of this bin are handled from the first `add` on
         self._counter = Gst.ElementFactory.make("identity", "source-frames")
         self.add(self._counter)
@@ -204,6 +208,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         limit_teardown(child)
         for element in fixed_rate(child):
             element.set_property("skip-to-first", True)  # otherwise the first frame is repeated for the time before it
+        self.limits.follow(child)
         self.add(child)
         child.link(self._counter)
         self._child = child

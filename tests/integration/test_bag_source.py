@@ -432,6 +432,25 @@ def test_pictures_of_another_size_are_left_out_and_others_continue(tmp_path):
     assert [line for line in reported if "pipeline" not in line and "were skipped" not in line] == [what]
 
 
+@pytest.mark.soak
+@pytest.mark.sources
+@pytest.mark.parametrize("kind", ["ros1", "mcap"])
+def test_after_a_gap_in_a_bag_its_pictures_pass_at_the_camera_s_rate(tmp_path, kind):
+    """30 Hz, shown at 5; three seconds are missing."""
+    store = typestore(kind)
+    stamps = [BEGAN_NS + round(n / 30 * 1e9) for n in (*range(30), *range(120, 210))]
+    pictures = [(ns, image(store, ns, numbered(n), "bgr8")) for n, ns in enumerate(stamps)]
+    bag = write_bag(tmp_path / "drive", kind, {"/front/image": pictures})
+    words = robot(bag, "~cameras.rear", "cameras.front.fps=5", topics=["front"])
+    with streaming(*words, cameras=("front",)) as (side, _, plans, _):
+        send(side, "front")
+        with watching(plans[0]) as front:
+            until(lambda: any(after - before > 2 for before, after in pairwise(front.times)))
+            again, count = front.times[-1], len(front.times)
+            until(lambda: time.monotonic() > again + 2)
+            assert 9 <= len(front.times) - count <= 12
+
+
 def test_a_bag_damaged_further_on_ends_only_its_camera(tmp_path):
     whole = camera_bag(tmp_path / "drive", "ros1", {"/front/image": map(numbered, range(40))}, RATE)
     data = bytearray(whole.read_bytes())
