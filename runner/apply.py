@@ -355,6 +355,11 @@ class VehicleSide:
         pipelines = ((name, self._pipeline(name)) for name in self._wanted)
         return frozenset(name for name, pipeline in pipelines if pipeline and pipeline.untimed)
 
+    def slow(self) -> dict[str, int]:
+        """By camera, the rate of its pictures, Hz, if that has been well below its own for a while."""
+        pipelines = {name: pipeline for name in self._wanted if (pipeline := self._pipeline(name))}
+        return {name: slow for name, pipeline in pipelines.items() if (slow := pipeline.slow_fps)}
+
     def stop(self) -> None:
         def stop() -> None:
             GLib.source_remove(self._looking)

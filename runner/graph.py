@@ -45,6 +45,8 @@ _TO_LIMITED: dict[str, Value] = {
 # Caps of encoded formats that a camera delivers; raw formats are named directly.
 _ENCODED = {"mjpeg": "image/jpeg", "h264": "video/x-h264", "h265": "video/x-h265"}
 SRT_MOST_BYTES = 1316  # of a packet; srtsink cuts longer ones unless its URI states a `payloadsize`
+# Encoders whose rate control goes by the frame rate of their caps, not by the time between pictures: see `assignments`.
+_COUNT_FRAMES = ("x264enc", "x265enc")
 Assignment = tuple[str, str, Value]  # element, property, value
 # Before the encoder of a recording. Frames that find the queue full are dropped and counted, so that a slow encoder or
 # disk never blocks the camera: 128 MB are 42 frames of 1920x1040. `recorded` counts the frames kept.
@@ -241,16 +243,20 @@ def check_video(graph: Graph) -> None:
         raise ModelError("graph.vehicle", None, f"log.video needs one of {', '.join(CODECS)}")
 
 
-def assignments(camera: Camera, knob: str, value: KnobValue) -> list[Assignment]:
+def assignments(camera: Camera, knob: str, value: KnobValue, pace: float = 1.0) -> list[Assignment]:
     """The element properties that turning a knob to a value sets, in the order of the graph.
 
+    pace    the camera's frame rate as a multiple of the one that arrives: so much more is asked of an encoder that
+            counts frames. The length of its buffer stays, since it counts that in frames too
     raises  ModelError if the type of the value does not fit the knob
     """
-    quantities = _quantities(camera, value)
+    of_time, of_frames = _quantities(camera, value), _quantities(camera, value, pace)
+    count_frames = {element.name for element in camera.graph.vehicle if element.factory in _COUNT_FRAMES}
     turned: list[Assignment] = []
     for target in camera.graph.knobs[knob]:
+        quantities = of_frames if target.element in count_frames else of_time
         if PLACEHOLDER.search(target.value) and "width" in quantities:
-            filled: Value = PLACEHOLDER.sub(lambda match: str(quantities[match[1]]), target.value)
+            filled: Value = PLACEHOLDER.sub(lambda match: str(of_time[match[1]]), target.value)
         elif target.value in quantities:
             filled = quantities[target.value]
         else:
@@ -302,12 +308,13 @@ def video_codec(graph: Graph) -> str:
     return next((codec for codec in CODECS if any(codec in factory for factory in factories)), "")
 
 
-def _quantities(camera: Camera, value: KnobValue) -> dict[str, Value]:
+def _quantities(camera: Camera, value: KnobValue, pace: float = 1.0) -> dict[str, Value]:
     """The quantities that a knob's value offers to its targets, by their names in the YAML."""
     if isinstance(value, bool):
         return {"on": value, "off": not value}
     if isinstance(value, int):
-        return {"kbps": value, "bps": value * 1000, **_buffer(camera, value)}
+        bps = round(1000 * value * pace)
+        return {"kbps": max(1, round(bps / 1000)), "bps": bps, **_buffer(camera, value)}
     if isinstance(value, Roi):
         # The crop element sees the native picture; an ROI is relative to the full image inside it.
         native_width, native_height = camera.source_size

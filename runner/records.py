@@ -23,6 +23,7 @@ from runner.core.model import Mode, Roi, plain
 
 Number = int | float
 Json = dict[str, Any]
+SLOW, SLOW_S = 0.7, 2.0  # a camera is slow if it has delivered less than this share of its rate for so long, s
 Applied = Mapping[str, Any]  # by knob, the value read back; empty for a camera without a pipeline
 T = TypeVar("T")
 
@@ -89,19 +90,34 @@ class DecisionMade:
 class CameraState(CameraDecision):
     """The decision for one camera, the values read back as applied, and the fault of its source, if any.
 
-    untimed  True: its source provides no capture times, so latency is unknown; absent otherwise
+    untimed   True: its source provides no capture times, so latency is unknown; absent otherwise
+    slow_fps  rate of its pictures, Hz, while the camera is slow; absent otherwise
     """
 
     weight: Number
     applied: Applied
     fault: str | None = None
     untimed: bool | UnsetType = UNSET
+    slow_fps: int | UnsetType = UNSET
 
     @classmethod
     def at(
-        cls, setting: Setting, weight: Number, applied: Applied, fault: str | None, untimed: bool = False
+        cls,
+        setting: Setting,
+        weight: Number,
+        applied: Applied,
+        fault: str | None,
+        untimed: bool = False,
+        slow_fps: int | None = None,
     ) -> CameraState:
-        return cls(**_decided(setting), weight=weight, applied=applied, fault=fault, untimed=untimed or UNSET)
+        return cls(
+            **_decided(setting),
+            weight=weight,
+            applied=applied,
+            fault=fault,
+            untimed=untimed or UNSET,
+            slow_fps=slow_fps or UNSET,
+        )
 
 
 @dataclass(frozen=True, slots=True)

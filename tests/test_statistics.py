@@ -24,6 +24,7 @@ from runner.drive.statistics import (
     latency,
     per_second,
     rate_curves,
+    slow_time,
     statistics,
 )
 from runner.drive.tables import camera_rows
@@ -159,6 +160,14 @@ def test_a_vehicle_alone_has_no_latency_and_no_losses(tmp_path: Path) -> None:
     assert np.isnan(found.decode.median)
     assert found.share == pytest.approx(1.0, abs=0.05)
     assert found.cameras["front_left"].hz == pytest.approx(40, rel=0.02)
+
+
+@pytest.mark.parametrize(("hz", "expected"), [(10, (18, 10)), (27, (18, 27)), (29, None), (40, None)])
+def test_a_report_says_for_how_long_a_camera_was_slow(hz: float, expected: tuple[float, float] | None) -> None:
+    t = np.arange(0, 20.2, 0.2)
+    sent = Sent(t, np.floor(t * hz + 1e-6), t, t)
+    found = slow_time(replace(camera(400, 0.5), sent=sent, fps=40.0), 20.0)
+    assert found == (expected and pytest.approx(expected, rel=0.05))
 
 
 # --- quality ----------------------------------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from itertools import pairwise
 from typing import Any, NamedTuple, TypeVar
 
@@ -113,12 +114,13 @@ class Sent:
 
 @dataclass(frozen=True, slots=True)
 class CameraSeries:
-    """One camera. received, sent: None where that side has no log."""
+    """One camera. received, sent: None where that side has no log. fps: of the configuration, Hz; nan if unknown."""
 
     name: str
     decided: DecidedSeries
     received: ReceivedSeries | None
     sent: Sent | None
+    fps: float = float("nan")
 
     @property
     def actual(self) -> TimeSeries:
@@ -396,8 +398,17 @@ def _camera(
     received = [(t, line, line.cameras[name]) for t, line in samples if name in line.cameras]
     sent = [(t, line.cameras[name]) for t, line in telemetry if name in line.cameras]
     return CameraSeries(
-        name, _decided(decided, full), _received(received) if received else None, _sent(sent) if sent else None
+        name,
+        _decided(decided, full),
+        _received(received) if received else None,
+        _sent(sent) if sent else None,
+        _fps(described.get("fps"), config.get("fps_max")),
     )
+
+
+def _fps(own: Any, limit: Any) -> float:
+    rates = [float(Fraction(str(rate))) for rate in (own, limit) if rate is not None]
+    return float("nan") if own is None else min(rates)
 
 
 def _decided(decided: Sequence[tuple[float, CameraDecision]], full: int) -> DecidedSeries:

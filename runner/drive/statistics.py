@@ -27,6 +27,7 @@ from runner.drive.series import (
     sending_spans,
     spans,
 )
+from runner.records import SLOW, SLOW_S
 
 FREEZE_GAPS = 30  # gaps over which the mean is taken (W3C webrtc-stats, freezeCount)
 FREEZE_FACTOR = 3.0  # of the mean gap
@@ -264,6 +265,9 @@ def _notes(drive: Series, cameras: Mapping[str, CameraStatistics]) -> Iterable[s
         yield "neither sent nor received video was logged: only decisions are known"
     if drive.positions is None:
         yield "no positions were logged: not drawn on the map"
+    for camera in drive.cameras.values():
+        if slow := slow_time(camera, drive.end):
+            yield f"{camera.name}: {slow[1]:.0f} of {camera.fps:g} Hz for {slow[0]:.0f} s"
     estimated = {name: camera.quality for name, camera in cameras.items() if camera.quality}
     frozen = ", ".join(f"{name} {_percentage(cameras[name].frozen)}" for name in estimated if cameras[name].frozen > 0)
     if frozen:
@@ -286,6 +290,24 @@ def _notes(drive: Series, cameras: Mapping[str, CameraStatistics]) -> Iterable[s
 
 def _percentage(share: float) -> str:
     return f"{share:.0%}" if share >= 0.01 else "<1%"
+
+
+def slow_time(camera: CameraSeries, end: float) -> tuple[float, float] | None:
+    """For how long the camera was slow, s, and the mean rate meanwhile, Hz; None: it was not.
+
+    As the vehicle sent it, else as it was received.
+    """
+    source = camera.sent or camera.received
+    if source is None or not camera.fps > 0:
+        return None
+    t, frames = source.t, source.frames
+    before = np.maximum(np.searchsorted(t, t - SLOW_S, "right") - 1, 0)
+    begin, until = np.array(sending_spans(camera.decided, end)).reshape(-1, 2).T[..., None]
+    sending = ((t[before] >= begin) & (t <= until)).any(0)
+    hz = (frames - frames[before]) / np.maximum(t - t[before], SLOW_S)
+    slow = sending & (t - t[before] >= SLOW_S) & (hz > 0) & (hz < SLOW * camera.fps)
+    seconds = float(np.diff(t, prepend=t[:1])[slow].sum())
+    return (seconds, float(hz[slow].mean())) if seconds >= SLOW_S else None
 
 
 # --- latency and freezes ----------------------------------------------------------------------------------------------

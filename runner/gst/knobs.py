@@ -36,6 +36,7 @@ class KnobPanel:
         self._pending: dict[str, KnobValue] = {}
         self.applied: dict[str, KnobValue] = {}
         self.faults: list[str] = []
+        self._pace = 1.0
         self._between_frames = IdleProbe(self._apply_pending)
 
     def set_now(self, values: Mapping[str, KnobValue]) -> None:
@@ -60,6 +61,19 @@ class KnobPanel:
         # Only a source pad knows whether a frame it has pushed is still being processed downstream.
         above = first.get_static_pad("sink").get_peer()
         self._between_frames.add_to(above)
+
+    @property
+    def pace(self) -> float:
+        """As in `runner.graph.assignments`."""
+        return self._pace
+
+    @pace.setter
+    def pace(self, pace: float) -> None:
+        with self._lock:
+            self._pace = pace
+            bitrate = {**self.applied, **self._pending}.get("bitrate")
+            if bitrate is not None:
+                self.turn({"bitrate": bitrate})
 
     def restart_encoder(self, knob: str) -> None:
         """Set the caps of a knob again with another pixel aspect ratio, which restarts the encoder.
@@ -86,7 +100,7 @@ class KnobPanel:
         self._on_turned()
 
     def _assignments(self, knob: str, value: KnobValue) -> list[Assignment]:
-        return assignments(self._camera, knob, value)
+        return assignments(self._camera, knob, value, self._pace)
 
     def _assign(self, assignment: Assignment) -> str | None:
         """Set one property and read it back; returns the fault, None if there is none."""

@@ -13,6 +13,7 @@ from runner.errors import RunError
 from runner.graph import Plan
 from runner.gst.arriving import CAPTURE_ID
 from runner.gst.knobs import KnobPanel
+from runner.gst.picture_rate import PictureRate
 from runner.gst.probes import BufferProbe, PassingBuffer, TypeProbe
 from runner.gst.rate_limit import RateLimits
 from runner.gst.repeats import RepeatDetector
@@ -73,6 +74,8 @@ class CameraPipeline:
         self._limits = source.limits if source else RateLimits(float(plan.camera.fps))
         if source is None:
             self._limits.follow(pipeline)
+        self._sent = pipeline.get_by_name("sent")  # None: nothing is counted
+        self._rate, self._on_report = PictureRate(float(plan.camera.fps)), on_report
         self._elements = [pipeline.get_by_name(element.name) for element in plan.vehicle]
         self._encoder = EncoderWatch(self._elements)
         entry = self._elements[0].get_static_pad("sink")
@@ -147,14 +150,31 @@ class CameraPipeline:
 
     def look(self) -> None:
         """Look what has passed; many times a second, from one thread."""
-        self._limits.look(time.monotonic())
+        now = time.monotonic()
+        self._limits.look(now)
+        if self._sent:
+            self._look_at_rate(now)
         if self.sent_frames:
             self.sent_frames.look()
 
+    def _look_at_rate(self, now: float) -> None:
+        was_slow = self.slow_fps is not None
+        self._rate.look(now, self.counters()[0])
+        if self._rate.pace != self.knobs.pace:
+            self.knobs.pace = self._rate.pace
+        if (self.slow_fps is not None) != was_slow:
+            rate = f"{float(self._plan.camera.fps):g} Hz"
+            self._on_report(f"{rate} again" if was_slow else f"{self.slow_fps} of {rate}")
+
+    @property
+    def slow_fps(self) -> int | None:
+        """The rate of its pictures, Hz, if that has been well below the camera's for a while; else None."""
+        slow = self._rate.slow_fps
+        return None if slow is None else max(1, round(slow))
+
     def counters(self) -> tuple[int, int]:
         """Frames and bytes that the encoder has output so far, counted in C."""
-        sent = self._pipeline.get_by_name("sent")
-        return passed_counts(sent) if sent else (0, 0)
+        return passed_counts(self._sent) if self._sent else (0, 0)
 
     @property
     def frame_s(self) -> float:
@@ -176,8 +196,8 @@ class CameraPipeline:
                 self.knobs.restart_encoder("size")
             case "event":
                 event = GstVideo.video_event_new_upstream_force_key_unit(Gst.CLOCK_TIME_NONE, True, 0)
-                if sent := self._pipeline.get_by_name("sent"):
-                    sent.get_static_pad("sink").push_event(event)
+                if self._sent:
+                    self._sent.get_static_pad("sink").push_event(event)
 
     def stages(self) -> SenderStages | None:
         """How long the last sampled picture took to leave the encoder; a few times a second, from one thread.

@@ -81,6 +81,7 @@ class Applier(Protocol):
     def faults(self) -> list[str]: ...
     def sources(self) -> Mapping[str, str]: ...
     def untimed(self) -> Collection[str]: ...
+    def slow(self) -> Mapping[str, int]: ...
     def stages(self) -> Mapping[str, tuple[float, float]]: ...
     def sent_frames(self) -> Mapping[str, Iterable[SentFrame]]: ...
     def copies(self) -> Mapping[str, int]: ...
@@ -522,10 +523,15 @@ class ControlLoop:
 
     def _state(self, applied: Mapping[str, KnobValues]) -> VehicleState:
         decision, weights = self._run.decision, self._run.state.weights
-        faults, untimed = self.applier.sources(), self.applier.untimed()
+        faults, untimed, slow = self.applier.sources(), self.applier.untimed(), self.applier.slow()
         cameras = {
             name: CameraState.at(
-                setting, plain(weights[name]), applied_to_json(name, applied[name]), faults.get(name), name in untimed
+                setting,
+                plain(weights[name]),
+                applied_to_json(name, applied[name]),
+                faults.get(name),
+                name in untimed,
+                slow.get(name),
             )
             for name, setting in decision.settings.items()
         }

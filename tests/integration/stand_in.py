@@ -69,6 +69,9 @@ class RecordingVehicle:
     def untimed(self) -> frozenset[str]:
         return frozenset()
 
+    def slow(self) -> dict[str, int]:
+        return {}
+
     def stages(self) -> dict[str, tuple[float, float]]:
         return {}
 

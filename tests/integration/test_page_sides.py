@@ -268,6 +268,31 @@ def test_a_source_that_repeats_its_picture_is_shown_as_frozen(chromium):
         until(lambda: {camera["status"] for camera in measure(page).values()} == {"frozen"})  # "lost" on a busy machine
 
 
+def test_a_camera_that_delivers_too_few_pictures_says_so_and_stays_live(chromium):
+    """As in the dark, when automatic exposure halves the rate: no alarm, and nothing is wrong with the stream."""
+    raw = "video/x-raw,format=I420,width={width},height={height},colorimetry=bt709"
+    slow = [
+        "{name: source, element: videotestsrc, properties: {is-live: true, pattern: ball}}",
+        f"{{name: dark, element: capsfilter, properties: {{caps: '{raw},framerate=4/1'}}}}",
+        "{name: states, element: capssetter, properties: {caps: 'video/x-raw,framerate={framerate}'}}",
+        "{name: raw, element: capsfilter, properties: {caps: '{raw_caps}'}}",
+    ]
+    elements = f"cameras.rear.source.elements=[{', '.join(slow)}]"
+    with (
+        sides() as (url, vehicle, _),
+        vehicle("+source@cameras.rear.source=test", elements),
+        opened(chromium, url) as page,
+    ):
+        until(lambda: measure(page)["rear"]["note"] == "4 of 15 Hz")
+        seen = [measure(page) for _ in range(20)]
+        assert {each["rear"]["status"] for each in seen} == {"live"}
+        assert {each["front"]["note"] for each in seen} == {""}
+        assert re.match(r"[345] of 15 fps", page.locator("[data-camera=rear] .rates").inner_text())
+        shot(page, "slow camera")
+        page.keyboard.press("v")
+        shot(page, "slow camera driving")
+
+
 def _own_address():
     """An address at which other machines may reach this one."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:

@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-import { alarmText, judge } from "../../runner/page/static/status.js";
+import { alarmText, judge, slowText } from "../../runner/page/static/status.js";
 
 const NOW = 100_000;
 const LIMITS = { frozen_ms: 120 };
@@ -63,4 +63,12 @@ test("alarms state how long and how late", () => {
   assert.equal(alarmText("lost", 1e9, NaN), "LOST");
   assert.equal(alarmText("unsupported", 0, NaN), "NO PICTURE");
   assert.equal(alarmText("synchronising", 0, NaN), "SYNCHRONISING");
+});
+
+test("a camera of a low rate is live between its pictures, and says its rate", () => {
+  const between = { arrived: NOW - 240, decoded: NOW - 235 };
+  assert.equal(judged(between), "frozen");
+  assert.equal(judged({ ...between, fps: 4 }), "live");
+  assert.equal(slowText(12, 40), "12 of 40 Hz");
+  assert.equal(slowText(12, 30000 / 1001), "12 of 29.97 Hz");
 });

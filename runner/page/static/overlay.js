@@ -41,6 +41,27 @@ function drawStatus(context, { width, height }, status, text) {
   drawLabel(context, width, height / 2, side * 0.13, text, "#2b333c", "#e6ebf0");
 }
 
+/**
+ * Draw a note into the lower right corner: no alarm, so that it neither covers nor colours the picture.
+ * @param {OffscreenCanvasRenderingContext2D} context
+ * @param {{x: number, y: number, width: number, height: number}} area the part of the canvas that is on the screen
+ * @param {boolean} mirrored whether the canvas is mirrored
+ * @param {string} text
+ */
+export function drawNote(context, area, mirrored, text) {
+  readably(context, area, mirrored, () => {
+    const size = Math.max(10, Math.round(Math.min(area.width, area.height) * 0.07));
+    context.font = `600 ${size}px system-ui, "DejaVu Sans", sans-serif`;
+    context.textAlign = "end";
+    context.textBaseline = "middle";
+    const wide = context.measureText(text).width + size;
+    context.fillStyle = "rgba(43,51,60,0.8)";
+    context.fillRect(area.width - wide, area.height - 1.6 * size, wide, 1.6 * size);
+    context.fillStyle = "#e6ebf0";
+    context.fillText(text, area.width - size / 2, area.height - 0.75 * size);
+  });
+}
+
 function drawAlarm(context, width, height, side, status, text) {
   dim(context, width, height, 0.5);
   if (status === "frozen") hatch(context, width, height, side);

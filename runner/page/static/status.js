@@ -51,6 +51,9 @@ const synchronisedAfter = (wave_s) => Math.min(2000 * (wave_s ?? WAVE_S) + DECOD
 /** How long a picture may stand until it is frozen, ms. @param {{frozen_ms: number}} limits  @param {number} fps */
 export const frozenAfter = (limits, fps) => Math.max(limits.frozen_ms, (INTERVALS * 1000) / fps);
 
+/** The text of a note: "12 of 40 Hz". @param {number} slow_fps  @param {number} fps */
+export const slowText = (slow_fps, fps) => `${slow_fps} of ${Math.round(100 * fps) / 100} Hz`;
+
 /**
  * The text of an alarm: "FROZEN 0.4 s", "LATE 310 ms", "LOST 3 s".
  * @param {string} status

@@ -50,6 +50,7 @@ let sampledAt = -Infinity; // page time of the last sample
  * @property {number} weight
  * @property {string} reason
  * @property {string} [fault]
+ * @property {number} [slow_fps]
  * @property {Applied} applied
  * @typedef {{online: boolean, mode: string, total_kbps: number, asked_kbps?: number|null, cameras: Record<string, Decision>, operator?: string}} State operator: the one that the
  *   vehicle has in control

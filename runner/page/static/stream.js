@@ -8,8 +8,8 @@ import { Pace } from "./pace.js";
 import { hasGpu, paintImage, pictureOf } from "./picture.js";
 import { ESTIMATED, GuideLines, labelPicture } from "./guide_lines.js";
 import { resize } from "./resizing.js";
-import { alarmText, frozenAfter, INTERVALS, judge, MOVING, STALLED } from "./status.js";
-import { drawOverlay, readably } from "./overlay.js";
+import { alarmText, frozenAfter, INTERVALS, judge, MOVING, slowText, STALLED } from "./status.js";
+import { drawNote, drawOverlay, readably } from "./overlay.js";
 import { straightOptics } from "./straight.js";
 import { StraightView } from "./straight_view.js";
 import { FILLS } from "./warp.js";
@@ -87,6 +87,8 @@ export class Stream {
     this.transit = null; // usual time from the station to this page
     this.on = this.sending = null;
     /** @type {number|null} */
+    this.slow_fps = null; // what the camera delivers, if well below its rate
+    /** @type {number|null} */
     this.failed_at = null; // when the source failed: it may repeat old pictures as new
     this.status = this.reported = "synchronising";
     this.isResizeDue = false; // whether the canvas keeps an old size for now
@@ -122,9 +124,9 @@ export class Stream {
 
   /** The vehicle's decision about this camera. */
   onDecision(decision) {
-    const { on, sending, fault } = decision;
+    const { on, sending, fault, slow_fps = null } = decision;
     const begins = on && sending && (this.on === false || this.sending === false);
-    Object.assign(this, { on, sending });
+    Object.assign(this, { on, sending, slow_fps });
     this.failed_at = fault ? (this.failed_at ?? now()) : null;
     if (begins) this.resetTimes();
     this.updateRegion(decision);
@@ -500,7 +502,7 @@ export class Stream {
     const { on, sending, refused, stood_since, waits_since, damaged, arrived, decoded, late_until } = this;
     const [faulty, isAbove] = [this.failed_at !== null, this.isOnlyInBirdseye];
     const drawn = this.drawn && (!isAbove || this.composed_at > -Infinity);
-    const fps = Math.min(this.camera.fps, this.straight?.warp.fps ?? Infinity, isAbove ? this.composed_fps : Infinity);
+    const fps = Math.min(this.slow_fps ?? this.camera.fps, this.straight?.warp.fps ?? Infinity, isAbove ? this.composed_fps : Infinity);
     const { wave_s } = this.camera;
     return { connected, online, on, sending, refused, drawn, stood_since, waits_since, wave_s, damaged, faulty, arrived, decoded, late_until, fps };
   }
@@ -516,8 +518,7 @@ export class Stream {
     const time = now();
     this.status = judge(this.times(), this.station.limits, time);
     if (!WAITING.includes(this.status)) this.waits_since = time;
-    const text = this.overlayText(time);
-    if (this.context && text !== this.painted_text) this.paint(time);
+    if (this.context && this.textsOver(time) !== this.painted_text) this.paint(time);
     const changed = this.status !== this.reported;
     this.reported = this.status;
     return changed;
@@ -526,6 +527,16 @@ export class Stream {
   /** Draw what waits for a canvas of another size. */
   drawResized() {
     if (this.isResizeDue) this.paint(now());
+  }
+
+  /** All that is written over the picture. */
+  textsOver(time) {
+    return [this.overlayText(time), this.slowText()].filter(Boolean).join("\n");
+  }
+
+  /** That a moving picture has fewer frames than the camera should deliver: nothing is wrong with the stream. */
+  slowText() {
+    return this.slow_fps && MOVING.includes(this.status) ? slowText(this.slow_fps, this.camera.fps) : "";
   }
 
   overlayText(time) {
@@ -549,8 +560,9 @@ export class Stream {
     else blank(context);
     this.drawGuides(context, canvas);
     this.labelEstimate(context, canvas);
+    if (this.slowText()) drawNote(context, this.visibleArea(canvas), this.display.view.mirrored, this.slowText());
     if (text) drawOverlay(context, this.visibleArea(canvas), this.display.view.mirrored, this.status, text);
-    this.painted_text = text;
+    this.painted_text = this.textsOver(time);
     this.reportMark(this.isLateToo(time) ? "damaged late" : this.status);
   }
 
@@ -619,6 +631,7 @@ export class Stream {
     const picture = this.shown?.picture;
     return {
       status: this.status,
+      note: this.slowText(),
       ...this.counts,
       error: this.error,
       straight: Boolean(this.straight && this.shown?.image && this.painted_text !== null),

@@ -297,7 +297,8 @@ function refreshCaption(name, { rates, form, reason }) {
   const kbps = [sample?.kbps, now?.kbps, now?.demand_kbps].map(whole).join(`${THIN}/${THIN}`);
   const repair = sample?.buffer_ms ? `; the jitter buffer waits up to ${sample.buffer_ms} ms for retransmissions` : "";
   const shape = `${size(sample?.width, sample?.height)} · ×${factor(now?.scaling)}`;
-  caption(rates, bitrate, `${whole(sample?.fps)} fps · ${kbps} kbit/s`, "frames per second · kbit/s: actual / allocated / demand");
+  const of = now?.slow_fps && !isSilent ? ` of ${whole(camera(name)?.fps)}` : "";
+  caption(rates, bitrate, `${whole(sample?.fps)}${of} fps · ${kbps} kbit/s`, "frames per second · kbit/s: actual / allocated / demand");
   const lost = sample?.lost ? ` · ${sample.lost} lost` : "";
   const wire = `${whole(sample?.lost)} packets lost, receiver rebuilt ${whole(sample?.rebuilt)} times`;
   caption(form, region, `${shape} · ${latency(age_ms, bound_ms)}${lost}`, `received size · scaling factor · latency from capture to drawing ± error bound; ${wire}${repair}`);

@@ -1,0 +1,94 @@
+"""Cameras that deliver fewer pictures than they should: the encoder still uses its bitrate, and the driver is told."""
+
+from __future__ import annotations
+
+import threading
+import time
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from rig import SMALL_ROBOT, streaming, until, watching
+from runner.core.commands import Command
+
+WIDTH, HEIGHT, KBPS = 424, 240, 1000
+WORDS = (*SMALL_ROBOT, "source=appsrc", "cameras.rear.fps=40")
+
+
+class Feed:
+    """Pushes different noisy pictures at a rate that may change; 0: none.
+
+    noise  its amplitude: of 255 no encoder makes little
+    """
+
+    def __init__(self, side, hz, noise=255):
+        chance = np.random.default_rng(1)
+        bands = (np.arange(2 * WIDTH) // 9 * 29 % 190).astype(np.uint8)
+        self._noise = bands % (256 - noise) + chance.integers(
+            0, noise + 1, (HEIGHT * 3 // 2, 2 * WIDTH), dtype=np.uint8
+        )
+        self._side, self.hz = side, hz
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self):
+        number, due = 0, time.monotonic()
+        while not self._ended.is_set():
+            if not self.hz:
+                due = time.monotonic() + 0.01
+                time.sleep(0.01)
+                continue
+            number += 7
+            self._side.push("rear", np.ascontiguousarray(self._noise[:, number % WIDTH :][:, :WIDTH]))
+            due = max(due + 1 / self.hz, time.monotonic() - 0.1)
+            time.sleep(max(0, due - time.monotonic()))
+
+    def end(self):
+        self._ended.set()
+        self._thread.join()
+
+
+@contextmanager
+def fed(hz, *words, noise=255):
+    with streaming(*WORDS, *words, cameras=("rear",)) as (side, _, (plan,), reported):
+        knobs = {"sending": True, "size": (WIDTH, HEIGHT), "bitrate": KBPS}
+        side.turn([Command("rear", knob, value) for knob, value in knobs.items()])
+        feed = Feed(side, hz, noise)
+        try:
+            with watching(plan) as client:
+                until(lambda: client.frames_with_retry() > 3)
+                yield side, feed, client, reported
+        finally:
+            feed.end()
+
+
+def kbps(side, seconds):
+    began, (_, before) = time.monotonic(), side.sent()["rear"]
+    time.sleep(seconds)
+    (_, after) = side.sent()["rear"]
+    return 8 * (after - before) / (time.monotonic() - began) / 1000
+
+
+@pytest.mark.parametrize(
+    "graph", ["openh264_rtsp", pytest.param("h264_rtsp", marks=[pytest.mark.soak, pytest.mark.sources])]
+)
+def test_after_a_pause_the_encoder_makes_up_for_nothing(graph):
+    """OpenH264 would, with 2 to 4 times its bitrate for a second."""
+    with fed(25, f"graph={graph}", "cameras.rear.fps=25", noise=12) as (side, feed, _, _):
+        time.sleep(1)
+        feed.hz = 0
+        time.sleep(3)
+        feed.hz = 25
+        assert kbps(side, 1) <= 1.15 * KBPS
+
+
+def test_a_camera_at_a_quarter_of_its_rate_gets_its_bitrate_and_is_named():
+    with fed(10) as (side, feed, _, reported):
+        until(lambda: "rear: 10 of 40 Hz" in reported)
+        assert kbps(side, 1.5) == pytest.approx(KBPS, rel=0.1)
+        feed.hz = 40
+        until(lambda: "rear: 40 Hz again" in reported)
+        assert kbps(side, 1) == pytest.approx(KBPS, rel=0.25)
+    assert [line for line in reported if "Hz" in line] == ["rear: 10 of 40 Hz", "rear: 40 Hz again"]
