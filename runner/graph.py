@@ -47,6 +47,8 @@ _ENCODED = {"mjpeg": "image/jpeg", "h264": "video/x-h264", "h265": "video/x-h265
 SRT_MOST_BYTES = 1316  # of a packet; srtsink cuts longer ones unless its URI states a `payloadsize`
 # Encoders whose rate control goes by the frame rate of their caps, not by the time between pictures: see `assignments`.
 _COUNT_FRAMES = ("x264enc", "x265enc")
+# Encoders whose rate control makes up for time without pictures, by pictures that are too large.
+_SAVE_UP = ("openh264enc",)
 Assignment = tuple[str, str, Value]  # element, property, value
 # Before the encoder of a recording. Frames that find the queue full are dropped and counted, so that a slow encoder or
 # disk never blocks the camera: 128 MB are 42 frames of 1920x1040. `recorded` counts the frames kept.
@@ -263,6 +265,12 @@ def assignments(camera: Camera, knob: str, value: KnobValue, pace: float = 1.0) 
             raise ModelError(f"graph.knobs.{knob}", repr(target.value), f"{knob} offers {', '.join(quantities)}")
         turned.append((target.element, target.property, filled))
     return turned
+
+
+def is_restarted_after_gaps(graph: Graph) -> bool:
+    """Whether the encoder must begin anew after a time without pictures, and does so with new caps."""
+    saves_up = any(element.factory in _SAVE_UP for element in graph.vehicle)
+    return saves_up and {target.property for target in graph.knobs["size"]} == {"caps"}
 
 
 def turn_elements(camera: Camera, elements: Iterable[Element], knobs: Mapping[str, KnobValue]) -> tuple[Element, ...]:

@@ -27,7 +27,7 @@ class PictureRate:
 
     def __init__(self, fps: float) -> None:
         self._fps = fps
-        self._counted = 0
+        self._counted, self._last = 0, 0.0
         self._allowance = Allowance()
         self._forget()
 
@@ -37,6 +37,10 @@ class PictureRate:
         self._seen: deque[tuple[float, int]] = deque()  # when a number of pictures was first counted
         self._slow_since: float | None = None
         self._risen = 0.0  # when the rate was last seen to rise
+
+    def silent_s(self, now: float) -> float:
+        """Time since the last picture, s; 0 before the first."""
+        return now - self._last if self._last else 0.0
 
     def look(self, now: float, count: int) -> None:
         """Many times a second, from one thread.
@@ -51,6 +55,7 @@ class PictureRate:
         if self._allowance.is_exceeded(now, new, self._fps / self.pace) and self.pace > 1:
             self.pace, self._risen = 1.0, now
         if new > 0:
+            self._last = now
             self._seen.append((now, count))
             while len(self._seen) > 2 and now - self._seen[1][0] > WINDOW_S:
                 self._seen.popleft()

@@ -10,7 +10,7 @@ from gi.repository import Gst, GstRtp, GstVideo
 
 from runner.core.commands import KnobValue
 from runner.errors import RunError
-from runner.graph import Plan
+from runner.graph import Plan, is_restarted_after_gaps
 from runner.gst.arriving import CAPTURE_ID
 from runner.gst.knobs import KnobPanel
 from runner.gst.picture_rate import PictureRate
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 Build = Callable[[Gst.Bin, Plan], "CameraPipeline"]
 SRT_KEY_BYTES = 32  # AES-256
+GAP_S, GAP_INTERVALS = 0.4, 3  # without a picture, after which an encoder that would make up for it begins anew
 CAPTURE_TIME = "urn:ietf:params:rtp-hdrext:ntp-64"  # RTP header extension with the capture time (RFC 6051)
 # New caps must not make the source renegotiate: its output does not change. It would query caps between two frames,
 # while the next knobs are being turned, and see only some of them.
@@ -76,6 +77,8 @@ class CameraPipeline:
             self._limits.follow(pipeline)
         self._sent = pipeline.get_by_name("sent")  # None: nothing is counted
         self._rate, self._on_report = PictureRate(float(plan.camera.fps)), on_report
+        self._restarts_after_gaps = is_restarted_after_gaps(plan.camera.graph)
+        self._is_gap = False
         self._elements = [pipeline.get_by_name(element.name) for element in plan.vehicle]
         self._encoder = EncoderWatch(self._elements)
         entry = self._elements[0].get_static_pad("sink")
@@ -162,6 +165,9 @@ class CameraPipeline:
         self._rate.look(now, self.counters()[0])
         if self._rate.pace != self.knobs.pace:
             self.knobs.pace = self._rate.pace
+        was_gap, self._is_gap = self._is_gap, self._rate.silent_s(now) > max(GAP_S, GAP_INTERVALS * self.frame_s)
+        if self._is_gap and not was_gap and self._restarts_after_gaps:
+            self.knobs.restart_encoder("size")
         if (self.slow_fps is not None) != was_slow:
             rate = f"{float(self._plan.camera.fps):g} Hz"
             self._on_report(f"{rate} again" if was_slow else f"{self.slow_fps} of {rate}")
