@@ -75,6 +75,7 @@ __all__ = [
     "discover",
     "missing_plugins",
     "missing_recorders",
+    "parameter_set_notes",
     "read_again",
     "read_video",
     "run_lanes",
@@ -575,6 +576,13 @@ def decode_video(path: Path, width: int, height: int) -> Iterator[tuple[int, Lum
     from runner.gst import pictures
 
     return pictures.decode_video(path, width, height)
+
+
+def parameter_set_notes(plan: Plan) -> list[str]:
+    """What viewers who join later lack, see `runner.gst.parameter_sets.parameter_set_notes`."""
+    from runner.gst import parameter_sets
+
+    return parameter_sets.parameter_set_notes(plan)
 
 
 def write_clip(path: Path, frames: Iterable[bytes], width: int, height: int, fps: Fraction) -> None:

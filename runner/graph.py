@@ -316,6 +316,15 @@ def video_codec(graph: Graph) -> str:
     return next((codec for codec in CODECS if any(codec in factory for factory in factories)), "")
 
 
+def may_lack_parameter_sets(plan: Plan) -> bool:
+    """Whether key pictures after the first may lack parameter sets: unless a payloader repeats them at each."""
+    codec = video_codec(plan.camera.graph)
+    payloader = next((element for element in plan.vehicle if element.factory == f"rtp{codec}pay"), None)
+    # rtph265pay does so only for IDR pictures, and x265 sends CRA pictures.
+    repeats = codec == "h264" and payloader is not None and payloader.properties.get("config-interval") == -1
+    return payloader is not None and not repeats
+
+
 def _quantities(camera: Camera, value: KnobValue, pace: float = 1.0) -> dict[str, Value]:
     """The quantities that a knob's value offers to its targets, by their names in the YAML."""
     if isinstance(value, bool):

@@ -252,3 +252,54 @@ def test_yaml_is_of_a_valid_configuration_and_decides_nothing(tod: Command) -> N
         "command line: total_kbps: has no effect with format=yaml\n"
     )
     assert tod("print", "format=yaml", "fps_max=0").problems == ["command line: fps_max: 0: must be above 0"]
+
+
+X265 = """
+defaults: [h264_rtsp, _self_]
+encoder:
+  - {name: encoder, element: x265enc, properties: {tune: zerolatency, speed-preset: ultrafast, MORE}}
+PARSE
+sender:
+  - {name: sent, element: identity}
+  - {name: pay0, element: rtph265pay, properties: {pt: 96, mtu: "{mtu_bytes}", config-interval: -1}}
+operator:
+  - ${..receiver}
+  - {name: depay, element: rtph265depay}
+  - {name: received, element: identity}
+  - {name: decoder, element: avdec_h265}
+  - {name: sink, element: fakesink}
+wire:
+  operator: [{name: wire, element: udpsrc, properties: {caps: "application/x-rtp,encoding-name=H265"}}]
+knobs:
+  bitrate: [{element: encoder, property: bitrate, value: kbps}]
+"""
+LACKS = (
+    "graph.vehicle: x265enc ! identity ! rtph265pay: later key pictures lack parameter sets,"
+    " who joins later sees nothing; h265parse with config-interval: -1 in front of pay0 adds them"
+)
+
+
+@pytest.mark.gst
+@pytest.mark.parametrize(
+    ("more", "parse", "lacks"),
+    [
+        ("key-int-max: 30", "", True),
+        ('option-string: "repeat-headers=1"', "", False),
+        ("key-int-max: 30", "  - {name: parse, element: h265parse, properties: {config-interval: -1}}", False),
+    ],
+)
+def test_a_graph_whose_later_key_pictures_lack_parameter_sets_is_reported(
+    tod: Command, conf: UserConf, more: str, parse: str, lacks: bool
+) -> None:
+    """x265's are CRA pictures, in front of which rtph265pay repeats none."""
+    gst = pytest.importorskip("runner.gst").Gst
+    for element in ("x265enc", "avdec_h265"):
+        if gst.ElementFactory.find(element) is None:
+            pytest.skip(f"needs {element}")
+    conf.write("graph/h265.yaml", X265.replace("MORE", more).replace("PARSE", parse))
+    words = (conf.word, "vehicle=delivery_robot", "source=test", "graph=h265")
+    for verb in ("print", "validate"):
+        result = tod(verb, *words)
+        assert result.status == 0, result.err
+        said = {"print": f"front: {LACKS}", "validate": LACKS}[verb]
+        assert (said in (result.err + result.out).splitlines()) is lacks

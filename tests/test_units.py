@@ -260,3 +260,26 @@ def test_a_stream_of_h265_begins_with_its_next_key_picture():
     key = read_unit(h265(33, 19), 2.0, 2.0, codec="h265")
     assert recent.add(key) == key
     assert recent.burst() == [key]
+
+
+def test_later_key_pictures_of_h265_get_the_parameter_sets_last_seen() -> None:
+    """As x265 sends them: its later key pictures are CRA (NAL unit type 21) without any."""
+
+    def nal(kind: int, code: bytes = b"\0\0\0\1") -> bytes:
+        return code + bytes([kind << 1, 1, 0x55, kind])
+
+    sets = nal(32) + nal(33) + nal(34)
+    first, picture, cra = nal(35) + sets + nal(39) + nal(21), nal(1), nal(21, b"\0\0\1")
+    recent = RecentUnits(refresh_s=1.0, codec="h265")
+    shown = [recent.add(read(data, at)) for at, data in enumerate((first, picture, cra, picture))]
+    assert [unit.data for unit in shown] == [first, picture, sets + cra, picture]
+    assert [unit.data for unit in recent.burst()] == [sets + cra, picture]
+    assert [unit.key for unit in shown] == [True, False, True, False]
+    unseen = RecentUnits(refresh_s=1.0, codec="h265")
+    assert unseen.add(read(cra, 0)).data == cra
+
+
+def read(data: bytes, at: float) -> AccessUnit:
+    unit = read_unit(data, None, at, codec="h265")
+    assert unit
+    return unit

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
+from itertools import pairwise
 from math import inf
 from typing import NamedTuple
 
 from runner.h264.keyframe import Bits, grey_idr
 
-SLICE, IDR, SEI = 1, 5, 6  # NAL unit types (ITU-T H.264, table 7-1)
+SLICE, IDR, SEI, SPS = 1, 5, 6, 7  # NAL unit types (ITU-T H.264, table 7-1)
 RECOVERY_POINT = 6  # SEI payload type (D.1.8)
 H265_VCL, H265_IRAP = range(32), range(16, 24)  # NAL unit types (ITU-T H.265, table 7-1)
+H265_SETS = range(32, 35)  # video, sequence and picture parameter sets
 PERIODS = 2  # of refresh until any picture is exact: they contain a whole wave, whenever it began
 CODECS = ("h264", "h265")
 LATE = 4  # factor by which a wave may take longer than stated
@@ -82,6 +84,22 @@ def coded_picture(data: bytes, codec: str) -> bytes:
     return b""
 
 
+def parameter_sets(data: bytes) -> bytes:
+    """The parameter sets in front of an H.265 picture, Annex B; empty: there are none."""
+    units, sets = [(header >> 1 & 0x3F, at - 4) for header, at in nal_units(data)], b""
+    for (kind, begin), (_, end) in pairwise([*units, (0, len(data))]):
+        if kind in H265_VCL:
+            break
+        if kind in H265_SETS:
+            sets += b"\0" + data[begin:end].rstrip(b"\0")
+    return sets
+
+
+def has_parameter_sets(data: bytes, codec: str) -> bool:
+    """Whether an access unit states the parameter sets that its picture needs."""
+    return bool(parameter_sets(data)) if codec == "h265" else any(h & 0x1F == SPS for h, _ in nal_units(data))
+
+
 def _read_h265(data: bytes, captured: float | None, arrived: float) -> AccessUnit | None:
     """`read_unit` for H.265. Recovery points are ignored: a late viewer waits for the next IRAP picture."""
     for header, _ in nal_units(data):
@@ -92,7 +110,7 @@ def _read_h265(data: bytes, captured: float | None, arrived: float) -> AccessUni
 
 
 def nal_units(data: bytes) -> Iterator[tuple[int, int]]:
-    """First byte of the header of each NAL unit, and the offset after it."""
+    """First byte of the header of each NAL unit, and the offset after it; its start code begins 4 bytes before."""
     at = data.find(b"\0\0\1")
     while 0 <= at < len(data) - 3:
         yield data[at + 3], at + 4
@@ -113,11 +131,14 @@ class RecentUnits:
     the units before it are gone, so a decoder that starts now shows the last IDR where no wave has passed yet; one that
     has been running does not.
 
+    Some encoders state their parameter sets only once; then key units are completed by those last seen (H.265).
+
     refresh_s  length of a refresh wave or keyframe interval, s; None if the graph does not state it
     codec      h264 or h265; an H.265 stream that others already watch starts with its next IRAP picture
     """
 
     def __init__(self, refresh_s: float | None, codec: str = "h264") -> None:
+        self._states_sets, self._sets = codec == "h265", b""
         self._grey = grey_idr if codec == "h264" else lambda _unit: None
         self._window = LONGEST_S if refresh_s is None else PERIODS * refresh_s
         self._key: AccessUnit | None = None
@@ -131,6 +152,8 @@ class RecentUnits:
     def add(self, unit: AccessUnit) -> AccessUnit:
         """Store a received unit; returns it with `exact` set for a decoder that starts from the stored units."""
         self._follow_clock(unit.arrived)
+        if self._states_sets:
+            unit = self._complete(unit)
         if unit.key:
             self._key, self._grey_since = unit, None if unit.exact else unit.arrived
             self._since.clear()
@@ -151,6 +174,12 @@ class RecentUnits:
         if self._is_cut and self._is_refreshing(self._resumed):
             self._since[-1] = unit = unit._replace(whole=False)
         return unit
+
+    def _complete(self, unit: AccessUnit) -> AccessUnit:
+        """With parameter sets, if it is a key unit and any are known."""
+        if sets := parameter_sets(unit.data):
+            self._sets = sets
+        return unit._replace(data=self._sets + unit.data) if unit.key and not sets else unit
 
     def _follow_clock(self, now: float) -> None:
         """Shift times if the clock was set back, or all units would be kept until it has caught up; also after a pause.

@@ -32,8 +32,8 @@ from runner.core.decision import Decision
 from runner.core.events import BitratePredicted, Event, ModeSelected, TotalSet
 from runner.core.model import Kbps, Mode, Vehicle, exact, plain
 from runner.core.step import start, step
-from runner.errors import ArgumentError
-from runner.graph import Plan
+from runner.errors import ArgumentError, MissingBindings
+from runner.graph import Plan, may_lack_parameter_sets
 from runner.plans import compile_plans
 from runner.records import CameraDecision, to_json
 from runner.redact import redacted
@@ -48,7 +48,8 @@ def run(arguments: Arguments) -> int:
         return _print_configuration(arguments)
     vehicle, plans, decision = _plan(arguments)
     text = json.dumps(as_json(plans, decision), indent=2, ensure_ascii=False) if form == "json" else ""
-    _print(text or as_text(vehicle, plans, decision), _stand_ins(plans) if form == "json" else [])
+    stand_ins = _stand_ins(plans) if form == "json" else []
+    _print(text or as_text(vehicle, plans, decision), [*stand_ins, *_parameter_sets(plans)])
     return 0
 
 
@@ -71,6 +72,18 @@ def _sweep(arguments: Arguments) -> int:
     ]
     _print("\n".join(lines), list(dict.fromkeys(note for _, (_, plans, _) in runs for note in _stand_ins(plans))))
     return 0
+
+
+def _parameter_sets(plans: Sequence[Plan]) -> list[str]:
+    """What viewers who join later lack; unknown without GStreamer."""
+    suspected = [plan for plan in plans if may_lack_parameter_sets(plan)]
+    if not suspected:
+        return []
+    try:
+        from runner.apply import parameter_set_notes
+    except MissingBindings:
+        return []
+    return [f"{plan.camera.name}: {sentence}" for plan in suspected for sentence in parameter_set_notes(plan)]
 
 
 def _plan(arguments: Arguments) -> tuple[Vehicle, Sequence[Plan], Decision]:

@@ -452,7 +452,7 @@ def _problems(config: Configuration, readers: Iterable[ConfigReader]) -> list[Pr
 def _registry_check(notes: dict[str, None]) -> PlanCheck | None:
     """The check against GStreamer's registry; anything it could not check goes to the notes."""
     try:
-        from runner.apply import check_plan, missing_plugins, missing_recorders
+        from runner.apply import check_plan, missing_plugins, missing_recorders, parameter_set_notes
     except MissingBindings as error:
         notes[f"nothing was checked against the GStreamer registry: {error}"] = None
         return None
@@ -460,6 +460,9 @@ def _registry_check(notes: dict[str, None]) -> PlanCheck | None:
     def check(plan: Plan) -> list[ModelError]:
         missing = (*missing_plugins(plan), *missing_recorders(plan))
         notes.update({f"not checked: {sentence}": None for sentence in missing})
-        return check_plan(plan)
+        problems = check_plan(plan)
+        if not problems:
+            notes.update(dict.fromkeys(parameter_set_notes(plan)))
+        return problems
 
     return check

@@ -252,6 +252,9 @@ def test_h265_is_played_or_refused_with_the_reason(chromium, h265):
         until(lambda: measure(page)["rear"]["received"] > received + 60)  # the refusal outlasts further keyframes
         assert tile.locator(".status").inner_text() == "⊘ NO PICTURE"
         shot(page, "h265")
+        with opened(chromium, url) as later:  # since then x265 has sent no parameter sets
+            until(lambda: re.fullmatch(expected, later.locator("[data-camera=rear] .refused").inner_text()))
+            assert measure(later)["rear"]["status"] == "unsupported"
 
 
 def test_a_source_that_repeats_its_picture_is_shown_as_frozen(chromium):

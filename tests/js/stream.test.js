@@ -97,3 +97,15 @@ test("a picture is late as soon as it arrives too late, before it is drawn: the 
   stream.decode(unit(190), now());
   assert.equal(statusOf(stream), "late");
 });
+
+test("a browser that plays no H.265 says so although the stream states no parameter sets", async () => {
+  const CRA = 21 << 1; // the first byte of its header
+  const decoders = { configured: 0 };
+  Object.assign(globalThis, { VideoDecoder: class { constructor() { decoders.configured++; } static isConfigSupported = async () => ({ supported: false }); } });
+  const station = /** @type {any} */ ({ clock: new Clock(), limits: LIMITS, connected: true, online: true, bound: NaN, video: true, dimensions: null, resync() {} });
+  const stream = new Stream({ ...CAMERA, codec: "h265" }, station);
+  stream.receive({ flags: 1, sequence: 0, captured: 0, arrived: 0, data: Uint8Array.of(0, 0, 0, 1, CRA, 1, 0x55) });
+  await new Promise((done) => setTimeout(done));
+  assert.equal(stream.refused, "This browser has no decoder for H.265 (hev1.1.6.L93.B0). Use an H.264 graph or another browser.");
+  assert.equal(decoders.configured, 0);
+});

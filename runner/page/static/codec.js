@@ -25,6 +25,9 @@ export function spsOf(unit, codec) {
 
 const hex = (byte) => byte.toString(16).padStart(2, "0");
 
+/** Codec strings that a browser plays if it plays the codec at all. */
+export const USUAL = { h264: "avc1.42E01F", h265: "hev1.1.6.L93.B0" };
+
 export const codecOf = (sps, codec) => (codec === "h265" ? hev1(sps) : avc1(sps));
 
 /** "avc1.PPCCLL": profile, constraints and level are the first three bytes of the parameter set. */

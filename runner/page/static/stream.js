@@ -1,6 +1,6 @@
 /** One camera in the worker: its decoder, its canvas, its status. */
 
-import { codecOf, isKnown, nameOf, spsOf } from "./codec.js";
+import { codecOf, isKnown, nameOf, spsOf, USUAL } from "./codec.js";
 import { now } from "./clock.js";
 import { imageToBox, placement, visible, WHOLE } from "./framing.js";
 import { elapsed, read } from "./counter.js";
@@ -199,6 +199,7 @@ export class Stream {
   /** A key unit sets the decoder up, and again if its parameters change. */
   configure(data) {
     const sps = spsOf(data, this.camera.codec);
+    if (!sps && !this.decoder) return this.checkUsual();
     if (!sps || (this.decoder && String(sps) === this.sps)) return;
     this.close();
     this.sps = String(sps);
@@ -210,6 +211,12 @@ export class Stream {
     this.decoder = decoder;
     this.codec = codec;
     decoder.configure({ codec, optimizeForLatency: true, colorSpace: BT709 });
+  }
+
+  /** Without parameter sets nothing can be decoded, but whether it ever could is known from the codec. */
+  async checkUsual() {
+    const why = await this.refusal(USUAL[this.camera.codec]);
+    if (why && !this.decoder && this.sps === null) Object.assign(this, { refused: why, refused_at: now() });
   }
 
   /** Why the browser does not decode this stream, "" if it can. Browsers name the error differently. */
