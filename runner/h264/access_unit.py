@@ -125,11 +125,11 @@ def _recovery(message: bytes) -> int | None:
 class RecentUnits:
     """The units of one camera that a late decoder needs: the last IDR, and the units since or of the last periods.
 
-    With intra-refresh, an IDR is sent only when the picture size changes. Starting from it alone mixes an old picture
-    with new changes; after two refresh periods, or one whole wave that the stream announces, the old picture is gone.
-    A stream that others already watch sends no IDR for a late viewer, who starts from a grey one. After a long pause
-    the units before it are gone, so a decoder that starts now shows the last IDR where no wave has passed yet; one that
-    has been running does not.
+    With intra-refresh, an IDR is sent only when the picture size changes, and by x264 at some hard cuts. Starting from
+    it alone mixes an old picture with new changes; after two refresh periods, or one whole wave that the stream
+    announces, the old picture is gone. A stream that others already watch sends no IDR for a late viewer, who starts
+    from a grey one. After a long pause the units before it are gone, so a decoder that starts now shows the last IDR
+    where no wave has passed yet; one that has been running does not.
 
     Some encoders state their parameter sets only once; then key units are completed by those last seen (H.265).
 
