@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from runner.core.commands import Command, KnobValue
 from runner.core.model import Media, suggest
 from runner.errors import RunError
-from runner.graph import Plan, launch
+from runner.graph import Plan, launch, may_lack_parameter_sets
 from runner.gst import TYPELIBS, GLib, Gst, load_types
 from runner.gst.aside import settle
 from runner.gst.clocks import captured_at
@@ -580,6 +580,8 @@ def decode_video(path: Path, width: int, height: int) -> Iterator[tuple[int, Lum
 
 def parameter_set_notes(plan: Plan) -> list[str]:
     """What viewers who join later lack, see `runner.gst.parameter_sets.parameter_set_notes`."""
+    if not may_lack_parameter_sets(plan):
+        return []
     from runner.gst import parameter_sets
 
     return parameter_sets.parameter_set_notes(plan)

@@ -6,7 +6,7 @@ from functools import lru_cache
 
 from gi.repository import Gst, GstVideo
 
-from runner.graph import Plan, launch, may_lack_parameter_sets, video_codec
+from runner.graph import Plan, launch, video_codec
 from runner.gst.registry import missing_plugins
 from runner.h264.access_unit import has_parameter_sets, starts
 
@@ -18,9 +18,11 @@ WAIT_NS = 2 * Gst.SECOND
 def parameter_set_notes(plan: Plan) -> list[str]:
     """One sentence if later key pictures lack them; a short stream is encoded to find out.
 
+    plan  one that `may_lack_parameter_sets`
+
     Nothing about graphs that this machine cannot run.
     """
-    if not may_lack_parameter_sets(plan) or missing_plugins(plan, ("vehicle",)):
+    if missing_plugins(plan, ("vehicle",)):
         return []
     graph, codec = plan.camera.graph, video_codec(plan.camera.graph)
     first = [element.name for element in plan.vehicle].index(graph.knobs["size"][0].element) + 1
