@@ -11,6 +11,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from runner.core.commands import Command, KnobValue
@@ -20,7 +21,8 @@ from runner.graph import Plan, launch, may_lack_parameter_sets
 from runner.gst import TYPELIBS, GLib, Gst, load_types
 from runner.gst.aside import settle
 from runner.gst.clocks import captured_at
-from runner.gst.credentials import log_in
+from runner.gst.credentials import Login, log_in
+from runner.gst.ip_camera import follow_cameras
 from runner.gst.outage import ReportMerger
 from runner.gst.pipeline import CameraPipeline
 from runner.gst.probes import PassingBuffer
@@ -248,18 +250,21 @@ class VehicleSide:
         passphrase = keyring.watched_passphrase(lambda what: on_report("keys", what)).get if keyring else None
         plans = _with_clip_range(_with_video(plans, video, "vehicle"))
         self._lock = threading.Lock()
+        self._logins = {p.camera.name: Login(p, partial(on_report, p.camera.name)) for p in plans}
         self._wanted: dict[str, dict[str, KnobValue]] = {plan.camera.name: {} for plan in plans}
         self.on_turned: Callable[[], None] = lambda: None
         self._glib = _Glib()
         self._server: CameraServer | None = None
         self._callers = {
-            p.camera.name: CameraCaller(p, self._build, on_report, passphrase) for p in plans if not p.serves
+            p.camera.name: CameraCaller(p, self._build, on_report, passphrase, self._refusal)
+            for p in plans
+            if not p.serves
         }
         served = [plan for plan in plans if plan.serves]
 
         def start() -> None:
             if served:
-                self._server = CameraServer(served, media, self._build, on_report, keyring)
+                self._server = CameraServer(served, media, self._build, on_report, keyring, self._refusal)
             for caller in self._callers.values():
                 caller.start()
             self._looking = every(LOOK_MS, self._look, lambda what: on_report("senders", what))
@@ -347,9 +352,10 @@ class VehicleSide:
         return faults
 
     def sources(self) -> dict[str, str]:
-        """By camera, the fault of its source: it has failed and is being replaced, or repeats a picture."""
-        pipelines = {name: pipeline for name in self._wanted if (pipeline := self._pipeline(name))}
-        return {name: fault for name, pipeline in pipelines.items() if (fault := pipeline.source_fault)}
+        """By camera, the fault of its source: it has failed, is awaited, refuses the login, or repeats a picture."""
+        pipelines = {name: self._pipeline(name) for name in self._wanted}
+        faults = {name: (p.source_fault if p else None) or self._refusal(name) for name, p in pipelines.items()}
+        return {name: fault for name, fault in faults.items() if fault}
 
     def untimed(self) -> frozenset[str]:
         """Cameras whose source does not know the capture time of its last picture."""
@@ -374,13 +380,16 @@ class VehicleSide:
     def _build(self, pipeline: Gst.Bin, plan: Plan) -> CameraPipeline:
         """Set up a newly built pipeline, with every knob at its wanted value."""
         name = plan.camera.name
+        report = partial(self._on_report, name)
         source = None
         limit_teardown(pipeline)
         if plan.frozen_s is not None:
-            source = WatchedSource(plan, lambda what: self._on_report(name, what))
+            source = WatchedSource(plan, self._logins[name], report)
             source.install(pipeline, plan)
-        elif problem := log_in(pipeline, plan):
-            self._on_report(name, problem)
+        else:
+            if problem := log_in(pipeline, plan):
+                report(problem)
+            follow_cameras(pipeline, plan)
         if self._video:
             VideoFile(self._video, name, "vehicle", _captured, self._on_report).follow(pipeline)
         return CameraPipeline(
@@ -388,9 +397,13 @@ class VehicleSide:
             plan,
             lambda: self._wanted_of(name),
             self._on_knobs_turned,
-            lambda what: self._on_report(name, what),
+            report,
             source,
         )
+
+    def _refusal(self, camera: str) -> str | None:
+        """Why a camera must not be asked now: it refuses the login, and would lock the vehicle out."""
+        return self._logins[camera].refusal
 
     def _look(self) -> None:
         """Look which pictures of each camera have passed since it looked last."""

@@ -503,7 +503,7 @@ def _source(data: Mapping[str, Any]) -> Source:
         capture=data.get("capture") or {},
         plays_bags="bag" in data,
         subscribes=data.get("ros", False),
-        **_given(data, ("loop", "frozen_s", "repeated_s", "depth_m", "credentials")),
+        **_given(data, ("loop", "frozen_s", "repeated_s", "depth_m", "credentials", "medium", "first_reply_s")),
         render=render["drive"] if render else "",
         render_s=render["seconds"] if render else 0,
         stand_in=_elements(data.get("stand_in")),

@@ -235,6 +235,8 @@ class Source:
     settings    values for cameras that name none, from the file itself: clip, device, address, bag, topic
     capture     format requested from its cameras unless they state another, see `Capture`
     credentials file with user name and password, for cameras that name none
+    medium      which of the video media that an IP camera offers, counted from 0
+    first_reply_s  how long it may take for each answer until it streams
     loop        restart at the end without a gap (a clip, a bag)
     frozen_s    without a frame for this long, and for 10 frame intervals, the source of a playing camera is replaced;
                 None: it is not monitored
@@ -251,6 +253,8 @@ class Source:
     settings: Mapping[str, Value] = field(default_factory=dict)
     capture: Mapping[str, Any] = field(default_factory=dict)
     credentials: str | None = None
+    medium: int = 0
+    first_reply_s: float = 30.0
     loop: bool = False
     frozen_s: float | None = None
     repeated_s: float | None = None
@@ -441,6 +445,12 @@ class Camera:
     def in_source(self) -> Roi:
         """The full image within the source's image."""
         return self.crop or self.full_roi
+
+    @property
+    def address(self) -> str | None:
+        """The address of its IP camera; None if it is none, or no address is configured."""
+        address = self.mount.get("address", self.source.settings.get("address"))
+        return str(address) if "address" in self.source.needs and address else None
 
     @property
     def topic(self) -> str | None:

@@ -2,14 +2,92 @@
 
 from __future__ import annotations
 
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
-from gi.repository import Gst
+from gi.repository import GLib, Gst
 
 from runner.graph import Plan
+from runner.system.backoff import pause_s
 from runner.system.files import exposure, read_file
+from runner.system.rtsp import describe
 
 LONGEST = 1000  # bytes
+REFUSED_S = (60.0, 1800.0)  # after a refused login, until the next one: doubled from the first value up to the second
+ASKED_S = 10.0  # how long the camera may take to say which logins it accepts
+
+
+class Login:
+    """How a camera is logged in to, over all of its connections.
+
+    A camera locks out who tries wrong passwords. So after a refused login nothing is tried until a growing pause is
+    over, or the file of the credentials has changed.
+
+    on_report  called, from any thread, with a sentence when the camera refuses the login
+    """
+
+    def __init__(self, plan: Plan, on_report: Callable[[str], None]) -> None:
+        given = plan.camera.credentials
+        self._file = None if given is None else Path(given)
+        self._plan, self._on_report = plan, on_report
+        self._stamp: tuple[int, ...] | None = None  # of the file, when it was last read
+        self._refused = 0  # logins in a row
+        self._until = 0.0  # s by the monotonic clock
+        self._reason: str | None = None
+
+    def log_in(self, pipeline: Gst.Bin) -> str | None:
+        """Likewise as the function `log_in`."""
+        self._stamp = self._current_stamp()
+        return log_in(pipeline, self._plan)
+
+    @property
+    def refusal(self) -> str | None:
+        """Why the camera must not be asked now; None if it may."""
+        if not self._refused or time.monotonic() >= self._until or self._current_stamp() != self._stamp:
+            return None
+        return self._reason
+
+    def refuse(self, client: Gst.Element) -> None:
+        """The camera has refused the login of an RTSP client."""
+        pause = pause_s(self._refused, *REFUSED_S)
+        self._refused, self._until = self._refused + 1, time.monotonic() + pause
+        what = "asks for a user and a password: name their file as credentials"
+        changes = ""
+        if self._file is not None:
+            what, changes = f"refuses the user or the password of {self._file}", ", or once this file has changed"
+        self._reason = f"the camera {what}"
+        self._on_report(f"{self._reason}; next attempt after {pause:g} s{changes}")
+        if self._refused == 1:
+            address = client.get_property("location")
+            threading.Thread(target=self._ask, args=(address,), name="challenge", daemon=True).start()
+
+    def accept(self) -> None:
+        """The camera has streamed."""
+        self._refused = 0
+
+    def _ask(self, address: str) -> None:
+        """Ask the camera which logins it accepts: only after a refusal, and without trying one."""
+        with suppress(OSError, ValueError):  # what it said before has been reported
+            if why := describe(address, ASKED_S).unknown_login:
+                self._reason = why
+                self._on_report(why)
+
+    def _current_stamp(self) -> tuple[int, ...] | None:
+        if self._file is None:
+            return None
+        try:
+            stat = self._file.stat()
+        except OSError:
+            return None
+        return stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns
+
+
+def was_refused(error: GLib.Error) -> bool:
+    """Whether an error says that a camera demands another login, or one at all."""
+    return bool(error.matches(Gst.ResourceError.quark(), Gst.ResourceError.NOT_AUTHORIZED))
 
 
 def log_in(pipeline: Gst.Bin, plan: Plan) -> str | None:

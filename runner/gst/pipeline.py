@@ -95,9 +95,18 @@ class CameraPipeline:
         _NOT_SEEKABLE.add_to(last)
 
     @property
+    def is_opening(self) -> bool:
+        """Whether its source still waits for the first answers of an IP camera, and for how long is its own matter."""
+        return bool(self._source and self._source.is_opening)
+
+    def has_waited(self, seconds: float) -> bool:
+        """Whether it has waited so long for one of these answers."""
+        return bool(self._source and self._source.waiting(seconds))
+
+    @property
     def source_fault(self) -> str | None:
-        """The fault of a source that is frozen and being replaced, or repeats a picture; None if it works."""
-        failed = self._source.outage.reason if self._source else None
+        """The fault of a source that is frozen, is not there yet, or repeats a picture; None if it works."""
+        failed = self._source.fault if self._source else None
         return failed or self._repeats.outage.reason
 
     def turn(self, changed: Mapping[str, KnobValue]) -> None:

@@ -14,6 +14,7 @@ from runner.gst.aside import set_state_in_thread
 from runner.gst.caps import structure
 from runner.gst.clocks import unix_time
 from runner.gst.credentials import log_in
+from runner.gst.ip_camera import follow_cameras
 from runner.gst.pipeline import passed_counts
 from runner.gst.rtspsrc import limit_teardown
 from runner.gst.source import fixed_rate, loop_clip
@@ -105,6 +106,7 @@ class Recorder:
             element.set_property("skip-to-first", True)  # otherwise the first frame is repeated for the time before it
         limit_teardown(self._pipeline)
         problem = log_in(self._pipeline, self._plan)
+        follow_cameras(self._pipeline, self._plan)
         if self._plan.loops:
             loop_clip(self._pipeline, self._plan)
         bus = self._pipeline.get_bus()

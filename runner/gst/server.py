@@ -25,6 +25,7 @@ from runner.errors import RunError
 from runner.graph import Plan, rtsp_url
 from runner.gst.connections import RtspConnection
 from runner.gst.memory import give_back
+from runner.gst.patient_media import PatientMedia
 from runner.gst.pipeline import Build, CameraPipeline
 from runner.gst.srtp import set_master_key
 from runner.gst.timers import every
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
 OnReport = Callable[[str, str], None]  # camera, what happened to it
 
 OPEN_S = 0.9  # a request for a camera that delivers nothing within this is answered 503; the camera continues to open
+OPENING_S = 0.02  # between two looks whether an IP camera has answered
 HELD_S = 5.0  # how long an open camera then waits for the next request
 CLOSE_S = 2.0  # how long connections may take to end when the server stops
 TEARDOWN_S = 5.0  # how long a camera that is reopened waits for the end of its previous pipeline
@@ -133,6 +135,7 @@ class CameraServer:
     build      makes a `CameraPipeline` from each new pipeline
     on_report  called when pipelines start and stop, and when viewers are disconnected
     keyring    of this vehicle; None: anyone may watch, and nothing is encrypted
+    refusal    returns why a camera must not be opened now; None: it may
 
     `controller` is the operator in control, "" for none: see `runner.gst.viewers`.
     """
@@ -144,6 +147,7 @@ class CameraServer:
         build: Build,
         on_report: OnReport,
         keyring: Keyring | None = None,
+        refusal: Callable[[str], str | None] = lambda _: None,
     ) -> None:
         check_port_free(media)
         self._viewers: ViewerCheck | None = None
@@ -154,7 +158,7 @@ class CameraServer:
             self._viewers = ViewerCheck(keyring, lambda what: on_report("keys", what), self._on_refused)
         self._report_refusal = LimitedReports(lambda what: on_report("keys", what))
         self._media, self._build, self._on_report = media, build, on_report
-        self.controller = ""
+        self.controller, self._refusal = "", refusal
         self.pipelines: dict[str, CameraPipeline] = {}
         self._changed = threading.Condition()  # a camera's stage; also guards the state shared by clients' threads
         self._connections: dict[GstRtspServer.RTSPClient, RtspConnection] = {}
@@ -213,6 +217,7 @@ class CameraServer:
         settings = plan.camera.graph.settings
         factory = _Factory()
         factory.set_launch(plan.server)
+        factory.set_media_gtype(PatientMedia.__gtype__)
         factory.set_shared(True)  # otherwise a second viewer takes the pipeline from the first
         factory.set_latency(0)
         factory.set_address_pool(self._addresses)
@@ -289,6 +294,8 @@ class CameraServer:
         The library would open it in the client's thread and answer only after 20 s. Here it is opened in a separate
         thread, so that a camera that is slow to start is open when the client retries.
         """
+        if not camera.is_open and self._is_waiting(camera.name):
+            return False
         deadline = time.monotonic() + OPEN_S
         while True:
             with self._changed:
@@ -308,6 +315,11 @@ class CameraServer:
             if (opening and opening.failed) or self._stopped.is_set() or time.monotonic() >= deadline:
                 return False
             # Otherwise its last viewer has just left, and it is ending.
+
+    def _is_waiting(self, name: str) -> bool:
+        """Whether it is known that a camera cannot be opened within OPEN_S."""
+        pipeline = self.pipelines.get(name)
+        return self._refusal(name) is not None or (pipeline is not None and pipeline.has_waited(OPEN_S))
 
     def _is_settled(self, camera: _Camera, opening: _Opening | None) -> bool:
         """Whether waiting for a camera to open is over."""
@@ -330,7 +342,7 @@ class CameraServer:
             media = camera.factory.construct(camera.url)
             if media is not None and CONSTRUCTS_LOCKED:
                 media.unlock()
-            opening.failed = media is None or not media.prepare(thread)
+            opening.failed = media is None or not self._prepare(media, thread, camera)
             if media is not None and not opening.failed:
                 if camera.is_open:
                     opening.held.wait(HELD_S)
@@ -339,6 +351,21 @@ class CameraServer:
             with self._changed:
                 opening.over, camera.opening = True, None
                 self._changed.notify_all()
+
+    def _prepare(self, media: PatientMedia, thread: GstRtspServer.RTSPThread, camera: _Camera) -> bool:
+        """Start a new pipeline and wait until it delivers."""
+        pipeline = self.pipelines.get(camera.name)
+
+        def wait() -> bool:
+            while pipeline and pipeline.is_opening and camera.stage is _Stage.BUILT:
+                if self._stopped.wait(OPENING_S):
+                    return False
+            return True
+
+        opened = media.open(thread, wait)
+        if opened:
+            self._on_prepared(media, camera)
+        return opened
 
     # --- clients ------------------------------------------------------------------------------------------------------
 

@@ -36,6 +36,7 @@ class SupervisedPipeline:
     on_built   called with each new pipeline before it starts; returns the pad whose first buffer shows that it works
     on_report  called once with each reason, until the pipeline works again
     rebuilt    how often a pipeline that had worked was rebuilt
+    must_wait   whether it must not be built again yet
     before_stop  called before this pipeline is stopped, in the thread that stops it
     """
 
@@ -53,6 +54,7 @@ class SupervisedPipeline:
         self._stopped = True
         self._outage = Outage(on_report)
         self.rebuilt = 0
+        self.must_wait: Callable[[], bool] = lambda: False
         self.before_stop: Callable[[], object] = lambda: None
 
     def start(self) -> None:
@@ -102,6 +104,9 @@ class SupervisedPipeline:
     def _retry_start(self) -> None:
         if self._change and self._change.is_alive() and time.monotonic() - self._ended < STOPPED_S:
             self._retry = later(STOPPING_S, self._retry_start)
+            return
+        if self.must_wait():
+            self._retry = later(RETRY_S, self._retry_start)
             return
         self._retry = None
         self.start()
@@ -155,6 +160,7 @@ class CameraCaller:
 
     build       makes a `CameraPipeline` from each new pipeline
     passphrase  returns what encrypts the stream, and may change; None: it is not encrypted
+    refusal     returns why the camera must not be asked now; None: it may
     """
 
     def __init__(
@@ -163,6 +169,7 @@ class CameraCaller:
         build: Build,
         on_report: Callable[[str, str], None],
         passphrase: Callable[[], str] | None = None,
+        refusal: Callable[[str], str | None] = lambda _: None,
     ) -> None:
         self._plan, self._build, self._passphrase = plan, build, passphrase
         self._used = ""  # the passphrase of the current pipeline
@@ -170,6 +177,7 @@ class CameraCaller:
         self.pipeline: CameraPipeline | None = None
         self._on_fault = lambda what: on_report(name, what)
         self._supervised = SupervisedPipeline(plan.pipeline, self._on_built, self._on_fault)
+        self._supervised.must_wait = lambda: refusal(name) is not None
 
     def start(self) -> None:
         self._supervised.start()

@@ -10,7 +10,8 @@ from gi.repository import GLib, Gst
 
 from runner.graph import Plan, launch
 from runner.gst.aside import HUNG, HUNG_STARTING, change_in_thread, set_state_in_thread
-from runner.gst.credentials import log_in
+from runner.gst.credentials import Login, was_refused
+from runner.gst.ip_camera import CameraClient, follow_cameras
 from runner.gst.outage import Outage
 from runner.gst.probes import EventProbe, IdleProbe
 from runner.gst.rate_limit import RateLimits
@@ -24,6 +25,7 @@ FIRST_FRAME_S = 10.0  # a UDP source may take 5 s to fail, and the first keyfram
 HELD_UP_S = 0.5  # between two checks; that time does not count
 IN_FLIGHT = 5  # frames that may still pass after an error that stops the source
 LONGEST_START_S = 300.0  # a start that hangs is abandoned then; its thread remains
+WAITING_S = 1.0  # an answer that takes longer is reported
 BACKOFF_S = (1.0, 10.0)  # between the starts of two attempts: doubled from the first value up to the second
 
 
@@ -35,22 +37,26 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
     asynchronous state changes do not leave this bin. Frames are counted in C before the gate, so a camera that is
     paused or off counts as working.
 
-    Before the first frame nothing is replaced: errors fail the whole pipeline, and the client gets an error.
+    Before the first frame nothing is replaced: errors fail the whole pipeline, and the client gets an error. Nor is a
+    camera that still answers the first requests of its client: `first_reply_s` limits each answer.
 
+    login      of the camera, over all of its pipelines
     on_report  called with what happened
 
     `limits` hold it at the camera's rate.
     """
 
-    def __init__(self, plan: Plan, on_report: Callable[[str], None]) -> None:
+    def __init__(self, plan: Plan, login: Login, on_report: Callable[[str], None]) -> None:
         super().__init__(name="watched-source")
         assert plan.frozen_s is not None
         self._plan, self._frozen_s = plan, plan.frozen_s
         self._launch, self._last = launch(plan.source), plan.source[-1].name
-        self._on_report = on_report
+        self._login, self._on_report = login, on_report
         self.outage = Outage(on_report)
         self.limits = RateLimits(float(plan.camera.fps))
-        self._opening = Opening()  # of its RTSP client; messages of this bin are handled from the first `add` on
+        # Messages of this bin are handled from the first `add` on.
+        self._opening = Opening()  # of its RTSP client
+        self._client: CameraClient | None = None  # of the child, if it is an IP camera
         self._counter = Gst.ElementFactory.make("identity", "source-frames")
         self.add(self._counter)
         self.add_pad(Gst.GhostPad.new("src", self._counter.get_static_pad("src")))
@@ -60,6 +66,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
             threading.Lock()
         )  # for the child: the server's threads start and stop it, GLib's thread replaces it
         self._child: Gst.Bin | None = None
+        self._late: tuple[str, float] | None = None  # the last request without an answer that was reported
         self._next_check: Delayed | None = None
         self._starting: threading.Thread | None = None  # starts the child
         self._started = 0.0  # when it began
@@ -75,6 +82,22 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
             pipeline.remove(pipeline.get_by_name(element.name))
         pipeline.add(self)
         self.link(pipeline.get_by_name(plan.vehicle[0].name))
+
+    @property
+    def fault(self) -> str | None:
+        """Why it delivers nothing; None if it does, or has only begun."""
+        return self.outage.reason or self.waiting(WAITING_S)
+
+    @property
+    def is_opening(self) -> bool:
+        """Whether an IP camera still answers the first requests."""
+        return bool(self._client and self._client.is_opening and not self._error)
+
+    def waiting(self, least_s: float) -> str | None:
+        """For which answer of an IP camera it has waited so long; None if for none."""
+        asked = self._client and self._client.asked
+        waited_s = time.monotonic() - asked[1] if asked else 0.0
+        return f"waiting for the camera: {asked[0]}, {waited_s:.0f} s" if asked and waited_s >= least_s else None
 
     # --- called by GStreamer ------------------------------------------------------------------------------------------
 
@@ -102,6 +125,10 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
 
     def do_handle_message(self, message: Gst.Message) -> None:
         self._opening.handle(message)
+        if self._client:
+            self._client.follow(message)
+        if message.type == Gst.MessageType.ERROR:
+            self._on_error(message)
         if self._frames():
             if message.type == Gst.MessageType.ERROR:
                 self._set_error(message.parse_error()[0].message)
@@ -126,6 +153,11 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         else:
             self.post_message(Gst.Message.new_error(self, GLib.Error(STREAM_ENDED), ""))
 
+    def _on_error(self, message: Gst.Message) -> None:
+        error = message.parse_error()[0]
+        if was_refused(error):
+            self._login.refuse(message.src)
+
     def _set_error(self, what: str) -> None:
         self._error = self._error or (what, self._frames())  # the first one: others follow from it
 
@@ -144,15 +176,29 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
             self._progress = (frames, now)
             if self._error and frames > self._error[1] + IN_FLIGHT:
                 self._error = None  # it does not stop the video
+        self._note_waiting(now)
         if not frames:
             return
         if not self._attempts:
+            self._login.accept()
             self._check_source(now)
         elif frames > self._last_attempt[0]:
             self._attempts = 0
+            self._login.accept()
             self.outage.report_recovery(now)
         else:
             self._check_attempt(now)
+
+    def _note_waiting(self, now: float) -> None:
+        """Report an answer that is late, once, and when it has come."""
+        asked = self._client.asked if self._client else None
+        if asked and asked != self._late and (waiting := self.waiting(WAITING_S)):
+            self._late = asked
+            self._on_report(waiting)
+        elif self._late and self._client and asked != self._late:
+            if not self._client.has_failed:
+                self._on_report(f"the camera answered {self._late[0]} after {now - self._late[1]:.0f} s")
+            self._late = None
 
     def _check_source(self, now: float) -> None:
         """During normal operation."""
@@ -173,6 +219,11 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         starting = self._starting
         if starting and starting.is_alive() and now - self._started < LONGEST_START_S:
             self._last_attempt = (self._last_attempt[0], now)  # its first frame is due once it has started
+            return
+        if self.is_opening:
+            self._last_attempt = (self._last_attempt[0], now)  # likewise
+            return
+        if self._login.refusal:
             return
         pause = pause_s(self._attempts - 1, *BACKOFF_S)
         if now - self._last_attempt[1] > (pause if self._error else max(pause, FIRST_FRAME_S)):
@@ -197,7 +248,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
     def _add_child(self) -> Gst.Bin:
         child = Gst.parse_bin_from_description(self._launch, ghost_unlinked_pads=False)
         child.add_pad(Gst.GhostPad.new("src", child.get_by_name(self._last).get_static_pad("src")))
-        if problem := log_in(child, self._plan):
+        if problem := self._login.log_in(child):
             self._on_report(problem)
         if self._plan.bag:
             from runner.gst.bag_feed import play_bag
@@ -205,6 +256,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
             play_bag(child, self._plan, self._plan.bag, self._on_report)
         for client in filter(is_rtsp_client, child.children):
             handle_stream_end(client, self._on_stream_gone)
+        self._client = next(iter(follow_cameras(child, self._plan)), None)
         limit_teardown(child)
         for element in fixed_rate(child):
             element.set_property("skip-to-first", True)  # otherwise the first frame is repeated for the time before it
@@ -215,7 +267,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         return child
 
     def _remove_child(self) -> None:
-        child, self._child = self._child, None
+        child, self._child, self._client = self._child, None, None
         if child is not None:
             self.remove(child)
             bus, opening, self._opening = Gst.Bus(), self._opening, Opening()

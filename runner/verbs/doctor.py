@@ -14,17 +14,19 @@ from __future__ import annotations
 import os
 import subprocess
 from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from runner.configuration.config import configuration
-from runner.core.model import Endpoint, RosSettings, Vehicle, suggest
-from runner.errors import ArgumentError, MissingBindings, RunError
+from runner.core.model import Camera, Endpoint, RosSettings, Vehicle, suggest
+from runner.errors import ArgumentError, MissingBindings, RunError, reason
 from runner.mqtt.broker import find_mosquitto
 from runner.plans import compile_plans
 from runner.system.extras import EXTRAS, how_to_install
 from runner.system.ports import check_port_free
+from runner.system.rtsp import OK, UNAUTHORIZED, describe
 from runner.system.usb import UsbCamera, buses
 from runner.verbs import VERBS, Arguments, study_word
 
@@ -93,6 +95,7 @@ def examine(verb: str, vehicle: Vehicle, document: Mapping[str, Any]) -> Iterato
     yield from _ports(verb, vehicle)
     if verb in ("vehicle", "demo", "record"):
         yield from _devices(vehicle)
+        yield from _ip_cameras(vehicle)
     if verb in ("vehicle", "demo"):
         yield _cores(vehicle)
     subscribes = any(camera.source.subscribes for camera in vehicle.cameras.values())
@@ -210,6 +213,32 @@ def _devices(vehicle: Vehicle) -> Iterator[Diagnosis]:
             what += f", without {', '.join(bus.unknown)}, whose capture does not state format and size"
         fits = bus.mbps <= bus.budget_mbps
         yield Diagnosis(fits, what if fits else f"{what}: choose mjpeg, a lower fps, or another bus")
+
+
+def _ip_cameras(vehicle: Vehicle) -> Iterator[Diagnosis]:
+    """What the IP cameras offer, without a login."""
+    with ThreadPoolExecutor() as pool:
+        cameras = (camera for camera in vehicle.cameras.values() if camera.address)
+        yield from pool.map(_ip_camera, cameras)
+
+
+def _ip_camera(camera: Camera) -> Diagnosis:
+    name, video = f"camera {camera.name}: {camera.address}", camera.source.medium + 1
+    try:
+        found = describe(str(camera.address), camera.source.first_reply_s)
+    except (OSError, ValueError) as error:
+        return Diagnosis(False, f"{name}: {reason(error) if isinstance(error, OSError) else error}")
+    if found.unknown_login:
+        return Diagnosis(False, f"{name}: {found.unknown_login}")
+    if found.status == UNAUTHORIZED:
+        what = f"{name} demands a login ({' or '.join(found.logins)})"
+        given = camera.credentials is not None
+        return Diagnosis(given, f"{what}, not tried here" if given else f"{what}: name the file as credentials")
+    if found.status != OK:
+        return Diagnosis(False, f"{name}: answers DESCRIBE with status {found.status}")
+    what = f"{name} offers {found.video} video media"
+    fits = video <= found.video
+    return Diagnosis(fits, what if fits else f"{what}, counted from 0: source.medium is {camera.source.medium}")
 
 
 def _cores(vehicle: Vehicle) -> Diagnosis:

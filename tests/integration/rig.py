@@ -492,6 +492,10 @@ def watching(plan: Any, *, pictures: bool = False, feedback: bool = False) -> It
         client.close()
 
 
+CAMERA_VIDEO = (
+    "videotestsrc is-live=true ! video/x-raw,format=I420,width=320,height=240,framerate=25/1 "
+    "! x264enc tune=zerolatency speed-preset=ultrafast key-int-max=25 ! rtph264pay name=pay0 pt=96 config-interval=-1"
+)
 IP_CAMERA = """
 import sys
 from runner.gst import GLib
@@ -500,10 +504,7 @@ server = GstRtspServer.RTSPServer()
 server.set_address("127.0.0.1")
 server.set_service(sys.argv[1])
 factory = GstRtspServer.RTSPMediaFactory()
-factory.set_launch(
-    "( videotestsrc is-live=true ! video/x-raw,format=I420,width=320,height=240,framerate=25/1 "
-    "! x264enc tune=zerolatency speed-preset=ultrafast key-int-max=25 ! rtph264pay name=pay0 pt=96 config-interval=-1 )"
-)
+factory.set_launch(f"( {sys.argv[4]} )")
 factory.set_shared(True)
 if user := sys.argv[2]:
     auth, token, permissions = GstRtspServer.RTSPAuth(), GstRtspServer.RTSPToken(), GstRtspServer.RTSPPermissions()
@@ -545,12 +546,15 @@ def count_handlers(session: Any, name: str) -> int:
 
 
 @contextmanager
-def ip_camera(port: int, user: str = "", password: str = "") -> Iterator[tuple[str, subprocess.Popen[str]]]:
+def ip_camera(
+    port: int, user: str = "", password: str = "", media: str = CAMERA_VIDEO
+) -> Iterator[tuple[str, subprocess.Popen[str]]]:
     """An IP camera in its own process. Yields its address and the process, which may be stopped or killed.
 
-    user  who may watch it; "": everybody
+    user   who may watch it; "": everybody
+    media  what it sends, each medium ending in a payloader named pay0, pay1, ...
     """
-    command = [sys.executable, "-c", IP_CAMERA, str(port), user, password]
+    command = [sys.executable, "-c", IP_CAMERA, str(port), user, password, media]
     environment = {**os.environ, "PYTHONPATH": str(CHECKOUT)}
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment, cwd=CHECKOUT) as child:
         try:

@@ -1,0 +1,225 @@
+"""IP cameras as people own them: sound beside the video, slow answers, wrong passwords."""
+
+from __future__ import annotations
+
+import re
+import time
+from contextlib import contextmanager
+
+import pytest
+from mini_camera import mini_camera
+
+from rig import free_port, ip_camera, streaming, until, watching
+from runner.configuration.config import configuration
+from runner.core.commands import Command
+from runner.verbs.doctor import _ip_cameras
+
+_FAST = "tune=zerolatency speed-preset=ultrafast key-int-max=15"
+_H264 = f"x264enc {_FAST} ! rtph264pay config-interval=-1"
+_VIDEO = "videotestsrc is-live=true ! video/x-raw,format=I420,width=320,height=240,framerate=15/1"
+_LATE = "queue max-size-time=0 max-size-buffers=0 max-size-bytes=0 min-threshold-time=1500000000"
+LAUNCHED = {
+    "video": f"{_VIDEO} ! {_H264}",
+    "late video": f"{_VIDEO} ! {_LATE} ! {_H264}",
+    "sound": "audiotestsrc is-live=true ! audio/x-raw,rate=8000,channels=1 ! alawenc ! rtppcmapay pt=8",
+    "H.265": f"{_VIDEO} ! x265enc {_FAST} ! rtph265pay config-interval=-1",
+}
+REAR = ("vehicle=delivery_robot", "source=rtsp", "fps_max=15")
+
+
+@contextmanager
+def robot(address, *words):
+    """A robot whose rear camera is an IP camera. Yields (side, plan, reported)."""
+    with streaming(*REAR, f'source.address="{address}"', *words, cameras=("rear",)) as (side, _, (plan,), reported):
+        values = {"sending": True, "size": (424, 240), "bitrate": 500}
+        side.turn([Command("rear", knob, value) for knob, value in values.items()])
+        yield side, plan, reported
+
+
+def shown(plan, frames=6, seconds=60.0):
+    """Watch until so many pictures have arrived; a viewer that is refused tries again."""
+    with watching(plan) as client:
+        until(lambda: client.frames_with_retry() >= frames, seconds, every_s=0.2)
+
+
+def refused(plan):
+    """Watch until the viewer is refused; how long this took, s."""
+    began = time.monotonic()
+    with watching(plan) as client:
+        until(lambda: client.errors)
+    return time.monotonic() - began
+
+
+def soak_of_sources(*values):
+    return pytest.param(*values, marks=(pytest.mark.soak, pytest.mark.sources))
+
+
+@pytest.mark.parametrize(
+    ("media", "medium", "chosen"),
+    [
+        (("sound", "H264"), 0, "H264"),
+        *(
+            soak_of_sources(media, medium, chosen)
+            for media, medium, chosen in (
+                (("H264",), 0, "H264"),
+                (("H264", "sound"), 0, "H264"),
+                (("metadata", "sound", "H264"), 0, "H264"),
+                (("H264", "sound", "back channel", "metadata"), 0, "H264"),
+                (("back channel", "H264"), 0, "H264"),
+                (("H265", "sound", "H264"), 0, "H265"),
+                (("H265", "sound", "H264"), 1, "H264"),
+                (("H264", "JPEG"), 1, "JPEG"),
+                (("sound", "JPEG"), 0, "JPEG"),
+                (("sound", "H264 sendonly"), 0, "H264 sendonly"),
+            )
+        ),
+    ],
+)
+def test_only_the_chosen_video_of_a_camera_is_set_up(media, medium, chosen):
+    """Its sound comes before its first key picture."""
+    with (
+        mini_camera(*media, late_s=0.3) as camera,
+        robot(camera.address, f"source.medium={medium}") as (_, plan, reported),
+    ):
+        shown(plan)
+        assert camera.set_up == [chosen]
+        assert set(reported) <= {"rear: pipeline built", "rear: pipeline stopped"}
+
+
+def launched(*media):
+    """The media of a camera of GStreamer, as launch lines."""
+    return " ".join(f"{LAUNCHED[kind]} name=pay{number}" for number, kind in enumerate(media))
+
+
+@pytest.mark.soak
+@pytest.mark.sources
+@pytest.mark.parametrize(
+    "media",
+    [
+        ("video",),
+        ("video", "sound"),
+        ("sound", "video"),
+        ("late video",),
+        ("late video", "sound"),
+        ("sound", "late video"),
+        ("H.265",),
+    ],
+    ids=" ".join,
+)
+def test_cameras_of_gstreamer_are_shown(media):
+    """Over UDP; their servers start sending all media at the same time."""
+    with ip_camera(free_port(), media=launched(*media)) as (address, _), robot(address) as (side, plan, reported):
+        shown(plan, frames=30)
+        assert side.sources() == {}
+        assert set(reported) <= {"rear: pipeline built", "rear: pipeline stopped"}
+
+
+@pytest.mark.parametrize(
+    ("media", "words", "why"),
+    [
+        (
+            ("H264", "sound"),
+            ("source.medium=1",),
+            "source.medium is 1, but the camera offers 1 video media, counted from 0",
+        ),
+        (("sound", "metadata"), (), "the camera offers no video, only audio, application"),
+    ],
+)
+def test_a_camera_without_the_wanted_video_is_reported(media, words, why):
+    with mini_camera(*media) as camera, robot(camera.address, *words) as (_, plan, reported), watching(plan):
+        until(lambda: f"rear: {why}" in reported)
+        assert camera.set_up == []
+
+
+@pytest.mark.parametrize(
+    ("method", "delay_s"),
+    [
+        ("DESCRIBE", 2.0),
+        soak_of_sources("DESCRIBE", 25.0),
+        soak_of_sources("OPTIONS", 2.0),
+        soak_of_sources("SETUP", 5.0),
+        soak_of_sources("PLAY", 22.0),
+    ],
+)
+def test_a_camera_that_answers_slowly_is_awaited(monkeypatch, method, delay_s):
+    """By one attempt, however long; its viewers are refused at once meanwhile."""
+    monkeypatch.setattr("runner.gst.server.OPEN_S", 0.3)  # as long as a viewer waits
+    with mini_camera(delays_s={method: delay_s}) as camera, robot(camera.address) as (side, plan, reported):
+        refused(plan)
+        waiting = until(side.sources)["rear"]
+        assert re.fullmatch(rf"waiting for the camera: {method}, [12] s", waiting)
+        assert refused(plan) < 0.3
+        shown(plan)
+        assert side.sources() == {}
+        assert camera.connections == 1
+        assert reported[1:3] == [f"rear: {waiting}", f"rear: the camera answered {method} after {delay_s:.0f} s"]
+
+
+def test_a_camera_that_has_streamed_must_answer_soon():
+    with mini_camera() as camera, robot(camera.address) as (side, plan, _), watching(plan) as client:
+        until(lambda: client.frames_with_retry() > 5)
+        assert side._pipeline("rear")._pipeline.get_by_name("source").get_property("tcp-timeout") == 1_000_000
+
+
+def test_a_vehicle_stops_while_a_camera_does_not_answer():
+    with mini_camera(delays_s={"DESCRIBE": 20}) as camera:
+        with robot(camera.address) as (side, plan, _), watching(plan):
+            until(side.sources)
+            began = time.monotonic()
+        assert time.monotonic() - began < 3
+
+
+@pytest.fixture
+def credentials(tmp_path):
+    file = tmp_path / "rear camera"
+    file.write_text("viewer:wrong\n")
+    file.chmod(0o600)
+    return file
+
+
+@pytest.mark.parametrize("login", ["basic", soak_of_sources("md5")])
+def test_a_refused_login_is_tried_again_when_its_file_changes(credentials, login):
+    """A camera locks out who tries too often. Its viewers make no attempt."""
+    words = (f'source.credentials="{credentials}"',)
+    with mini_camera(login=login, password="right") as camera, robot(camera.address, *words) as (side, plan, reported):
+        for _ in range(4):
+            refused(plan)
+        assert len(camera.logins) == 1
+        why = f"the camera refuses the user or the password of {credentials}"
+        assert side.sources() == {"rear": why}
+        assert f"rear: {why}; next attempt after 60 s, or once this file has changed" in reported
+        credentials.write_text("viewer:right\n")
+        if login == "basic":
+            shown(plan)
+            assert side.sources() == {}
+        else:
+            refused(plan)
+            assert len(camera.logins) == 2
+            assert any("next attempt after 120 s" in line for line in reported)
+
+
+@pytest.mark.soak
+@pytest.mark.sources
+def test_a_refused_login_is_tried_again_after_growing_pauses(monkeypatch, credentials):
+    monkeypatch.setattr("runner.gst.credentials.REFUSED_S", (2.0, 30.0))
+    with (
+        mini_camera(login="md5") as camera,
+        robot(camera.address, f'source.credentials="{credentials}"') as (_, plan, _),
+    ):
+        began = time.monotonic()
+        while time.monotonic() - began < 12:  # due at 0, 2 and 6 s, then at 14 s
+            refused(plan)
+        assert len(camera.logins) == 3
+
+
+def test_a_camera_that_only_knows_sha_256_is_named(credentials):
+    demands = "the camera demands SHA-256; this GStreamer knows MD5"
+    words = (f'source.credentials="{credentials}"',)
+    with mini_camera(login="sha256") as camera, robot(camera.address, *words) as (side, plan, reported):
+        refused(plan)
+        until(lambda: f"rear: {demands}" in reported)
+        assert side.sources() == {"rear": demands}
+        assert len(camera.logins) == 1
+        vehicle = configuration([*REAR, f'source.address="{camera.address}"', *words]).vehicle()
+        found = list(_ip_cameras(vehicle))
+        assert found == [(False, f"camera {name}: {camera.address}: {demands}") for name in vehicle.cameras]
