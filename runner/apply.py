@@ -22,6 +22,7 @@ from runner.gst import TYPELIBS, GLib, Gst, load_types
 from runner.gst.aside import settle
 from runner.gst.clocks import captured_at
 from runner.gst.credentials import Login, log_in
+from runner.gst.decoders import DecoderWatch
 from runner.gst.ip_camera import follow_cameras
 from runner.gst.outage import ReportMerger
 from runner.gst.pipeline import CameraPipeline
@@ -251,6 +252,7 @@ class VehicleSide:
         plans = _with_clip_range(_with_video(plans, video, "vehicle"))
         self._lock = threading.Lock()
         self._logins = {p.camera.name: Login(p, partial(on_report, p.camera.name)) for p in plans}
+        self._left_out: dict[str, set[str]] = {plan.camera.name: set() for plan in plans}  # decoders
         self._wanted: dict[str, dict[str, KnobValue]] = {plan.camera.name: {} for plan in plans}
         self.on_turned: Callable[[], None] = lambda: None
         self._glib = _Glib()
@@ -384,12 +386,10 @@ class VehicleSide:
         source = None
         limit_teardown(pipeline)
         if plan.frozen_s is not None:
-            source = WatchedSource(plan, self._logins[name], report)
+            source = WatchedSource(plan, self._logins[name], self._left_out[name], report)
             source.install(pipeline, plan)
         else:
-            if problem := log_in(pipeline, plan):
-                report(problem)
-            follow_cameras(pipeline, plan)
+            self._prepare(pipeline, plan, report)
         if self._video:
             VideoFile(self._video, name, "vehicle", _captured, self._on_report).follow(pipeline)
         return CameraPipeline(
@@ -400,6 +400,15 @@ class VehicleSide:
             report,
             source,
         )
+
+    def _prepare(self, pipeline: Gst.Bin, plan: Plan, report: Callable[[str], None]) -> None:
+        """Set up a source that is not watched."""
+        if problem := log_in(pipeline, plan):
+            report(problem)
+        follow_cameras(pipeline, plan)
+        end = pipeline.get_by_name(plan.source[-1].name).get_static_pad("src")
+        decoders = DecoderWatch(pipeline, end, self._left_out[plan.camera.name], report)
+        decoders.follow((pipeline.get_parent() or pipeline).get_bus())
 
     def _refusal(self, camera: str) -> str | None:
         """Why a camera must not be asked now: it refuses the login, and would lock the vehicle out."""

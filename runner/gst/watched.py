@@ -11,6 +11,7 @@ from gi.repository import GLib, Gst
 from runner.graph import Plan, launch
 from runner.gst.aside import HUNG, HUNG_STARTING, change_in_thread, set_state_in_thread
 from runner.gst.credentials import Login, was_refused
+from runner.gst.decoders import SILENT_S, DecoderWatch
 from runner.gst.ip_camera import CameraClient, follow_cameras
 from runner.gst.outage import Outage
 from runner.gst.probes import EventProbe, IdleProbe
@@ -25,6 +26,7 @@ FIRST_FRAME_S = 10.0  # a UDP source may take 5 s to fail, and the first keyfram
 HELD_UP_S = 0.5  # between two checks; that time does not count
 IN_FLIGHT = 5  # frames that may still pass after an error that stops the source
 LONGEST_START_S = 300.0  # a start that hangs is abandoned then; its thread remains
+DECODER_S = 2 * SILENT_S  # how much longer the pictures may stand while the decoder is looked at
 WAITING_S = 1.0  # an answer that takes longer is reported
 BACKOFF_S = (1.0, 10.0)  # between the starts of two attempts: doubled from the first value up to the second
 
@@ -41,22 +43,24 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
     camera that still answers the first requests of its client: `first_reply_s` limits each answer.
 
     login      of the camera, over all of its pipelines
+    left_out   decoders that are not chosen, likewise
     on_report  called with what happened
 
     `limits` hold it at the camera's rate.
     """
 
-    def __init__(self, plan: Plan, login: Login, on_report: Callable[[str], None]) -> None:
+    def __init__(self, plan: Plan, login: Login, left_out: set[str], on_report: Callable[[str], None]) -> None:
         super().__init__(name="watched-source")
         assert plan.frozen_s is not None
         self._plan, self._frozen_s = plan, plan.frozen_s
         self._launch, self._last = launch(plan.source), plan.source[-1].name
-        self._login, self._on_report = login, on_report
+        self._login, self._left_out, self._on_report = login, left_out, on_report
         self.outage = Outage(on_report)
         self.limits = RateLimits(float(plan.camera.fps))
         # Messages of this bin are handled from the first `add` on.
         self._opening = Opening()  # of its RTSP client
         self._client: CameraClient | None = None  # of the child, if it is an IP camera
+        self._decoders: DecoderWatch | None = None  # of the child
         self._counter = Gst.ElementFactory.make("identity", "source-frames")
         self.add(self._counter)
         self.add_pad(Gst.GhostPad.new("src", self._counter.get_static_pad("src")))
@@ -157,6 +161,8 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         error = message.parse_error()[0]
         if was_refused(error):
             self._login.refuse(message.src)
+        if self._decoders:
+            self._decoders.handle(error)
 
     def _set_error(self, what: str) -> None:
         self._error = self._error or (what, self._frames())  # the first one: others follow from it
@@ -202,8 +208,11 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
 
     def _check_source(self, now: float) -> None:
         """During normal operation."""
-        if now - self._progress[1] <= self._frozen_s:
+        still_s = now - self._progress[1]
+        if still_s <= self._frozen_s:
             return
+        if not self._error and self._decoders and self._decoders.suspects and still_s < self._frozen_s + DECODER_S:
+            return  # the camera is not frozen: its decoder may soon be found to be at fault
         if self._is_idle():
             self.outage.report_failure(
                 f"source: {self._error[0] if self._error else f'no frame for {self._frozen_s:g} s'}", self._progress[1]
@@ -250,6 +259,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         child.add_pad(Gst.GhostPad.new("src", child.get_by_name(self._last).get_static_pad("src")))
         if problem := self._login.log_in(child):
             self._on_report(problem)
+        self._decoders = DecoderWatch(child, child.get_static_pad("src"), self._left_out, self._on_report)
         if self._plan.bag:
             from runner.gst.bag_feed import play_bag
 
@@ -267,7 +277,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         return child
 
     def _remove_child(self) -> None:
-        child, self._child, self._client = self._child, None, None
+        child, self._child, self._client, self._decoders = self._child, None, None, None
         if child is not None:
             self.remove(child)
             bus, opening, self._opening = Gst.Bus(), self._opening, Opening()

@@ -1,4 +1,4 @@
-"""IP cameras as people own them: sound beside the video, slow answers, wrong passwords."""
+"""IP cameras as people own them: sound beside the video, slow answers, wrong passwords, decoders that do not work."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from mini_camera import mini_camera
 
 from rig import free_port, ip_camera, streaming, until, watching
 from runner.configuration.config import configuration
+from runner.configuration.yaml_file import load_file
 from runner.core.commands import Command
+from runner.resources import directory
 from runner.verbs.doctor import _ip_cameras
 
 _FAST = "tune=zerolatency speed-preset=ultrafast key-int-max=15"
@@ -223,3 +225,66 @@ def test_a_camera_that_only_knows_sha_256_is_named(credentials):
         vehicle = configuration([*REAR, f'source.address="{camera.address}"', *words]).vehicle()
         found = list(_ip_cameras(vehicle))
         assert found == [(False, f"camera {name}: {camera.address}: {demands}") for name in vehicle.cameras]
+
+
+@contextmanager
+def chosen_decoder(after, behind="identity"):
+    """A decoder of H.264 that decodebin prefers, since its class does not say that it is hardware.
+
+    after   how many pictures it delivers, then none
+    behind  elements behind it
+    """
+    from runner.gst import Gst
+
+    class Decoder(Gst.Bin):
+        def __init__(self):
+            super().__init__()
+            self.passed = 0
+            inner = Gst.parse_bin_from_description(f"avdec_h264 ! {behind}", True)
+            self.add(inner)
+            for name in ("sink", "src"):
+                self.add_pad(Gst.GhostPad.new(name, inner.get_static_pad(name)))
+            self.get_static_pad("src").add_probe(Gst.PadProbeType.BUFFER, self.on_picture)
+
+        def on_picture(self, _pad, _info):
+            self.passed += 1
+            return Gst.PadProbeReturn.OK if self.passed <= after else Gst.PadProbeReturn.DROP
+
+    Decoder.set_metadata("Vendor's decoder", "Codec/Decoder/Video", "Decodes H.264", "Vendor")
+    for name, direction, caps in (
+        ("sink", Gst.PadDirection.SINK, "video/x-h264,stream-format=avc,alignment=au"),
+        ("src", Gst.PadDirection.SRC, "video/x-raw(ANY)"),
+    ):
+        template = Gst.PadTemplate.new(name, direction, Gst.PadPresence.ALWAYS, Gst.Caps.from_string(caps))
+        Decoder.add_pad_template(template)
+    assert Gst.Element.register(None, "vendordec", Gst.Rank.PRIMARY + 1000, Decoder)
+    try:
+        yield
+    finally:
+        Gst.ElementFactory.find("vendordec").set_rank(Gst.Rank.NONE)
+
+
+@pytest.mark.parametrize("after", [0, soak_of_sources(1), soak_of_sources(20)])
+def test_a_decoder_that_delivers_nothing_is_left_out(after):
+    with chosen_decoder(after), mini_camera() as camera, robot(camera.address) as (side, plan, reported):
+        shown(plan, frames=after + 10)
+        silent = "decoder vendordec: no picture within 2 s; the next attempt leaves it out"
+        assert [line for line in reported if silent in line]
+        assert side.sources() == {}
+
+
+@pytest.mark.soak
+@pytest.mark.sources
+def test_a_decoder_whose_pictures_the_next_element_refuses_is_left_out():
+    form = "video/x-raw,format=VENDOR,width=320,height=240,framerate=15/1"
+    behind = f'capssetter join=false replace=true caps="{form}"'
+    with chosen_decoder(1000, behind), mini_camera() as camera, robot(camera.address) as (_, plan, reported):
+        shown(plan)
+        assert "rear: decoder vendordec: no picture has passed; the next attempt leaves it out" in reported
+
+
+@pytest.mark.parametrize("source", ["rtsp", "v4l2", "bag", "ros", "file"])
+def test_packaged_sources_prefer_decoders_in_software(source):
+    found = load_file(directory("conf") / "source" / f"{source}.yaml")["elements"]
+    decoders = [element for element in found if element["element"] == "decodebin"]
+    assert [element["properties"] for element in decoders] == [{"force-sw-decoders": True}]
