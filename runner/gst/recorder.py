@@ -14,7 +14,7 @@ from runner.gst.aside import set_state_in_thread
 from runner.gst.caps import structure
 from runner.gst.clocks import unix_time
 from runner.gst.credentials import log_in
-from runner.gst.ip_camera import follow_cameras
+from runner.gst.ip_camera import CameraClient, follow_cameras
 from runner.gst.pipeline import passed_counts
 from runner.gst.rtspsrc import limit_teardown
 from runner.gst.source import fixed_rate, loop_clip
@@ -84,6 +84,7 @@ class Recorder:
         self._progress = (0, time.monotonic())  # frames at the last change of the counter, and when
         self._rated = fixed_rate(self._pipeline) if not plan.loops else []
         self._feed = self._read_bag() if plan.bag else None
+        self._clients: list[CameraClient] = []
 
     def _read_bag(self) -> BagFeed:
         """Record a bag as fast as the encoder accepts it: once, or repeatedly up to a given length."""
@@ -106,7 +107,7 @@ class Recorder:
             element.set_property("skip-to-first", True)  # otherwise the first frame is repeated for the time before it
         limit_teardown(self._pipeline)
         problem = log_in(self._pipeline, self._plan)
-        follow_cameras(self._pipeline, self._plan)
+        self._clients = follow_cameras(self._pipeline, self._plan)
         if self._plan.loops:
             loop_clip(self._pipeline, self._plan)
         bus = self._pipeline.get_bus()
@@ -207,6 +208,8 @@ class Recorder:
             return f"the file was not finished within {WRITE_S:g} s" if stalled_s > WRITE_S else None
         if self._queue.get_property("current-level-buffers"):  # the first frame of an encoder may take seconds
             return f"frames are queued, but none was written for {WRITE_S:g} s" if stalled_s > WRITE_S else None
+        if any(client.is_opening for client in self._clients):  # an IP camera has its own limit for each answer
+            return None
         return f"no frame for {SOURCE_SILENT_S:g} s" if stalled_s > SOURCE_SILENT_S else None
 
     def _count_down(self) -> None:

@@ -27,6 +27,7 @@ HELD_UP_S = 0.5  # between two checks; that time does not count
 IN_FLIGHT = 5  # frames that may still pass after an error that stops the source
 LONGEST_START_S = 300.0  # a start that hangs is abandoned then; its thread remains
 DECODER_S = 2 * SILENT_S  # how much longer the pictures may stand while the decoder is looked at
+BEGIN_S = 5.0  # until a pipeline that was built is started, at most
 WAITING_S = 1.0  # an answer that takes longer is reported
 BACKOFF_S = (1.0, 10.0)  # between the starts of two attempts: doubled from the first value up to the second
 
@@ -70,6 +71,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
             threading.Lock()
         )  # for the child: the server's threads start and stop it, GLib's thread replaces it
         self._child: Gst.Bin | None = None
+        self._built, self._has_begun = time.monotonic(), False
         self._late: tuple[str, float] | None = None  # the last request without an answer that was reported
         self._next_check: Delayed | None = None
         self._starting: threading.Thread | None = None  # starts the child
@@ -94,7 +96,9 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
 
     @property
     def is_opening(self) -> bool:
-        """Whether an IP camera still answers the first requests."""
+        """Whether it is yet to start, or an IP camera still answers the first requests."""
+        if not self._has_begun:
+            return time.monotonic() - self._built < BEGIN_S
         return bool(self._client and self._client.is_opening and not self._error)
 
     def waiting(self, least_s: float) -> str | None:
@@ -109,6 +113,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         if transition == Gst.StateChange.READY_TO_PAUSED:
             with self._lock:
                 self._add_child()
+            self._has_begun = True
             self._watched = time.monotonic()
             self._progress = (self._frames(), self._watched)
             self._next_check = later(CHECK_S, self._watch)

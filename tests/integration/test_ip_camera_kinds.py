@@ -81,11 +81,14 @@ def test_only_the_chosen_video_of_a_camera_is_set_up(media, medium, chosen):
     """Its sound comes before its first key picture."""
     with (
         mini_camera(*media, late_s=0.3) as camera,
-        robot(camera.address, f"source.medium={medium}") as (_, plan, reported),
+        robot(camera.address, f"source.medium={medium}") as (side, plan, reported),
+        watching(plan) as client,
     ):
-        shown(plan)
+        until(lambda: client.frames_with_retry() > 5)
         assert camera.set_up == [chosen]
-        assert set(reported) <= {"rear: pipeline built", "rear: pipeline stopped"}
+        assert reported == ["rear: pipeline built"]
+        source = side._pipeline("rear")._pipeline.get_by_name("source")
+        assert source.get_property("tcp-timeout") == 1_000_000  # as in its file again: the camera has streamed
 
 
 def launched(*media):
@@ -113,7 +116,7 @@ def test_cameras_of_gstreamer_are_shown(media):
     with ip_camera(free_port(), media=launched(*media)) as (address, _), robot(address) as (side, plan, reported):
         shown(plan, frames=30)
         assert side.sources() == {}
-        assert set(reported) <= {"rear: pipeline built", "rear: pipeline stopped"}
+        assert reported.count("rear: pipeline built") == 1  # slow answers may be reported, but no attempt fails
 
 
 @pytest.mark.parametrize(
@@ -124,7 +127,7 @@ def test_cameras_of_gstreamer_are_shown(media):
             ("source.medium=1",),
             "source.medium is 1, but the camera offers 1 video media, counted from 0",
         ),
-        (("sound", "metadata"), (), "the camera offers no video, only audio, application"),
+        soak_of_sources(("sound", "metadata"), (), "the camera offers no video, only audio, application"),
     ],
 )
 def test_a_camera_without_the_wanted_video_is_reported(media, words, why):
@@ -155,12 +158,6 @@ def test_a_camera_that_answers_slowly_is_awaited(monkeypatch, method, delay_s):
         assert side.sources() == {}
         assert camera.connections == 1
         assert reported[1:3] == [f"rear: {waiting}", f"rear: the camera answered {method} after {delay_s:.0f} s"]
-
-
-def test_a_camera_that_has_streamed_must_answer_soon():
-    with mini_camera() as camera, robot(camera.address) as (side, plan, _), watching(plan) as client:
-        until(lambda: client.frames_with_retry() > 5)
-        assert side._pipeline("rear")._pipeline.get_by_name("source").get_property("tcp-timeout") == 1_000_000
 
 
 def test_a_vehicle_stops_while_a_camera_does_not_answer():
