@@ -21,3 +21,12 @@ def test_differences_are_named() -> None:
         "graph.mtu_bytes: 1200 here, 900 on the vehicle; cameras.rear.weight: null here, 2 on the vehicle"
     )
     assert differences(of(), of("graph=openh264_rtsp")).endswith(" more")
+
+
+def test_a_camera_of_one_side_is_one_difference() -> None:
+    assert differences(of(), of("~cameras.mast", "fps_max=10")) == (
+        "cameras.mast: only here; fps_max: null here, 10 on the vehicle"
+    )
+    assert differences(of("~cameras.rear", "~cameras.mast"), of()) == (
+        "cameras.mast: only on the vehicle; cameras.rear: only on the vehicle"
+    )

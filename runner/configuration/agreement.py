@@ -37,12 +37,27 @@ def settings(document: Mapping[str, Any]) -> SettingsByPath:
 
 def differences(here: SettingsByPath, vehicle: SettingsByPath) -> str | None:
     """The differences between the operator's configuration and the vehicle's, in one line; None if they agree."""
-    paths = [path for path in {**here, **vehicle} if here.get(path) != vehicle.get(path)]
-    parts = [
-        f"{path}: {shown(here.get(path))} here, {shown(vehicle.get(path))} on the vehicle" for path in paths[:MAX_NAMED]
+    ours, theirs = _cameras(here), _cameras(vehicle)
+    cameras = {"only here": ours - theirs, "only on the vehicle": theirs - ours}
+    parts = [f"{camera}: {where}" for where, some in cameras.items() for camera in sorted(some)]
+    parts += [
+        f"{path}: {shown(here.get(path))} here, {shown(vehicle.get(path))} on the vehicle"
+        for path in {**here, **vehicle}
+        if here.get(path) != vehicle.get(path) and _camera(path) not in ours ^ theirs
     ]
-    more = [f"{len(paths) - MAX_NAMED} more"] if len(paths) > MAX_NAMED else []
-    return "; ".join([*parts, *more]) or None
+    more = [f"{len(parts) - MAX_NAMED} more"] if len(parts) > MAX_NAMED else []
+    return "; ".join([*parts[:MAX_NAMED], *more]) or None
+
+
+def _cameras(of: SettingsByPath) -> set[str]:
+    """Paths of the cameras, such as cameras.front."""
+    return {camera for path in of if (camera := _camera(path))}
+
+
+def _camera(path: str) -> str | None:
+    """The path of the camera that a setting belongs to; None: it belongs to none."""
+    section, *rest = path.split(".")
+    return f"{section}.{rest[0]}" if section == "cameras" and rest else None
 
 
 def _leaves(value: Any, path: Path) -> Iterator[tuple[str, Any]]:

@@ -123,7 +123,8 @@ class Station:
         self._last_message = 0.0
         self._vehicles: dict[str, bool] = {}  # by name, for those known to the broker: whether online
         self._connected_at: float | None = None
-        self._differences: str | None = None
+        self._differences: str | None = None  # between both sides' configurations
+        self._noted_differences: str | None = None  # as reported
         self._pending: dict[str, _PendingRequest] = {}
         self._lock = threading.Lock()
         self.meters = {name: ReceptionMeter(float(camera.fps)) for name, camera in vehicle.cameras.items()}
@@ -297,7 +298,7 @@ class Station:
             return None
         wall = time.time() - now  # of the monotonic clock
         for name, camera in (state.cameras if state else {}).items():
-            if not camera.sending:
+            if not camera.sending or name not in self._vehicle.cameras:
                 continue
             if camera.fault or self.untimed(name):  # it may repeat a picture, whose age is unknown
                 return None
@@ -393,11 +394,10 @@ class Station:
             self._vehicles[name] = state is not None if is_own else is_online(message.payload)
         if not is_own:
             return
-        if state and (missing := self._vehicle.cameras.keys() - state.cameras.keys()):
-            raise ValueError(f"cameras: {', '.join(sorted(missing))}: missing: the vehicle's configuration differs")
         self._published = state
         self._signed_off = state is None
         if state:
+            self._note_differences()
             self._vehicle_online()
         else:
             self._vehicle_lost("the vehicle is offline")
@@ -459,11 +459,19 @@ class Station:
                 self._wall_ahead_s = own_set_s
 
     def _on_configuration(self, message: MqttMessage) -> None:
-        """Report where the vehicle's configuration differs from this side's."""
-        differences = agreement.differences(self._settings, read_settings(message.payload).settings)
-        if differences and differences != self._differences:
-            self.note(f"the vehicle's configuration differs: {differences}")
-        self._differences = differences
+        self._differences = agreement.differences(self._settings, read_settings(message.payload).settings)
+        self._note_differences()
+
+    def _note_differences(self) -> None:
+        """Report where the vehicle's configuration differs from this side's, once it is online.
+
+        What the broker has stored may be of a vehicle that ended long ago.
+        """
+        if self._published is None or self._differences == self._noted_differences:
+            return
+        self._noted_differences = self._differences
+        if self._differences:
+            self.note(f"the vehicle's configuration differs: {self._differences}")
 
     def _check_vehicle_name(self, now: float) -> None:
         """Report once which vehicles are online, if this one is unknown to the broker."""

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 
-from browser import all_live, has_started, luma, measure, opened, send, shot, state_when, until, visit
+from browser import all_live, has_started, luma, measure, opened, send, shot, state_when, take_control, until, visit
 from rig import CHECKOUT, SMALL_ROBOT, answers, clock_ahead, free_port, needs_browser, needs_compiler, process
 from runner.core.model import Endpoint
 from runner.core.roles import Role
@@ -201,6 +201,22 @@ def test_no_stale_values_are_shown_of_a_camera_that_is_off_or_lost(chromium):
         until(lambda: measure(page)["front"]["status"] == "lost")
         until(lambda: caption(page, "front") == "– fps · –/–/– kbit/s – · ×– · – ms")
         shot(page, "lost")
+
+
+@pytest.mark.soak
+@pytest.mark.players
+def test_a_camera_that_the_vehicle_lacks_is_lost_and_the_others_are_driven(chromium):
+    with sides() as (url, vehicle, _), opened(chromium, url) as page, vehicle("~cameras.mast"):
+        until(lambda: {name: shown["status"] for name, shown in measure(page).items()} == LACKING)
+        until(lambda: page.locator("[data-camera=mast] .refused").inner_text() == "The vehicle has no camera mast.")
+        assert page.locator("#banner").is_hidden()
+        take_control(page)
+        page.locator("[data-camera=rear] .switch").click()
+        until(lambda: measure(page)["rear"]["status"] == "off")
+        shot(page, "lacking")
+
+
+LACKING = {"front": "live", "rear": "live", "mast": "lost"}
 
 
 def caption(page, camera):

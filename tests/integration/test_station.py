@@ -326,6 +326,53 @@ def test_a_decision_is_one_note_however_many_cameras_it_changes(both):
     assert listener.notes[1:] == [text]
 
 
+def test_a_camera_that_one_side_lacks_leaves_the_others_to_be_driven(both):
+    station, vehicle, _ = both
+    late = Station(station._vehicle, {"cameras.front.fps": 15, "cameras.mast.fps": 15})
+    listener = RecordingListener()
+    late.listeners.append(listener)
+    cameras = {name: STATE["cameras"][name] for name in ("front", "rear")} | {"door": STATE["cameras"]["mast"]}
+    vehicle.publish("configuration", {"run": "a", "settings": {"cameras.front.fps": 15, "cameras.door.fps": 15}})
+    vehicle.publish("state", STATE | {"cameras": cameras})
+    late.connect()
+    try:
+        vehicle.live_until(lambda: late.state)
+        late.take(samples())
+        decided = {row.name: row.state and row.state.kbps for row in late.rows()}
+        assert decided == {"front": 500, "rear": 500, "mast": None}
+        assert "mast" not in late.sending()
+        named = "the vehicle's configuration differs: cameras.mast: only here; cameras.door: only on the vehicle"
+        assert sorted(listener.notes) == ["the vehicle is online, mode automatic", named]
+        replies = []
+        late.ask({"event": "total_set", "kbps": 1000}, replies.append)
+        request = vehicle.request("total_set")
+        vehicle.operator = late.identity
+        vehicle.publish("reply", {"id": request["id"], "t": 1, "result": "applied", "reason": ""})
+        until(lambda: replies)
+        assert results(replies) == [("applied", "")]
+    finally:
+        late.close()
+
+
+def test_the_stored_configuration_of_a_vehicle_that_has_ended_is_not_compared(both):
+    station, vehicle, _ = both
+    vehicle.publish("configuration", {"run": "a", "settings": {"fps_max": 15}})
+    vehicle.publish("state", OFFLINE)
+    until(lambda: station.state is None)
+    late = Station(station._vehicle, {"fps_max": 10})
+    listener = RecordingListener()
+    late.listeners.append(listener)
+    late.connect()
+    try:
+        until(lambda: late._differences and late._signed_off)
+        assert listener.notes == []
+        vehicle.publish("state", STATE)
+        until(lambda: listener.notes)
+        assert listener.notes == ["the vehicle's configuration differs: fps_max: 10 here, 15 on the vehicle"]
+    finally:
+        late.close()
+
+
 def test_a_vehicle_that_signs_off_is_offline_immediately(both):
     station, vehicle, listener = both
     vehicle.publish("state", OFFLINE)

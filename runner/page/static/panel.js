@@ -1,6 +1,6 @@
 /** The side panel of the selected camera: decided values and why, values read back, and what the operator may set. */
 
-import { camera, decisionOf, inControl, listen, mode, store } from "./store.js";
+import { camera, decisionOf, inControl, listen, mode, store, whyUndecided } from "./store.js";
 import { pending, request, showProblem, whyNoControl } from "./requests.js";
 import { fullRegion, isLocked, sendRegion, toggleLocked } from "./roi.js";
 import { RegionFrame } from "./region_frame.js";
@@ -21,7 +21,7 @@ const WHY = {
 
 /** The selected camera; "" before the first hello, when nothing is shown here. */
 const name = () => store.selected ?? "";
-const whyNot = () => (!decisionOf(name()) ? "The vehicle is offline." : inControl() ? null : `${capital(whyNoControl())}.`);
+const whyNot = () => (!decisionOf(name()) ? whyUndecided(name()) : inControl() ? null : `${capital(whyNoControl())}.`);
 const whyNotByHand = () => whyNot() ?? WHY[mode()] ?? null;
 const capital = (text) => text[0].toUpperCase() + text.slice(1);
 

@@ -197,6 +197,11 @@ export const camera = (name) => store.hello?.cameras.find((each) => each.name ==
  * @returns {Decision|undefined}
  */
 export const decisionOf = (name) => (store.state?.online && name ? store.state.cameras[name] : undefined);
+/**
+ * Why there is no decision about a camera; "": there is one.
+ * @param {string} name
+ */
+export const whyUndecided = (name) => (!store.state?.online ? "The vehicle is offline." : decisionOf(name) ? "" : `The vehicle has no camera ${name}.`);
 export const mode = () => (store.state?.online ? store.state.mode : null);
 export const inControl = () => store.connected && store.holder === "you";
 

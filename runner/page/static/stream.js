@@ -122,14 +122,14 @@ export class Stream {
     this.late_until = 0;
   }
 
-  /** The vehicle's decision about this camera. */
+  /** The vehicle's decision about this camera; undefined: the vehicle does not have it. */
   onDecision(decision) {
-    const { on, sending, fault, slow_fps = null } = decision;
+    const { on = null, sending = null, fault, slow_fps = null } = decision ?? {};
     const begins = on && sending && (this.on === false || this.sending === false);
     Object.assign(this, { on, sending, slow_fps });
     this.failed_at = fault ? (this.failed_at ?? now()) : null;
     if (begins) this.resetTimes();
-    this.updateRegion(decision);
+    if (decision) this.updateRegion(decision);
   }
 
   /** Track which part of the full image the pictures show, once it has been read back. */

@@ -1,6 +1,6 @@
 /** The tiles: one per camera, with its status, its picture and the values of its stream. */
 
-import { alertStatus, camera, decisionOf, enlarge, inControl, listen, publish, select, store } from "./store.js";
+import { alertStatus, camera, decisionOf, enlarge, inControl, listen, publish, select, store, whyUndecided } from "./store.js";
 import { drawFirst, reportSize, transferCanvas } from "./link.js";
 import { pending, request, whyNoControl } from "./requests.js";
 import { dragRegion, shownRegion } from "./roi.js";
@@ -265,7 +265,7 @@ function refresh(name, index) {
 
 function refreshStatus(name, { element, status, shape, word, refused }) {
   const now = store.status[name] ?? "synchronising";
-  const why = now === "unsupported" ? store.refused[name] : decisionOf(name)?.fault;
+  const why = now === "unsupported" ? store.refused[name] : (decisionOf(name)?.fault ?? (store.state?.online ? whyUndecided(name) : ""));
   refused.hidden = !why;
   setText(refused, why ?? "");
   setAttribute(element, "data-status", now);
@@ -282,7 +282,7 @@ function refreshSwitch(name, { on }) {
   setAttribute(on, "data-pending", requested ? "" : null);
   on.disabled = !inControl() || !now;
   setText(on, requested ? (requested.event.on ? "on…" : "off…") : now ? (now.on ? "on" : "off") : "–");
-  setAttribute(on, "title", on.disabled ? (now ? whyNoControl() : "the vehicle is offline") : withKey("switch this camera on or off", "switch"));
+  setAttribute(on, "title", on.disabled ? (now ? whyNoControl() : whyUndecided(name)) : withKey("switch this camera on or off", "switch"));
 }
 
 function refreshCaption(name, { rates, form, reason }) {

@@ -170,7 +170,7 @@ function onState(message) {
   const wentOffline = station.online && !message.online;
   station.online = message.online;
   if (wentOffline) judgeAll(); // mark each picture before the banner names the cause
-  for (const stream of streams) if (message.cameras?.[stream.name]) stream.onDecision(message.cameras[stream.name]);
+  if (message.cameras) for (const stream of streams) stream.onDecision(message.cameras[stream.name]);
 }
 
 function applyGuides() {
