@@ -183,6 +183,42 @@ def test_a_saved_place_of_a_removed_camera_is_reported(tmp_path: Path, robot: Ve
     ]
 
 
+@pytest.mark.parametrize(
+    "content, problem",
+    [
+        (
+            "vehicles: {delivery_robot: {mast: {row: 0}}}\n",
+            "vehicles.delivery_robot.mast.column: missing: must be given",
+        ),
+        ("vehicles: [\n", "line 2: expected the node content, but found '<stream end>'"),
+        (b"\xff\xfe", None),
+        (None, None),  # a folder
+    ],
+)
+def test_a_wrong_file_keeps_nobody_from_driving(
+    tmp_path: Path, robot: Vehicle, content: str | bytes | None, problem: str | None
+) -> None:
+    path = tmp_path / "layout" / "alice.yaml"
+    path.parent.mkdir()
+    if content is None:
+        path.mkdir()
+    else:
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    layouts = Layouts(tmp_path, "alice")
+    (note,) = layouts.notes(robot)
+    assert layouts.places(robot) == own_places(robot)
+    assert note.startswith(f"{path}: {problem or ''}")
+    assert note.endswith("; the vehicle's own layout is shown")
+    with pytest.raises(UserError):  # it stays as it is until it is mended
+        layouts.save(robot, SAVED)
+    if isinstance(content, str):
+        assert path.read_text() == content
+        path.unlink()
+        layouts.save(robot, SAVED)
+        assert layouts.places(robot)["rear"] == Place(0, 2)
+        assert not list(layouts.notes(robot))
+
+
 # --- validate ---------------------------------------------------------------------------------------------------------
 
 

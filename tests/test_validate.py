@@ -435,3 +435,26 @@ def test_a_word_that_names_no_file_of_a_configuration(tod: Command, conf: UserCo
     conf.write("modes/a.yaml", "defaults: [paper, _self_]\n").write("../x.yaml", "a: 1\n")
     result = tod("validate", word.format(conf.path))
     assert (result.status, result.err) == (2, f"command line: {expected.format(conf.path)}\n")
+
+
+def test_files_in_linked_folders_are_checked_and_loops_are_not_followed(tod: Command, conf: UserConf) -> None:
+    shared = conf.path.with_name("shared")
+    conf.write("../shared/vehicle/van.yaml", "defaults: [delivery_robot]\nheigth: 1\n").write(
+        "../shared/graph/old/mine.yaml", ""
+    ).write("config.yaml", "{}\n")
+    for name in ("vehicle", "graph"):
+        (conf.path / name).symlink_to(shared / name)
+    (shared / "vehicle" / "up").symlink_to(conf.path)  # loops: to the directory itself, one of each other, far above
+    (shared / "vehicle" / "across").symlink_to(shared / "graph")
+    (shared / "graph" / "across").symlink_to(shared / "vehicle")
+    (conf.path / "cameras").symlink_to("/")
+    found = [line.replace(str(conf.path), "~") for line in tod("validate", conf.word).problems]
+    nested = "would be ignored: files must be directly in"
+    assert [line for line in found if "van.yaml" in line or "mine.yaml" in line] == [
+        f"~/graph/across/van.yaml: {nested} graph/, not in subfolders",
+        f"~/graph/old/mine.yaml: {nested} graph/, not in subfolders",
+        "~/vehicle/van.yaml: heigth: unknown key; expected one of defaults, name, cameras, latency, dimensions",
+        f"~/vehicle/across/old/mine.yaml: {nested} vehicle/, not in subfolders",
+    ]
+    named = tod("validate", str(conf.path / "vehicle" / "van.yaml")).problems
+    assert [line.replace(str(conf.path), "~") for line in named] == [line for line in found if "heigth" in line]

@@ -63,7 +63,9 @@ class Layouts:
 
     user      directory of the user; None: nothing can be saved
     operator  name of the operator, and of the file
-    raises    UserError for an invalid name; ConfigError with all problems of the file
+    raises    UserError for an invalid name
+
+    A file that is wrong keeps nobody from driving: the vehicle's own places apply, and `notes` says so.
     """
 
     def __init__(self, user: Path | None = None, operator: str = WITHOUT_KEYS) -> None:
@@ -72,7 +74,13 @@ class Layouts:
         if not OPERATOR.fullmatch(operator):
             raise UserError("keys", "", repr(operator), OPERATOR_RULE.removeprefix("topic: "))
         self.path = user / LAYOUT / f"{operator}.yaml" if user else None
-        self._saved = self._read()
+        self._saved, self._problems = _Saved(), list[str]()
+        try:
+            self._saved = self._read()
+        except ConfigError as error:
+            self._problems = [str(problem) for problem in error.problems]
+        except UserError as error:
+            self._problems = [str(error)]
 
     def places(self, vehicle: Vehicle) -> Places:
         """The places of a vehicle's cameras: those saved for it, otherwise its own."""
@@ -84,7 +92,8 @@ class Layouts:
         return self._saved.drive.get(vehicle.name)
 
     def notes(self, vehicle: Vehicle) -> Iterator[str]:
-        """Notes about saved places of a vehicle that have no effect."""
+        """Notes about a file that is wrong, and about saved places of a vehicle that have no effect."""
+        yield from (f"{problem}; the vehicle's own layout is shown" for problem in self._problems)
         named = [(f"vehicles.{vehicle.name}.{name}", name) for name in self._saved.vehicles.get(vehicle.name, {})]
         named += [(f"drive.{vehicle.name}: {name}", name) for name in _cameras(self._saved.drive.get(vehicle.name, {}))]
         for where, name in named:
@@ -124,7 +133,7 @@ class Layouts:
             sections[vehicle.name] = read(document)
         saved = saved._replace(**{part: sections})
         write_whole(self.path, _text(saved).encode())
-        self._saved = saved
+        self._saved, self._problems = saved, []
 
     def _read(self) -> _Saved:
         with os_errors_as(partial(UserError, str(self.path), "", None)):

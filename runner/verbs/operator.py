@@ -73,8 +73,8 @@ def _served(operator: LiveOperator, conf: Path | None) -> Iterator[PageServer | 
 
     layouts = Layouts(conf, station.identity if vehicle.keys else WITHOUT_KEYS)
     page = PageServer(vehicle, station, keyring=page_keyring(vehicle), layouts=layouts)
-    page.start()
     station.listeners.append(page)
+    page.start()
     station.note(f"page: {page.url}")
     try:
         yield page

@@ -151,13 +151,21 @@ def _directories(arguments: Arguments) -> dict[Path | None, list[Path] | None]:
         if not file.is_file():
             raise ArgumentError("", word, "no such file")
         inside = [arguments.conf] if arguments.conf else [*file.parents, *file.absolute().parents]
-        above = [conf for conf in inside if file.resolve().is_relative_to(conf.resolve()) and _has_groups(conf)]
+        above = [conf for conf in inside if _inside(conf, file) and _has_groups(conf)]
         if not above:
             rule = "is in no configuration directory: none above it has vehicle/, cameras/, ..."
             raise ArgumentError("", word, f"is not in {arguments.conf}" if arguments.conf else rule)
         conf = above[0]
-        found.setdefault(conf, []).append(conf / file.resolve().relative_to(conf.resolve()))  # type: ignore[union-attr]
+        found.setdefault(conf, []).append(_inside(conf, file))  # type: ignore[arg-type]  # it is
     return found
+
+
+def _inside(conf: Path, file: Path) -> Path | None:
+    """A file's path below a directory, as named or with all links followed; None: it is elsewhere."""
+    for path, top in ((Path(os.path.abspath(file)), Path(os.path.abspath(conf))), (file.resolve(), conf.resolve())):
+        if path.is_relative_to(top):
+            return conf / path.relative_to(top)
+    return None
 
 
 def _has_groups(directory: Path) -> bool:
@@ -178,11 +186,22 @@ def check_files(directories: Sequence[Path], named: Collection[Path] | None) -> 
 
 
 def _yaml_files(directory: Path) -> Iterator[Path]:
-    """YAML files, except those in data folders and hidden folders."""
-    for folder, folders, names in os.walk(directory):
-        top = Path(folder) == directory
-        folders[:] = sorted(name for name in folders if name[0] != "." and not (top and name in DATA))
-        yield from (Path(folder, name) for name in sorted(names) if _is_yaml(name))
+    """YAML files, also those in linked folders, except those in data folders and hidden folders."""
+    for folder, folders, names in os.walk(directory, followlinks=True):
+        here = Path(folder)
+        skipped = DATA if here == directory else ()
+        folders[:] = sorted(
+            name for name in folders if name[0] != "." and name not in skipped and not _leads_back(here / name)
+        )
+        yield from (here / name for name in sorted(names) if _is_yaml(name))
+
+
+def _leads_back(folder: Path) -> bool:
+    """Whether a folder is a link to one of those that lead to it: following it would not end."""
+    if not folder.is_symlink():
+        return False
+    target = folder.resolve()
+    return any(above.resolve().is_relative_to(target) for above in folder.absolute().parents)
 
 
 def _is_yaml(name: str) -> bool:
