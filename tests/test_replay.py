@@ -120,6 +120,15 @@ def test_a_file_of_events(tod: Command, events_file: Path) -> None:
     assert [json.loads(line)["total_kbps"] for line in result.out.splitlines()] == [3000, 8000]
 
 
+@pytest.mark.parametrize("text", ["", '{"t": 1.0, "log": "dropped", "lines": 3}\n'])
+def test_an_input_without_events_is_named(tod: Command, tmp_path: Path, text: str) -> None:
+    empty = tmp_path / "drive.jsonl"
+    empty.write_text(text)
+    status, out, err = tod("replay", *PAPER, f"input={tmp_path}")
+    assert (status, out) == (0, "")
+    assert err.startswith(f"{empty}: has no events, so there is nothing to replay\n")
+
+
 def test_standard_input_and_output() -> None:
     story = lines([predicted(0, 3000), {"t": 1, "event": "camera_switched", "camera": "ü", "on": True}])
     result = process("replay", *PAPER, stdin=story)

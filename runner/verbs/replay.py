@@ -280,7 +280,7 @@ def events(lines: Iterable[str], name: str, uplink: MeasuredUplink | None = None
     uplink  measures the link again from the drive's reception reports, in place of the drive's own measurements
     raises  UserError with the number of the line
     """
-    last, dropped, warnings = 0.0, 0, list[str]()
+    last, dropped, warnings, is_empty = 0.0, 0, list[str](), True
     skipped = OTHER_KINDS if uplink else (*OTHER_KINDS, REPORTS)
     for number, document in read_lines(lines, name, warnings, skipped=skipped):
         if is_log(document):
@@ -289,6 +289,7 @@ def events(lines: Iterable[str], name: str, uplink: MeasuredUplink | None = None
                 continue
             record = line_from_json(document) if uplink else None
             if uplink and isinstance(record, ReceptionReported) and (measured := uplink.take(record)):
+                is_empty = False
                 yield to_json(measured), measured
             continue
         if uplink and document["event"] == NAMES[LinkMeasured] and "camera" not in document:
@@ -296,8 +297,10 @@ def events(lines: Iterable[str], name: str, uplink: MeasuredUplink | None = None
         if document["t"] < last:
             problem = f"t: {document['t']}: must not decrease; the event before was at {last}"
             raise UserError(f"{name}: line {number}", "", None, problem)
-        last = document["t"]
+        last, is_empty = document["t"], False
         yield document, parse(document)
+    if is_empty:
+        warnings.append(f"{name}: has no events, so there is nothing to replay")
     if dropped:
         warnings.append(f"{name}: dropped lines: {dropped}; decisions may differ from the drive's")
     print("\n".join(warnings), end="\n" if warnings else "", file=sys.stderr)
