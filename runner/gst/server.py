@@ -168,7 +168,7 @@ class CameraServer:
         self._progress: dict[str, tuple[int, float]] = {}  # by such a camera, frame count and when it last changed
         self._stopped = threading.Event()
         self._server = GstRtspServer.RTSPServer()
-        self._server.set_address(media.host)
+        self._server.set_address(ip_address_of(media.host))  # of a name with several, IPv4
         self._server.set_service(str(media.port))
         self._server.set_backlog(BACKLOG)
         self._server.set_content_length_limit(MAX_BODY_BYTES)

@@ -15,7 +15,7 @@ from contextlib import ExitStack, contextmanager, suppress
 
 import pytest
 
-from rig import SMALL_FRONT, streaming, until
+from rig import SMALL_FRONT, answers, streaming, until
 from rtsp_client import RtspClient
 from runner.core.commands import Command
 from runner.gst import GLib, Gst
@@ -109,6 +109,20 @@ def asking_options(vehicle, camera):
 
 
 # --- opening ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_name_with_addresses_of_both_kinds_is_served_over_ipv4(monkeypatch):
+    """As localhost on many machines, whose operators call 127.0.0.1; the library alone may listen on ::1 only."""
+    found = socket.getaddrinfo
+
+    def resolve(host, *words, **named):
+        if host != "both.example":
+            return found(host, *words, **named)
+        return [(socket.AF_INET6, 1, 6, "", ("::1", 0, 0, 0)), (socket.AF_INET, 1, 6, "", ("127.0.0.1", 0))]
+
+    monkeypatch.setattr(socket, "getaddrinfo", resolve)
+    with serving("media.host=both.example") as vehicle:
+        assert answers(vehicle.port)
 
 
 @pytest.mark.parametrize(
