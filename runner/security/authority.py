@@ -21,6 +21,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 
@@ -64,6 +65,24 @@ class Issued(msgspec.Struct, frozen=True):
     revoked: datetime | None = None
 
 
+class Wanted(NamedTuple):
+    """Keys to be issued: as in `Issued`."""
+
+    name: str
+    role: Role
+    hosts: tuple[str, ...] = ()
+
+    def check(self) -> None:
+        """raises UserError for a name or a host that no keys can have"""
+        if not NAME.fullmatch(self.name) or (self.name in RESERVED) is not (self.role is Role.BROKER):
+            rule = f"must be 1 to 64 letters, digits, _ and -, and none of {', '.join(RESERVED)}"
+            raise ArgumentError(self.role, repr(self.name), rule)
+        if not all(map(is_host, self.hosts)):
+            rule = "must be addresses or names without a port, in ASCII: an international one begins with xn--"
+            argument = "broker" if self.role is Role.BROKER else "host"
+            raise ArgumentError(argument, ", ".join(self.hosts), rule)
+
+
 @dataclass(frozen=True, slots=True)
 class Authority:
     """An authority's directory. Only one process at a time changes it, see `opened`.
@@ -101,20 +120,32 @@ class Authority:
         """The newest certificate of each name, in order of first issue."""
         return list({issued.name: issued for issued in self._issued()}.values())
 
+    def check(self, wanted: Sequence[Wanted], *known: tuple[str, str | None]) -> None:
+        """Check a whole request before anything of it is done.
+
+        known   by argument, a name that must have keys, or be among those wanted
+        raises  UserError for a name that is taken by another role, or unknown
+        """
+        roles = {issued.name: issued.role for issued in self.holders()}
+        for name, role, _ in wanted:
+            if roles.setdefault(name, role) is not role:
+                raise ArgumentError(role, repr(name), f"is taken: {name} is a {roles[name]}")
+        for argument, each in known:
+            if each and each not in {name for name, _, _ in wanted}:
+                self._known(each, argument, revoked=argument == "revoke")
+
     def issue(self, name: str, role: Role, hosts: Sequence[str]) -> bool:
         """Create a holder's directory; returns False if it already has one with the same role and hosts.
 
         raises  UserError for a name that is taken by another role or invalid
         """
-        if not NAME.fullmatch(name) or (name in RESERVED) is not (role is Role.BROKER):
-            rule = f"must be 1 to 64 letters, digits, _ and -, and none of {', '.join(RESERVED)}"
-            raise ArgumentError(role, repr(name), rule)
+        wanted = Wanted(name, role, tuple(hosts))
+        wanted.check()
+        self.check([wanted])
         present = next((issued for issued in self.holders() if issued.name == name), None)
-        if present and present.role is not role:
-            raise ArgumentError(role, repr(name), f"is taken: {name} is a {present.role}")
         if present and self._in_use(present) and (not hosts or set(hosts) == set(present.hosts)):
             return False
-        self._renew(name, role, tuple(hosts) or (present.hosts if present else ()))
+        self._renew(name, role, wanted.hosts or (present.hosts if present else ()))
         return True
 
     def rotate(self, name: str) -> None:
@@ -167,8 +198,12 @@ class Authority:
     def _write_issued(self, issued: list[Issued]) -> None:
         _write(self._own / ISSUED, msgspec.json.format(msgspec.json.encode(issued)))
 
-    def _known(self, name: str, argument: str) -> Issued:
-        active = {issued.name: issued for issued in self.holders() if not issued.revoked}
+    def _known(self, name: str, argument: str, revoked: bool = False) -> Issued:
+        """The certificate in use of a name; raises UserError for an unknown one.
+
+        revoked  whether a revoked one will do
+        """
+        active = {issued.name: issued for issued in self.holders() if revoked or not issued.revoked}
         if name not in active:
             raise ArgumentError(argument, repr(name), f"must be one of {', '.join(active) or '(none yet)'}")
         return active[name]
@@ -193,10 +228,6 @@ class Authority:
     def _renew(self, name: str, role: Role, hosts: tuple[str, ...]) -> None:
         # Listed before anybody has it: a serial number unknown to the authority could never be revoked.
         serial, until = secrets.randbits(159) | 1, self.now() + VALID
-        if not all(map(is_host, hosts)):
-            rule = "must be addresses or names without a port, in ASCII: an international one begins with xn--"
-            argument = "broker" if role is Role.BROKER else "host"
-            raise ArgumentError(argument, ", ".join(hosts), rule)
         pair = new_certificate(self._pair, name, role, hosts, serial, self.now(), VALID)
         if any(issued.name == name for issued in self.holders()):
             self._renew_media_secret(role)

@@ -26,7 +26,7 @@ from datetime import datetime
 
 from runner.core.roles import PEOPLE, Role
 from runner.errors import ArgumentError
-from runner.security.authority import Authority, Issued
+from runner.security.authority import Authority, Issued, Wanted
 from runner.verbs import Arguments
 
 ROLES = (Role.VEHICLE, *PEOPLE)
@@ -37,13 +37,17 @@ def run(arguments: Arguments) -> int:
     values = arguments.values
     hosts = tuple(filter(None, values.get("host", "").split(",")))
     named = [role for role in ROLES if role in values]
-    if hosts and len([role for role in named if role is not Role.BROKER]) == 0:
+    if hosts and not named:
         raise ArgumentError("host", values["host"], "must come with the name of a vehicle or operator")
+    wanted = [Wanted(values[role], role, _hosts_of(role, named, hosts)) for role in named]
+    if "broker" in values:
+        wanted.append(Wanted("broker", Role.BROKER, (values["broker"],)))
+    for each in wanted:  # everything is checked before the first file is written
+        each.check()
     authority = Authority(output)
     with authority.opened():
-        changed = [values[role] for role in named if authority.issue(values[role], role, _hosts_of(role, named, hosts))]
-        if "broker" in values and authority.issue("broker", Role.BROKER, (values["broker"],)):
-            changed.append("broker")
+        authority.check(wanted, *((action, values.get(action)) for action in ("rotate", "revoke")))
+        changed = [each.name for each in wanted if authority.issue(*each)]
         for action in (authority.rotate, authority.revoke):
             if name := values.get(action.__name__):
                 action(name)
