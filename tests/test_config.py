@@ -529,6 +529,14 @@ def test_a_base_that_does_not_exist(conf: UserConf, tod: Command) -> None:
             ["inputs.buttons.view=hat9-up", "inputs.buttons.map=hat9-up"],
             "inputs.buttons.map: 'hat9-up': is already assigned to view",
         ),
+        (["~graph=1"], "~graph=1: what follows = must be the name of a file; to remove the choice itself: ~graph"),
+        (["~pqos=[1]"], "~pqos=[1]: what follows = must be the name of a file; to remove the choice itself: ~pqos"),
+        (["cameras.rear_center.fps=0.1"], "fps: 0.1: with vbv_frames 1.5 of its graph it must be at least 0.15"),
+        (["graph.jitter_buffer_ms=1000000"], "graph.jitter_buffer_ms: 1000000: must be at most 10000"),
+        (
+            ["cameras.rear_center.rate_quality.b_full_kbps=1e9"],
+            "cameras.rear_center.rate_quality.b_full_kbps: 1000000000.0: must be at most 2000000",
+        ),
         (["~cameras.nothing"], "Could not delete from config. 'cameras.nothing' does not exist."),
     ],
 )

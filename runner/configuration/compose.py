@@ -159,6 +159,10 @@ def _compose(overrides: Sequence[Override], directories: Sequence[Path]) -> tupl
     except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError([_hydra_problem(error, directories)]) from None
     except (TypeError, ValueError) as error:
+        if "deletion value must be a string" in str(error):
+            word = " ".join(o.text for o in overrides if o.deletes and repr(o.text) in str(error))
+            rule = f"what follows = must be the name of a file; to remove the choice itself: {word.partition('=')[0]}"
+            raise ConfigError([Problem(COMMAND_LINE, "", word, rule)]) from None
         if not re.search(r"is not an int|invalid literal for int|list indices must be integers", str(error)):
             raise
         rule = "list entries are addressed by index, from 0, and cannot be removed; override the whole list"

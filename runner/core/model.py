@@ -25,6 +25,7 @@ Value = bool | int | float | str  # type of an element's property in YAML
 
 PLACEHOLDER = re.compile(r"\{(\w+)\}")  # in the properties of elements: "{clip}"
 SMALLEST_SIDE_PX = 16  # one H.264 macroblock; encoders refuse less
+MOST_BUFFER_MS = 10_000  # of the encoder's rate control, as x264enc allows
 
 
 class ModelError(ValueError):
@@ -436,6 +437,10 @@ class Camera:
             if self.crop.x + self.crop.width > width or self.crop.y + self.crop.height > height:
                 found = f"{self.crop.width}x{self.crop.height} at {self.crop.x},{self.crop.y}"
                 raise ModelError("native", found, f"must lie inside the native {width}x{height}")
+        frames = float(self.graph.settings.get("vbv_frames", 0))
+        if 1000 * frames > MOST_BUFFER_MS * self.fps:
+            rule = f"with vbv_frames {frames:g} of its graph it must be at least {1000 * frames / MOST_BUFFER_MS:g}"
+            raise ModelError("fps", plain(self.fps), rule)
 
     @property
     def source_size(self) -> tuple[int, int]:
