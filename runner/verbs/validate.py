@@ -156,7 +156,7 @@ def _directories(arguments: Arguments) -> dict[Path | None, list[Path] | None]:
             rule = "is in no configuration directory: none above it has vehicle/, cameras/, ..."
             raise ArgumentError("", word, f"is not in {arguments.conf}" if arguments.conf else rule)
         conf = above[0]
-        found.setdefault(conf, []).append(_inside(conf, file))  # type: ignore[arg-type]  # it is
+        found.setdefault(conf, []).append(_inside(conf, file))  # type: ignore[union-attr, arg-type]
     return found
 
 
