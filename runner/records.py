@@ -130,6 +130,7 @@ class VehicleState:
     fault       why the rules could not decide, so that an earlier decision stays in force
     attention   of the driver; absent: the operator in control states none
     operator    id of the operator in control; absent: none
+    certificate_ends  when the certificate of the vehicle expires, s since 1970; absent: it has none
     """
 
     t: float = field(compare=False)
@@ -142,6 +143,7 @@ class VehicleState:
     asked_kbps: Number | None = None
     attention: Attention | UnsetType = UNSET
     operator: str | UnsetType = UNSET
+    certificate_ends: float | UnsetType = UNSET
 
     @property
     def total_words(self) -> str:

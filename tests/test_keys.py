@@ -31,6 +31,7 @@ from runner.security.authority import Authority, Issued
 from runner.security.broker_files import broker_settings
 from runner.security.exposure import keyring_of
 from runner.security.keyring import Keyring
+from runner.verbs.doctor import _certificates
 
 NOW = datetime(2026, 5, 1, tzinfo=UTC)
 FIRST = ("vehicle=car", "host=10.0.0.2,car.example", "controller=alice", "broker=10.0.0.1")
@@ -57,6 +58,52 @@ def verified(authority, name, *options):
     words = ["-CAfile", directory / "authority/ca.crt", *options, directory / name / "own.crt"]
     ended = subprocess.run(["openssl", "verify", *words], capture_output=True, text=True, check=False)
     return ended.stdout + ended.stderr
+
+
+@pytest.mark.parametrize(
+    "age_d, words",
+    [
+        (300, "ok      car's certificate is valid until {end}"),
+        (
+            340,
+            "MISSING car's certificate expires on {end}, in 25 days: `tod-runner keys output=DIR rotate=car` renews it",
+        ),
+        (400, "MISSING car's certificate expired on {end}: `tod-runner keys output=DIR rotate=car` renews it"),
+        (
+            -5,
+            "MISSING car's certificate is valid from {begin} on, but it is {now} by this machine's clock: `tod-runner",
+        ),
+    ],
+)
+def test_doctor_names_a_certificate_that_expires_within_30_days(tmp_path, age_d, words):
+    now = datetime.now(UTC)
+    issued = now - timedelta(days=age_d, hours=-1)
+    authority = Authority(tmp_path / "keys", lambda: issued)
+    with authority.opened():
+        authority.issue("car", Role.VEHICLE, [])
+    (found,) = _certificates(tmp_path / "keys" / "car")
+    line = f"{'ok     ' if found.fine else 'MISSING'} {found.what}"
+    ends, begins = issued + timedelta(days=365), issued - timedelta(hours=1)
+    assert line.startswith(words.format(end=f"{ends:%Y-%m-%d}", begin=f"{begins:%Y-%m-%d}", now=f"{now:%Y-%m-%d}"))
+    assert list(_certificates(tmp_path / "keys")) == [found]  # of all holders, as for a demo
+
+
+@pytest.mark.parametrize(
+    "words, why",
+    [
+        (["vehicle=car", "controller=a,b"], "controller: 'a,b': must be 1 to 64 letters"),
+        (["vehicle=car", "controller=car"], "controller: 'car': is taken: car is a vehicle"),
+        (["vehicle=car", "broker=10.0.0.1:8883"], "broker: '10.0.0.1:8883': must be addresses or names"),
+        (["vehicle=car", "rotate=bob"], "rotate: 'bob': must be one of "),
+        (["vehicle=car", "revoke=bob"], "revoke: 'bob': must be one of "),
+    ],
+)
+def test_a_request_that_is_refused_makes_no_keys(tod, tmp_path, words, why):
+    output = tmp_path / "keys"
+    refused = tod("keys", f"output={output}", *words)
+    assert refused.status == 2
+    assert why in refused.err.replace("10.0.0.1:8883: must", "'10.0.0.1:8883': must")
+    assert {path.name for path in output.iterdir()} <= {"authority"} if output.exists() else True
 
 
 def test_a_certificate_states_name_role_hosts_and_term(authority):

@@ -30,6 +30,7 @@ import aiohttp
 from runner.configuration.layout import NOWHERE, Layouts
 from runner.core.events import Attention
 from runner.core.roles import Role
+from runner.operator.station import LinkState
 from runner.page.control import GRACE_S, Control, combined_attention, page_of
 from runner.page.history import MAX_SAMPLES, History
 from runner.page.login import COOKIE, PageLogin
@@ -70,7 +71,7 @@ def served(*overrides, layouts=None, login=None, keyring=None, note=print):
     No window is dropped for its silence: most clients here answer pings only while they receive.
     """
     port = free_port()
-    station = SimpleNamespace(state=None, note=note, user="anna", answer_s=1.0, attention=None)
+    station = SimpleNamespace(state=None, note=note, user="anna", answer_s=1.0, attention=None, link_state=LinkState())
     page = PageServer(vehicle(f"page.port={port}", *overrides), station, layouts=layouts, keyring=keyring)
     page._login = login or page._login
     with pytest.MonkeyPatch.context() as patch:
@@ -100,6 +101,25 @@ def test_a_login_whose_body_never_comes_is_closed(monkeypatch):
         own = f"Host: localhost:{port}\r\nOrigin: https://localhost:{port}\r\n"
         line.sendall(f"POST /login HTTP/1.1\r\n{own}Content-Length: 100\r\n\r\n".encode())
         assert line.recv(1) == b""
+
+
+@pytest.mark.parametrize(
+    "handshake",
+    [
+        UPGRADE.replace("Connection:", "Connection:\xff"),
+        UPGRADE.replace("Upgrade: ", "Upgrade: \xc3"),
+        UPGRADE.replace("-Key: ", "-Key: \xff"),
+        UPGRADE.replace("-Key: ", "-Key: \xc3\xa9"),  # UTF-8
+        UPGRADE.replace("-Version: ", "-Version: \xfe"),
+    ],
+)
+def test_a_handshake_that_is_not_ascii_is_the_clients_fault(handshake):
+    notes = []
+    with served(note=notes.append) as (port, _), socket.create_connection(("127.0.0.1", port), timeout=60) as line:
+        text = f"GET /live?viewer=me HTTP/1.1\r\nHost: localhost:{port}\r\n{handshake}\r\n\r\n"
+        line.sendall(text.encode("latin-1"))
+        assert line.recv(65536)[8:].startswith(b" 400 ")
+    assert notes == []
 
 
 class OneSession:

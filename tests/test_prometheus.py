@@ -20,6 +20,7 @@ from rig import CHECKOUT, free_port
 from runner.core.model import Endpoint
 from runner.errors import RunError
 from runner.metrics.side import metrics_of
+from runner.mqtt.link import ControlLink
 from runner.records import CameraTelemetry, Telemetry
 
 pytest.importorskip("prometheus_client")
@@ -136,6 +137,22 @@ def test_a_vehicle_whose_state_never_arrived_is_offline():
     _MetricsListener(SideMetrics(metrics, None))
     (online,) = metrics.collect()
     assert (online.name, [sample.value for sample in online.samples]) == ("tod_vehicle_online", [0.0])
+
+
+def test_the_control_link_and_its_certificates_have_metrics():
+    from runner.metrics.prometheus import Metrics
+
+    metrics = Metrics("car")
+    metrics.link = ControlLink(Endpoint("127.0.0.1", 1), None, {}, lambda here: None, print)
+    (connected,) = metrics.collect()  # without keys no certificate
+    assert (connected.name, connected.samples[0].value) == ("tod_control_connected", 0.0)
+    metrics.link.certificate_ends = lambda: {"own": 1.8e9}
+    _, ends = metrics.collect()
+    assert (ends.name, ends.samples[0].labels["whose"], ends.samples[0].value) == (
+        "tod_certificate_expiry_timestamp_seconds",
+        "own",
+        1.8e9,
+    )
 
 
 def test_free_space_is_that_of_the_disk_of_the_log(tmp_path):

@@ -12,7 +12,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 from wsgiref.simple_server import WSGIRequestHandler, make_server
 
 from prometheus_client import CollectorRegistry, make_wsgi_app
@@ -26,6 +26,17 @@ from runner.system.ports import check_port_free
 
 STOP_S = 1.0
 HOSTS = ("127.0.0.1", "localhost")
+
+
+class Link(Protocol):
+    """A side's control link."""
+
+    @property
+    def is_connected(self) -> bool: ...
+
+    def certificate_ends(self) -> Mapping[str, float]:
+        """By whose certificate it is, the time until which it is valid, s since 1970."""
+
 
 Healthy = Callable[[], str | None]  # why the side does not work; None: it does
 Reading = Callable[[Any], float | None]  # of a record, or of its entry for a camera; None: unknown, left out
@@ -105,6 +116,7 @@ class Metrics(Collector):
     def __init__(self, vehicle: str, log: Path | None = None) -> None:
         self._vehicle, self._log = vehicle, log
         self.healthy: Healthy | None = None
+        self.link: Link | None = None
         self._newest: dict[type, Any] = {}
         self._online: bool | None = None
 
@@ -126,6 +138,14 @@ class Metrics(Collector):
             yield self._family("log_free_bytes", "Free space for the drive's log", [((), float(_free(self._log)))])
         if self.healthy:
             yield self._family("healthy", "1 while the side works", [((), float(self.healthy() is None))])
+        if self.link:
+            yield self._family(
+                "control_connected", "1 while there is a control link", [((), float(self.link.is_connected))]
+            )
+            if ends := self.link.certificate_ends():
+                text = "When a certificate of the control link expires, s since 1970"
+                values = [((whose,), at) for whose, at in ends.items()]
+                yield self._family("certificate_expiry_timestamp_seconds", text, values, ("whose",))
         for kind, record in list(self._newest.items()):
             of_all, of_camera = METRICS[kind]
             for metric in of_all:
@@ -173,14 +193,14 @@ class _Server(ThreadingWSGIServer):
 
 
 @contextmanager
-def served(metrics: Metrics, port: int, healthy: Healthy) -> Iterator[None]:
+def served(metrics: Metrics, port: int, healthy: Healthy, link: Link | None) -> Iterator[None]:
     """Serve metrics and health on 127.0.0.1 for the duration of the block.
 
     raises  RunError if the port is in use
     """
     endpoint = Endpoint(HOSTS[0], port)
     check_port_free(endpoint)
-    metrics.healthy = healthy
+    metrics.healthy, metrics.link = healthy, link
     registry = CollectorRegistry(auto_describe=False)
     registry.register(metrics)
     scrape = make_wsgi_app(registry)

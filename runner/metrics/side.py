@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from runner.metrics.prometheus import Healthy, Metrics
+    from runner.metrics.prometheus import Healthy, Link, Metrics
 
 
 class SideMetrics:
@@ -28,12 +28,12 @@ class SideMetrics:
         if self._metrics:
             self._metrics.show_online(online)
 
-    def serve(self, healthy: Healthy) -> None:
+    def serve(self, healthy: Healthy, link: Link | None = None) -> None:
         """raises RunError if the port is in use"""
         if self._metrics and self._port:
             from runner.metrics.prometheus import served
 
-            self._open.enter_context(served(self._metrics, self._port, healthy))
+            self._open.enter_context(served(self._metrics, self._port, healthy, link))
 
     def close(self) -> None:
         self._open.close()

@@ -6,6 +6,7 @@ import errno
 import json
 import select
 import socket
+import ssl
 import sys
 import threading
 import time
@@ -32,16 +33,34 @@ CLOSE_S, CLOSING_S = 2.0, 0.1  # for signing off, and between two looks at wheth
 PERIODIC = {"telemetry", "reception", "clock", "advice", "steering"}  # the next one follows soon: QoS 0
 SUPERSEDED = PERIODIC | {"state"}  # replaced by a later message, and so not sent ...
 UNSENT_BYTES = 4096  # ... while this much is queued: after an outage it would delay current messages
+MOST_REASONS = 10  # reported of one outage: a peer chooses some of their words
+HEARD_BYTES = 32  # what a program says first tells which one it is
 RETAINED = ("state", "telemetry", "configuration")
 
 
 class _Client(Client):
-    """A client whose loop survives a broker that violates the protocol.
+    """A client whose loop survives a broker that violates the protocol, and which knows how a connection ended.
 
     on_broken  called with the violation
+    heard      the first bytes that arrived over the connection
+    error      of its socket; None: none occurred
     """
 
     on_broken: Callable[[Exception], None]
+    heard = b""
+    error: OSError | None = None
+
+    def _sock_recv(self, bufsize: int) -> bytes:
+        """paho keeps neither what it could not read nor the error to itself: without this override both are unknown."""
+        try:
+            data = super()._sock_recv(bufsize)
+        except BlockingIOError:
+            raise
+        except OSError as error:
+            self.error = error
+            raise
+        self.heard += data[: HEARD_BYTES - len(self.heard)]
+        return data
 
     def loop_forever(self, timeout: float = LOOP_S, retry_first_connection: bool = False) -> MQTTErrorCode:
         """Run in the thread started by `loop_start`."""
@@ -79,14 +98,27 @@ class ControlLink:
         self._login = login
         self._broker, self._will, self._listen = broker, will, listen
         self._on_connected, self._on_report = on_connected, on_report
-        self._connection_fault: str | None = None  # why there is no connection, as reported
+        self.fault: str | None = None  # why there is no connection; None: there is one, or none was lost or tried yet
+        self._reported: set[str] = set()  # faults since the last connection
+        self._expiring: set[str] = set()  # certificates that were reported
+        self._is_explained = False  # whether it was said why this connection has failed
         self._report_fault = LimitedReports(on_report)  # of a message
         self.dropped = 0
         self._listening, self._closing = threading.Event(), threading.Event()
         self._client = self._new_client()
 
+    @property
+    def is_connected(self) -> bool:
+        """Whether this side receives its messages."""
+        return self._listening.is_set()
+
+    def certificate_ends(self) -> Mapping[str, float]:
+        """By whose certificate it is, the time until which it is valid, s since 1970; empty without keys."""
+        return self._login.ends() if self._login else {}
+
     def connect(self) -> None:
         """Connect, and stay connected; returns immediately."""
+        self._report_expiring()
         self._client.connect_async(self._broker.host, self._broker.port, KEEPALIVE_S)
         self._client.loop_start()
 
@@ -177,22 +209,24 @@ class ControlLink:
         if self._will:
             topic, message = self._will
             client.will_set(topic, json.dumps(message), qos=1, retain=_is_retained(topic))
+        client.on_pre_connect = self._begin
         client.on_socket_open = _configure_socket
         if self._login:
             client.tls_set_context(self._login.context)
-            client.on_pre_connect = self._log_in
             client.on_socket_open = self._check_broker
-        client.on_connect_fail = lambda *_: self._failed_to_connect(sys.exception())
+        client.on_connect_fail = lambda *_: self._on_connect_fail(sys.exception())
         client.on_connect = self._on_connect
         client.on_subscribe = self._on_subscribe
-        client.on_disconnect = lambda *_: self._on_disconnect()
+        client.on_disconnect = self._on_disconnect
         for topic_filter, function in self._listen.items():
             client.message_callback_add(topic_filter, self._guarded(function))
         return client
 
-    def _log_in(self, client: Client, _data: object) -> None:
+    def _begin(self, client: Client, _data: object) -> None:
         """Use the current keys, which may have been replaced since the last connection."""
-        assert self._login
+        self._client.heard, self._client.error, self._is_explained = b"", None, False
+        if self._login is None:
+            return
         try:
             client.username_pw_set(self._login.user, self._login.refresh())
         except UserError as error:
@@ -205,7 +239,19 @@ class ControlLink:
         except RunError as error:
             sock.close()  # nothing that this peer sends is read
             raise ConnectionError(str(error)) from None
+        self._report_expiring()
         _configure_socket(client, data, sock)
+
+    def _report_expiring(self) -> None:
+        """Report, once each, which certificates expire soon."""
+        if self._login is None:
+            return
+        from runner.security.validity import expiring
+
+        for line in expiring(self._login.ends(), time.time()):
+            if line not in self._expiring:
+                self._expiring.add(line)
+                self._on_report(f"{line}: `tod-runner keys output=DIR rotate=NAME` renews it")
 
     def _guarded(self, function: Callable[[MqttMessage], None]) -> Callable[[Client, object, MQTTMessage], None]:
         def on_message(_client: Client, _data: object, message: MQTTMessage) -> None:
@@ -228,7 +274,7 @@ class ControlLink:
 
     def _on_connect(self, _client: Client, _data: object, _flags: object, code: Any, _properties: object) -> None:
         if code.is_failure:
-            self._failed_to_connect(RunError(f"refused: {code}".lower()))
+            self._failed_to_connect(f"refused: {code}".lower())
         else:
             self._subscribe()
 
@@ -237,31 +283,60 @@ class ControlLink:
 
     def _on_subscribe(self, _client: Client, _data: object, _mid: int, codes: Any, _properties: object) -> None:
         if refused := [each for each, code in zip(self._listen, codes, strict=False) if code.is_failure]:
-            self._failed_to_connect(RunError(f"refused to subscribe to {', '.join(refused)}"))
+            self._failed_to_connect(f"refused to subscribe to {', '.join(refused)}")
             retry = threading.Timer(RETRY_S[-1], self._subscribe)
             retry.daemon = True
             retry.start()
             return
-        if self._connection_fault:
-            self._connection_fault = None
+        if self._reported:
+            self._reported.clear()
             self._on_report(f"connected to the MQTT broker at {self._broker}")
+        self.fault = None
         self._listening.set()
         self._on_connected(True)
 
-    def _on_disconnect(self) -> None:
-        if self._listening.is_set():
+    def _on_disconnect(self, _client: Client, _data: object, _flags: object, code: Any, _properties: object) -> None:
+        if not self._lose() and not self._is_explained:
+            self._failed_to_connect(self._end(silent=code == "Keep alive timeout"), perhaps_keys=True)
+
+    def _lose(self) -> bool:
+        """This side no longer receives its messages; returns whether it did."""
+        was_listening = self._listening.is_set()
+        if was_listening:
             self._listening.clear()
             self._on_connected(False)
+        return was_listening
 
     def _on_broken(self, error: Exception) -> None:
-        self._on_disconnect()
-        self._failed_to_connect(error)
+        self._failed_to_connect(str(error) if self._lose() else self._end())
 
-    def _failed_to_connect(self, error: BaseException | None) -> None:
-        why = str(getattr(error, "strerror", None) or error).lower()
-        if why != self._connection_fault and not self._closing.is_set():
-            self._connection_fault = why
-            self._on_report(f"no control link: MQTT broker at {self._broker}: {why}; retrying")
+    def _end(self, silent: bool = False) -> str:
+        """Why the connection ended before this side could listen."""
+        from runner.mqtt import refusal
+
+        client = self._client
+        return refusal.of_end(client.heard, client.error, silent, tls=self._login is not None)
+
+    def _on_connect_fail(self, error: BaseException | None) -> None:
+        from runner.mqtt import refusal
+
+        why = refusal.of_failure(error, tls=self._login is not None)
+        self._failed_to_connect(why, perhaps_keys=isinstance(error, ssl.SSLError))
+
+    def _failed_to_connect(self, why: str, perhaps_keys: bool = False) -> None:
+        """Report once why there is no control link.
+
+        perhaps_keys  a certificate of this side that does not count is the cause
+        """
+        self._is_explained = True
+        if self._closing.is_set():
+            return
+        if perhaps_keys and self._login:
+            why = self._login.invalid() or why
+        self.fault = f"no control link: MQTT broker at {self._broker}: {why}"
+        if why not in self._reported and len(self._reported) < MOST_REASONS:
+            self._reported.add(why)
+            self._on_report(f"{self.fault}; retrying")
 
 
 def _is_one_of(kinds: set[str], topic: str) -> bool:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import ssl
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any
 
 from runner.core.roles import Role
 from runner.errors import RunError
-from runner.security.keyring import Keyring, mqtt_password
+from runner.security.keyring import AUTHORITY, CERTIFICATE, Keyring, mqtt_password
+
+FILES = {"own": CERTIFICATE, "the authority's": AUTHORITY}
 
 
 class Login:
@@ -24,6 +27,8 @@ class Login:
         self._revoked = keyring.watched_revoked(on_report)
         self._own, self._secret = keyring.watched_certificate(on_report), keyring.watched_secret(on_report)
         self._broker, self._used = 0, b""  # in use: serial number of the broker's certificate, own certificate
+        self._validity = {whose: keyring.validity(name) for whose, name in FILES.items()}
+        self._broker_ends: float | None = None  # s since 1970; None: its certificate was not seen yet
         self.user = keyring.holder.name
         self.context = ssl.create_default_context(cafile=keyring.authority)
         self.context.check_hostname = False  # see `check`
@@ -39,6 +44,7 @@ class Login:
         if self._used != (own := self._own.get()):
             self.context.load_cert_chain(self._keyring.certificate, self._keyring.key)
             self._used = own
+            self._validity |= {"own": self._keyring.validity()}
         with suppress(OSError):  # `_revoked` reports it; the list that was loaded before stays in force
             self.context.load_verify_locations(self._keyring.revocation_list)
         return mqtt_password(self._secret.get())
@@ -53,9 +59,23 @@ class Login:
         if subject.get("organizationalUnitName") != Role.BROKER:
             raise RunError("the peer is not the broker: its certificate has a different role")
         self._broker = int(certificate["serialNumber"], 16)
+        self._broker_ends = ssl.cert_time_to_seconds(certificate["notAfter"])
         if self._broker in self._revoked.get():
             raise RunError("the certificate of the broker is revoked")
 
     def has_changed(self) -> bool:
         """Whether to reconnect: the broker's certificate is revoked, or there are new keys."""
         return self._broker in self._revoked.get() or self._used != self._own.get()
+
+    def invalid(self) -> str | None:
+        """Why this side's certificates do not count now, by this machine's clock; None if they do."""
+        from runner.security.validity import invalid
+
+        now = time.time()
+        found = {whose: invalid(validity, now) for whose, validity in self._validity.items()}
+        return next((f"{whose} certificate {why}" for whose, why in found.items() if why), None)
+
+    def ends(self) -> Mapping[str, float]:
+        """By whose certificate it is, the time until which it is valid, s since 1970."""
+        ends = {whose: validity.ends for whose, validity in self._validity.items()}
+        return ends if self._broker_ends is None else ends | {"the broker's": self._broker_ends}

@@ -269,5 +269,5 @@ def live_operator(
         ending.callback(operator.stop)
         if pictures:
             pictures.start()
-        metrics.serve(operator.problem)
+        metrics.serve(operator.problem, station.link)
         yield operator

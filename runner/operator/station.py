@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+from msgspec import UNSET
+
 from runner.configuration import agreement
 from runner.core.events import Attention
 from runner.core.model import Vehicle
@@ -81,6 +83,20 @@ class Listener:
     def on_note(self, note: Note) -> None:
         """A message for the operator."""
 
+    def on_link(self, link: LinkState) -> None:
+        """The control link of this side, whenever what there is to say about it changes."""
+
+
+class LinkState(NamedTuple):
+    """What there is to say about the control link.
+
+    fault     why there is none; None: there is one, or it has only just been lost
+    expiring  a sentence about each certificate of either side that expires soon
+    """
+
+    fault: str | None = None
+    expiring: tuple[str, ...] = ()
+
 
 class CameraRow(NamedTuple):
     """One camera: its rates and counters, and its state on the vehicle, if known."""
@@ -123,6 +139,7 @@ class Station:
         self._last_message = 0.0
         self._vehicles: dict[str, bool] = {}  # by name, for those known to the broker: whether online
         self._connected_at: float | None = None
+        self.link_state = LinkState()
         self._differences: str | None = None  # between both sides' configurations
         self._noted_differences: str | None = None  # as reported
         self._pending: dict[str, _PendingRequest] = {}
@@ -155,15 +172,15 @@ class Station:
         self._requests = topic(vehicle.name, "request", self.identity)
         self._receptions = topic(vehicle.name, "reception", self.identity)
         will = (self._requests, of_run(OPERATOR_GONE, self._run))
-        self._link = ControlLink(vehicle.control, will, listen, self._on_connected, self.note, login)
+        self.link = ControlLink(vehicle.control, will, listen, self._on_connected, self.note, login)
 
     def connect(self) -> None:
         """Connect to the broker, and stay connected; returns immediately."""
-        self._link.connect()
+        self.link.connect()
 
     def close(self) -> None:
         self.state = None  # so that signing off is not reported as a loss
-        self._link.close((self._requests, of_run(SIGNED_OFF, self._run)))
+        self.link.close((self._requests, of_run(SIGNED_OFF, self._run)))
 
     def ask(self, event: JsonObject, on_reply: OnReply | None = None) -> None:
         """Send a request to the vehicle.
@@ -172,12 +189,13 @@ class Station:
         """
         if self.state is None:
             if on_reply:
-                on_reply(Outcome(self._vehicle_time[0], "refused", "the vehicle is offline"))
+                reason = self.link.fault or "the vehicle is offline"
+                on_reply(Outcome(self._vehicle_time[0], "refused", reason))
             return
         identity, now = uuid.uuid4().hex, time.monotonic()
         with self._lock:
             self._pending[identity] = _PendingRequest(on_reply, event["event"], now + self.answer_s)
-        self._link.publish(self._requests, {**event, "id": identity, "as_of": self._vehicle_now(now)})
+        self.link.publish(self._requests, {**event, "id": identity, "as_of": self._vehicle_now(now)})
 
     def _announce(self, now: float) -> None:
         """Announce this operator as present, also to a vehicle that is temporarily silent."""
@@ -185,7 +203,7 @@ class Station:
             self.ask(self._presence())
         elif self._may_reach_vehicle(now):
             event = {**self._presence(), "id": uuid.uuid4().hex, "as_of": self._vehicle_now(now)}
-            self._link.publish(self._requests, event)
+            self.link.publish(self._requests, event)
 
     def _presence(self) -> JsonObject:
         attention = self.attention  # another thread may replace it
@@ -242,6 +260,7 @@ class Station:
         if self.state and now - self._last_message > SILENT_S and not is_excused:
             self._vehicle_lost(f"the vehicle has been silent for {SILENT_S:g} s")
         self._time_out(now)
+        self._check_link()
         self._check_vehicle_name(now)
         self._announce(now)  # the heartbeat
         self._compare_clocks(now)
@@ -255,7 +274,7 @@ class Station:
 
     def may_report(self) -> bool:
         """Whether a report would be sent immediately. While earlier ones wait, arrivals accumulate for the next."""
-        return not self._link.is_behind()
+        return not self.link.is_behind()
 
     def report_reception(self, arrivals: Arrivals) -> None:
         """Report arrivals since the last report to the vehicle; to be called every REPORT_S, by one thread."""
@@ -285,7 +304,7 @@ class Station:
             with self._lock:
                 self._clock_requests.append(sent)
             report = replace(report, sent=sent)
-        self._link.publish(self._receptions, to_json(report), behind=True)  # its arrivals are in no other report
+        self.link.publish(self._receptions, to_json(report), behind=True)  # its arrivals are in no other report
 
     def _worst_latency_ms(self, now: float) -> float | None:
         """Upper bound of the latency of the slowest displayed picture, ms; None: unknown, or nothing is displayed.
@@ -320,7 +339,7 @@ class Station:
     def headline(self) -> str:
         state = self.state  # another thread may replace it
         if state is None:
-            return f"{self._vehicle.name}: offline"
+            return f"{self._vehicle.name}: {self.link.fault or 'offline'}"
         clock = self.clock
         latencies = f"latencies ± {1000 * clock.bound_s:.1f} ms" if clock else "latencies still unknown"
         return f"{self._vehicle.name}, mode {state.mode}, total {state.total_words} kbit/s, {latencies}"
@@ -375,7 +394,7 @@ class Station:
             position=telemetry.position if telemetry else None,
             refused=telemetry.refused if telemetry else 0,
             cameras=cameras,
-            dropped=self._link.dropped,
+            dropped=self.link.dropped,
             speed_factor=telemetry.speed_factor if telemetry else None,
             clock_ahead_ms=round(1000 * self.clock.ahead_s, 3) if self.clock else None,
             clock_bound_ms=round(1000 * self.clock.bound_s, 3) if self.clock else None,
@@ -473,6 +492,15 @@ class Station:
         if self._differences:
             self.note(f"the vehicle's configuration differs: {self._differences}")
 
+    def _check_link(self) -> None:
+        state, ends = self.state, dict(self.link.certificate_ends())
+        if state and state.certificate_ends is not UNSET:
+            ends["the vehicle's"] = state.certificate_ends
+        before, self.link_state = self.link_state, LinkState(self.link.fault, _expiring(ends))
+        if self.link_state != before:
+            for listener in self.listeners:
+                listener.on_link(self.link_state)
+
     def _check_vehicle_name(self, now: float) -> None:
         """Report once which vehicles are online, if this one is unknown to the broker."""
         if self._connected_at is None or now - self._connected_at < FOUND_S:
@@ -515,6 +543,14 @@ class Station:
             self.note(why)
         self._telemetry = None
         self._set_state(None)
+
+
+def _expiring(ends: Mapping[str, float]) -> tuple[str, ...]:
+    if not ends:  # as without keys
+        return ()
+    from runner.security.validity import expiring
+
+    return tuple(expiring(ends, time.time()))
 
 
 def _camera_sample(row: CameraRow, measured: CameraTelemetry | None) -> CameraSample:

@@ -29,7 +29,7 @@ from runner.errors import ConfigError, RunError, UserError
 from runner.graph import video_codec
 from runner.h264.access_unit import AccessUnit, RecentUnits
 from runner.mqtt.messages import read_message
-from runner.operator.station import Listener, Station
+from runner.operator.station import LinkState, Listener, Station
 from runner.page.control import Control, combined_attention, page_of
 from runner.page.counter import CounterReading, counter_reading
 from runner.page.history import History
@@ -152,6 +152,9 @@ class PageServer(Listener):
 
     def on_steering(self, at: float, rad: float) -> None:
         self._call_soon(self._broadcast, "steering", {"at_ms": 1000 * at, "rad": rad})
+
+    def on_link(self, link: LinkState) -> None:
+        self._call_soon(self._broadcast, "link", link._asdict())
 
     def on_note(self, note: Note) -> None:
         self._call_soon(self._add_note, {"time": note.t, "text": note.text})
@@ -354,7 +357,10 @@ class PageServer(Listener):
         if connection is not None:
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
         ws = web.WebSocketResponse(compress=False, max_msg_size=MAX_MESSAGE_BYTES, autoping=False)
-        await ws.prepare(request)
+        try:
+            await ws.prepare(request)
+        except ValueError:  # headers that are not ASCII: the client's fault
+            raise web.HTTPBadRequest(text="not a handshake of a WebSocket\n") from None
         viewer = PageViewer(token, cameras, lambda camera: self._recent[camera].burst(), browser, monitor)
         self._viewers.append(viewer)
         self._send_current_state(viewer)
@@ -407,6 +413,7 @@ class PageServer(Listener):
         station = {"operator": self._station.user, "answer_s": self._station.answer_s}
         current = {"layout": self._layout(), "selected": viewer.selected or None}
         viewer.post("hello", introduction | station | current)
+        viewer.post("link", self._station.link_state._asdict())
         viewer.post("state", state_to_json(self._station.state))
         viewer.post("history", self._history.columns())
         for note in self._notes:
@@ -578,7 +585,7 @@ def _wave_s(camera: Camera) -> float | None:
 
 
 class _FaultHandler(logging.Handler):
-    """Reports the faults of this server. Invalid HTTP is the client's fault and is answered with 400."""
+    """Reports the faults of this server. Invalid HTTP, answered with 400, and leaving early are the client's."""
 
     def __init__(self, on_report: Callable[[str], None]) -> None:
         super().__init__(logging.WARNING)
@@ -587,7 +594,7 @@ class _FaultHandler(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         error = record.exc_info[1] if record.exc_info else None
         text = f"page: {record.getMessage()}" + (f": {type(error).__name__}: {error}" if error else "")
-        if not isinstance(error, HttpProcessingError):
+        if not isinstance(error, HttpProcessingError | ConnectionError):
             self._on_report(text)
 
 

@@ -16,6 +16,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from runner.core.roles import Role
+from runner.security.validity import Validity
 
 LABEL = r"[A-Za-z0-9_](?:[A-Za-z0-9_-]*[A-Za-z0-9_])?"
 DNS_NAME = re.compile(rf"(?:\*\.)?{LABEL}(?:\.{LABEL})*\.?")
@@ -106,6 +107,15 @@ def serial_of(certificate: bytes) -> int:
     raises  ValueError
     """
     return x509.load_pem_x509_certificate(certificate).serial_number
+
+
+def validity_of(certificate: bytes) -> Validity:
+    """Of a certificate, PEM.
+
+    raises  ValueError
+    """
+    loaded = x509.load_pem_x509_certificate(certificate)
+    return Validity(loaded.not_valid_before_utc.timestamp(), loaded.not_valid_after_utc.timestamp())
 
 
 def serials_of(crl: bytes) -> frozenset[int]:

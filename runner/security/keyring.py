@@ -23,13 +23,16 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 import msgspec
 
 from runner.core.roles import Role
 from runner.errors import UserError
 from runner.system.files import exposure, read_file
+
+if TYPE_CHECKING:
+    from runner.security.validity import Validity
 
 AUTHORITY, CERTIFICATE, KEY, SECRET, HOLDER = "ca.crt", "own.crt", "own.key", "own.secret", "own.json"
 REVOKED, PEOPLE = "crl.pem", "people.json"
@@ -224,6 +227,15 @@ class Keyring:
             return serials_of(self.read(REVOKED))
         except ValueError as error:
             raise self._error(REVOKED, error) from None
+
+    def validity(self, name: str = CERTIFICATE) -> Validity:
+        """Of a certificate in a file: the holder's, or the authority's."""
+        from runner.security.certificates import validity_of
+
+        try:
+            return validity_of(self.read(name))
+        except ValueError as error:
+            raise self._error(name, error) from None
 
     def people(self) -> Mapping[str, Person]:
         """Who may reach this vehicle, by name."""

@@ -14,6 +14,7 @@ import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -220,20 +221,23 @@ class _VehicleControl:
         }
         login = Login(keyring, on_report) if keyring else None
         will = (self._topic("state"), OFFLINE)
-        self._link = ControlLink(vehicle.control, will, listen, self._on_connected, on_report, login)
+        self.link = ControlLink(vehicle.control, will, listen, self._on_connected, on_report, login)
 
     def connect(self, live: LiveVehicle) -> None:
         self._live = live
-        self._link.connect()
+        self.link.connect()
 
     def publish(self, record: VehicleState | Telemetry | Settings | SpeedAdvice | SteeringAngle) -> bool:
         """Publish a record; returns False if it has to wait because the link is behind."""
-        return not self._is_name_free.is_set() or self._link.publish(self._topic(TOPICS[type(record)]), to_json(record))
+        ends = self.link.certificate_ends().get("own")
+        if isinstance(record, VehicleState) and ends is not None:
+            record = replace(record, certificate_ends=ends)
+        return not self._is_name_free.is_set() or self.link.publish(self._topic(TOPICS[type(record)]), to_json(record))
 
     def close(self) -> None:
         if self._announce_timer:
             self._announce_timer.cancel()
-        self._link.close(*([(self._topic("state"), OFFLINE)] if self._is_name_free.is_set() else []))
+        self.link.close(*([(self._topic("state"), OFFLINE)] if self._is_name_free.is_set() else []))
 
     def _topic(self, *parts: str) -> str:
         return topic(self._name, *parts)
@@ -262,7 +266,7 @@ class _VehicleControl:
         reply = self._topic("reply", message.sender)
 
         def answer(outcome: Outcome) -> None:
-            self._link.publish(reply, {"id": parsed.identity, **to_json(outcome)})
+            self.link.publish(reply, {"id": parsed.identity, **to_json(outcome)})
 
         will, run = is_will(parsed.identity), run_of(parsed.identity)
         request = Request(message.sender, parsed.document, answer, parsed.as_of, will, run)
@@ -286,7 +290,7 @@ class _VehicleControl:
             assert report.sent is not UNSET
             now = time.time()
             answer = ClockAnswer(report.sent, received, now, wall_ahead_s(), clock_error_s())
-            self._link.publish(clock_topic, to_json(answer))
+            self.link.publish(clock_topic, to_json(answer))
 
         self._live.loop.take(QueuedReport(message.sender, report, None if report.sent is UNSET else state_clock))
 
@@ -387,7 +391,7 @@ def live_vehicle(
         ending.callback(live.stop)
         if ros:
             ros.start()
-        metrics.serve(live.problem)
+        metrics.serve(live.problem, control.link)
         control.connect(live)
         for plan in plans:
             address = rtsp_url(vehicle.media, plan.camera.name) if plan.serves else "connects to the operator"

@@ -1,8 +1,9 @@
 """usage: tod-runner doctor [VERB] [OVERRIDE ...]
 
 Lists what this machine lacks to run a verb with this configuration, and how to install it: Python packages, GStreamer
-and its bindings, elements, broker, free ports, cameras and the USB bandwidth they share, cores. The default verb is
-`demo`, which needs everything that both sides need. Ends with status 1 if something is missing.
+and its bindings, elements, broker, free ports, certificates that are valid for 30 more days, cameras and the USB
+bandwidth they share, cores. The default verb is `demo`, which needs everything that both sides need. Ends with status 1
+if something is missing.
 
   tod-runner doctor
   tod-runner doctor vehicle source=v4l2 graph=h264_va_rtsp
@@ -13,6 +14,7 @@ from __future__ import annotations
 
 import os
 import subprocess
+import time
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
@@ -21,9 +23,11 @@ from typing import Any, NamedTuple
 
 from runner.configuration.config import configuration
 from runner.core.model import Camera, Endpoint, RosSettings, Vehicle, suggest
-from runner.errors import ArgumentError, MissingBindings, RunError, reason
+from runner.errors import ArgumentError, MissingBindings, RunError, UserError, reason
 from runner.mqtt.broker import find_mosquitto
 from runner.plans import compile_plans
+from runner.security.keyring import HOLDER, Keyring
+from runner.security.validity import date, expiring, invalid
 from runner.system.extras import EXTRAS, how_to_install
 from runner.system.ports import check_port_free
 from runner.system.rtsp import OK, UNAUTHORIZED, describe
@@ -33,6 +37,7 @@ from runner.verbs import VERBS, Arguments, study_word
 IMPORT_S = 30  # rclpy or rospy loads within a second
 CORE_MPX_S = 180  # cropped, scaled and encoded per core and second at factor 0.5, measured with h264_rtsp
 STREAMING = ("vehicle", "operator", "latency", "demo", "record", "model", "quality")  # verbs that need GStreamer
+CONNECTING = ("vehicle", "operator", "latency", "ros", "demo")  # verbs that use keys
 NEEDED = {  # extras of this package that a verb needs with any configuration
     "vehicle": ("live",),
     "operator": ("live",),
@@ -93,6 +98,8 @@ def examine(verb: str, vehicle: Vehicle, document: Mapping[str, Any]) -> Iterato
     if verb == "demo":
         yield _broker()
     yield from _ports(verb, vehicle)
+    if verb in CONNECTING and vehicle.keys is not None and find_spec("cryptography"):
+        yield from _certificates(Path(vehicle.keys))
     if verb in ("vehicle", "demo", "record"):
         yield from _devices(vehicle)
         yield from _ip_cameras(vehicle)
@@ -111,7 +118,7 @@ def _extras(verb: str, vehicle: Vehicle, document: Mapping[str, Any]) -> Iterato
         yield "page"
     if verb in ("vehicle", "demo", "record") and any(c.source.render for c in vehicle.cameras.values()):
         yield "synthetic"
-    if verb in ("vehicle", "operator", "latency", "ros", "demo"):
+    if verb in CONNECTING:
         yield from ["security"] if vehicle.keys is not None else []
     ports = {"vehicle": vehicle.metrics.vehicle_port, "operator": vehicle.metrics.operator_port}
     if any(port is not None and verb in (side, "demo") for side, port in ports.items()):
@@ -194,6 +201,24 @@ def _ports(verb: str, vehicle: Vehicle) -> Iterator[Diagnosis]:
             yield Diagnosis(False, f"{key}: {error}")
         else:
             yield Diagnosis(True, f"{key}: {endpoint} is free")
+
+
+def _certificates(keys: Path) -> Iterator[Diagnosis]:
+    """Until when certificates are valid: of one holder, or of all for a demo."""
+    for directory in [keys] if (keys / HOLDER).exists() else sorted(path.parent for path in keys.glob(f"*/{HOLDER}")):
+        ring = Keyring(directory)
+        try:
+            name, validity = ring.holder.name, ring.validity()
+        except UserError as error:
+            yield Diagnosis(False, str(error))
+            continue
+        now, whose = time.time(), f"{name}'s"
+        why = invalid(validity, now)
+        wrong = [f"{whose} certificate {why}"] if why else expiring({whose: validity.ends}, now)
+        fine = f"{whose} certificate is valid until {date(validity.ends)}"
+        yield Diagnosis(
+            not wrong, f"{wrong[0]}: `tod-runner keys output=DIR rotate={name}` renews it" if wrong else fine
+        )
 
 
 def _devices(vehicle: Vehicle) -> Iterator[Diagnosis]:

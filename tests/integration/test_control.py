@@ -323,7 +323,7 @@ def test_invalid_messages_from_the_vehicle_end_no_operator(broker, vehicle, stat
         for payload in GARBAGE:
             stranger.link._client.publish(f"tod/delivery_robot/{name}", payload, qos=1, retain=name == "state")
     stranger.link._client.publish("tod/delivery_robot/state", b'{"online": "x"}', qos=1, retain=True)
-    until(lambda: station._link.dropped >= 4 * len(GARBAGE))
+    until(lambda: station.link.dropped >= 4 * len(GARBAGE))
     why = "not JSON: Expecting value: line 1 column 1 (char 0)"
     assert f"a message on tod/delivery_robot/state was dropped: {why}" in listener.notes
     until(lambda: station.take({}) is None and station.state, every_s=0.2)

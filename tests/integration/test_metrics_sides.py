@@ -43,6 +43,7 @@ def test_both_sides_serve_figures_of_a_drive(tmp_path):
         seen = until(lambda: complete(passes(operator)), every_s=0.2)
         sent = until(lambda: passes(vehicle), every_s=0.2)
     assert seen["tod_vehicle_online", ""] == seen["tod_healthy", ""] == sent["tod_healthy", ""] == 1
+    assert seen["tod_control_connected", ""] == sent["tod_control_connected", ""] == 1
     assert seen["tod_log_free_bytes", ""] > 0
     assert sent["tod_log_free_bytes", ""] > 0
     assert sent["tod_decided_kbps", ""] == sent["tod_predicted_kbps", ""] == 3000
@@ -58,4 +59,5 @@ def test_both_sides_serve_figures_of_a_drive(tmp_path):
     ]
     mentioned = {name for text in texts for name in re.findall(r"\btod_[a-z_]+", text)}
     assert len(mentioned) > 10
+    mentioned.remove("tod_certificate_expiry_timestamp_seconds")  # only with keys
     assert mentioned <= {name for name, _ in (*seen, *sent)}

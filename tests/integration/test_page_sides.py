@@ -11,6 +11,7 @@ import ssl
 import subprocess
 import time
 from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
 from functools import partial
 from itertools import dropwhile
 from pathlib import Path
@@ -214,6 +215,44 @@ def test_a_camera_that_the_vehicle_lacks_is_lost_and_the_others_are_driven(chrom
         page.locator("[data-camera=rear] .switch").click()
         until(lambda: measure(page)["rear"]["status"] == "off")
         shot(page, "lacking")
+
+
+@pytest.mark.soak
+@pytest.mark.players
+def test_the_page_says_why_there_is_no_control_link(chromium):
+    control, port = free_port(), free_port()
+    words = (*ROBOT, f"control.port={control}", f"page.port={port}", "log.video=false")
+    with (
+        process("operator", *words),
+        opened(chromium, until(lambda: answers(port) and f"http://127.0.0.1:{port}/")) as page,
+    ):
+        why = f"✕ VIDEO IS NOT LIVE: no control link: MQTT broker at 127.0.0.1:{control}: connection refused"
+        until(lambda: page.locator("#banner").inner_text() == why)
+        assert page.locator("#connection").inner_text() == "✕ no control link"
+        shot(page, "no_control_link")
+        with private_broker(Endpoint("127.0.0.1", control)):
+            until(lambda: page.locator("#banner").inner_text() == "✕ VEHICLE OFFLINE: video is not live")
+
+
+@pytest.mark.soak
+@pytest.mark.players
+def test_the_page_names_certificates_that_expire_soon(chromium, tmp_path):
+    for name, role, days in (
+        ("broker", Role.BROKER, 300),
+        ("delivery_robot", Role.VEHICLE, 360),
+        ("alice", Role.CONTROLLER, 354),
+    ):
+        authority = Authority(tmp_path / "keys", lambda days=days: datetime.now(UTC) - timedelta(days=days, hours=-1))
+        with authority.opened():
+            authority.issue(name, role, ["127.0.0.1"])
+    own, vehicles = (f"{datetime.now(UTC) + timedelta(days=days, hours=1):%Y-%m-%d}" for days in (11, 5))
+    with sides(keys=tmp_path / "keys") as (url, vehicle, _), vehicle(), opened(chromium, url) as page:
+        text = (
+            f"▲ Renew the keys: own certificate expires on {own}, in 11 days; "
+            f"the vehicle's certificate expires on {vehicles}, in 5 days"
+        )
+        until(lambda: page.locator("#warning").is_visible() and page.locator("#warning").inner_text() == text)
+        shot(page, "expiring")
 
 
 LACKING = {"front": "live", "rear": "live", "mast": "lost"}

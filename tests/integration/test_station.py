@@ -293,9 +293,9 @@ def test_duplicate_or_unrequested_clock_answers_are_ignored(both):
     before, answer = station.clock, vehicle.answers[-1]
     vehicle.publish("clock", {**answer, "received": answer["received"] + 9, "answered": answer["answered"] + 9})
     vehicle.publish("clock", {"sent": 12.5, "received": 99.0, "answered": 99.0, "set_s": 0.0, "error_s": None})
-    dropped = station._link.dropped
+    dropped = station.link.dropped
     vehicle.publish("clock", {**answer, "sent": "yesterday"})
-    until(lambda: station._link.dropped > dropped)  # the last of three, in order
+    until(lambda: station.link.dropped > dropped)  # the last of three, in order
     station.take(fresh())
     assert abs(station.clock.ahead_s - before.ahead_s) < 1
 

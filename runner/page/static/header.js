@@ -116,7 +116,8 @@ function refreshBanner() {
   const why = store.hung
     ? "VIDEO STOPPED: the page's worker does not respond; reload the page"
     : "NO CONNECTION TO THE STATION: video is not live; reconnecting";
-  const text = store.connected ? "VEHICLE OFFLINE: video is not live" : why;
+  const offline = store.link.fault ? `VIDEO IS NOT LIVE: ${store.link.fault}` : "VEHICLE OFFLINE: video is not live";
+  const text = store.connected ? offline : why;
   byId("banner").hidden = !isOffline;
   setText(byId("banner"), isOffline ? `✕ ${text}` : "");
 }
@@ -125,7 +126,8 @@ function refreshBanner() {
 export function linkFault() {
   if (!store.connected) return store.hung ? "video stopped" : "station unreachable";
   if (!store.state) return "no state yet";
-  return !store.state.online ? "vehicle offline" : hearing.isLost ? "vehicle receives nothing" : null;
+  if (!store.state.online) return store.link.fault ? "no control link" : "vehicle offline";
+  return hearing.isLost ? "vehicle receives nothing" : null;
 }
 
 function refreshConnection() {
@@ -141,10 +143,12 @@ function refreshWarning() {
   wasSampled ||= store.sample !== null;
   if (!isOnline || store.sample || !wasSampled) sampledAt = now;
   if (!isOnline || !store.sample || isClockKnown()) clockKnownAt = now;
-  const warning = now - sampledAt >= GRACE_MS ? UNMEASURED : now - clockKnownAt >= GRACE_MS ? UNKNOWN : "";
+  const warning = now - sampledAt >= GRACE_MS ? UNMEASURED : now - clockKnownAt >= GRACE_MS ? UNKNOWN : expiryText();
   byId("warning").hidden = !warning;
   setText(byId("warning"), warning);
 }
+
+const expiryText = () => (store.connected && store.link.expiring.length ? `▲ Renew the keys: ${store.link.expiring.join("; ")}` : "");
 
 function isClockKnown() {
   const moving = Object.entries(store.ages).filter(([name]) => MOVING.includes(store.status[name]));
@@ -187,7 +191,8 @@ export function startHeader() {
   listen("control", onControl);
   listen("control state", watchOperator);
   listen("state socket ages", watchHearing);
-  listen("hello state control requests socket", refresh);
+  listen("hello state link control requests socket", refresh);
+  listen("link", refreshWarning);
   listen("sample socket state", refreshTotals);
   listen("ages", refreshWarning);
   listen("ages", refreshSkew);

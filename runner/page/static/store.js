@@ -66,6 +66,7 @@ let sampledAt = -Infinity; // page time of the last sample
  * @property {number|null} clock_bound_ms error bound of the latencies; null: they are unknown
  * @property {number|null} speed_factor advised share of full speed
  * @property {Record<string, CameraSample>} cameras
+ * @typedef {{fault: string|null, expiring: string[]}} Link of the station to the broker: why there is none, and which certificates expire soon
  * @typedef {{time: number, text: string, level: string, own: boolean}} Note own: the page's, not the station's
  */
 
@@ -77,6 +78,7 @@ let sampledAt = -Infinity; // page time of the last sample
  * @property {Hello|null} hello
  * @property {State|null} state
  * @property {Sample|null} sample null: none yet, or none for a second
+ * @property {Link} link
  * @property {string} holder
  * @property {boolean} abandoned
  * @property {boolean} elsewhere
@@ -101,6 +103,7 @@ export const store = {
   hello: null,
   state: null,
   sample: null,
+  link: { fault: null, expiring: [] },
   holder: "nobody",
   abandoned: false, // whether nobody is in control because the page that was has closed
   elsewhere: false, // whether another window of this page has the keyboard focus
@@ -146,7 +149,7 @@ export function onStationMessage(message) {
   const { kind } = message;
   const { selected } = store;
   if (kind === "hello") onHello(message);
-  else if (kind === "state" || kind === "sample") store[kind] = message;
+  else if (kind === "state" || kind === "sample" || kind === "link") store[kind] = message;
   else if (kind === "control") onControl(message);
   else if (kind === "layout" && store.hello) store.hello.layout = message;
   else if (kind === "selection") return setSelected(message.camera);
@@ -201,7 +204,7 @@ export const decisionOf = (name) => (store.state?.online && name ? store.state.c
  * Why there is no decision about a camera; "": there is one.
  * @param {string} name
  */
-export const whyUndecided = (name) => (!store.state?.online ? "The vehicle is offline." : decisionOf(name) ? "" : `The vehicle has no camera ${name}.`);
+export const whyUndecided = (name) => (!store.state?.online ? (store.link.fault ? "There is no control link." : "The vehicle is offline.") : decisionOf(name) ? "" : `The vehicle has no camera ${name}.`);
 export const mode = () => (store.state?.online ? store.state.mode : null);
 export const inControl = () => store.connected && store.holder === "you";
 
