@@ -34,6 +34,7 @@ PERIODIC = {"telemetry", "reception", "clock", "advice", "steering"}  # the next
 SUPERSEDED = PERIODIC | {"state"}  # replaced by a later message, and so not sent ...
 UNSENT_BYTES = 4096  # ... while this much is queued: after an outage it would delay current messages
 MOST_REASONS = 10  # reported of one outage: a peer chooses some of their words
+BRIEF_S, MOST_BRIEF = 1.0, 3  # how long a connection must last, and how many in a row may not, until it is said
 HEARD_BYTES = 32  # what a program says first tells which one it is
 RETAINED = ("state", "telemetry", "configuration")
 
@@ -101,6 +102,7 @@ class ControlLink:
         self.fault: str | None = None  # why there is no connection; None: there is one, or none was lost or tried yet
         self._reported: set[str] = set()  # faults since the last connection
         self._expiring: set[str] = set()  # certificates that were reported
+        self._listened, self._brief = 0.0, 0  # since when by time.monotonic; connections in a row that soon ended
         self._is_explained = False  # whether it was said why this connection has failed
         self._report_fault = LimitedReports(on_report)  # of a message
         self.dropped = 0
@@ -150,6 +152,9 @@ class ControlLink:
 
         returns  whether the connection was dropped
         """
+        if self._listening.is_set() and self._brief and time.monotonic() - self._listened > BRIEF_S:
+            self._brief = 0
+            self._report_connected()
         if not self._listening.is_set() or not (self._has_moved() or (self._login and self._login.has_changed())):
             return False
         self._drop_connection()
@@ -288,10 +293,9 @@ class ControlLink:
             retry.daemon = True
             retry.start()
             return
-        if self._reported:
-            self._reported.clear()
-            self._on_report(f"connected to the MQTT broker at {self._broker}")
-        self.fault = None
+        self._listened = time.monotonic()
+        if self._brief < MOST_BRIEF:
+            self._report_connected()
         self._listening.set()
         self._on_connected(True)
 
@@ -299,13 +303,22 @@ class ControlLink:
         if not self._lose() and not self._is_explained:
             self._failed_to_connect(self._end(silent=code == "Keep alive timeout"), perhaps_keys=True)
 
+    def _report_connected(self) -> None:
+        if self._reported:
+            self._reported.clear()
+            self._on_report(f"connected to the MQTT broker at {self._broker}")
+        self.fault = None
+
     def _lose(self) -> bool:
         """This side no longer receives its messages; returns whether it did."""
-        was_listening = self._listening.is_set()
-        if was_listening:
-            self._listening.clear()
-            self._on_connected(False)
-        return was_listening
+        if not self._listening.is_set():
+            return False
+        self._listening.clear()
+        self._on_connected(False)
+        self._brief = self._brief + 1 if time.monotonic() - self._listened < BRIEF_S else 0
+        if self._brief >= MOST_BRIEF:  # such as one that does not allow what this side sends
+            self._failed_to_connect("the broker ends each connection soon after it is made")
+        return True
 
     def _on_broken(self, error: Exception) -> None:
         self._failed_to_connect(str(error) if self._lose() else self._end())

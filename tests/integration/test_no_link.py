@@ -182,6 +182,28 @@ def test_every_other_program_is_named(tmp_path, answer, plain, encrypted, tls):
     assert notes == [encrypted if tls else plain]
 
 
+def ends_after_subscribing(line):
+    line.recv(999)
+    line.sendall(b"\x20\x02\0\0")  # CONNACK
+    subscribed = line.recv(999)
+    line.sendall(b"\x90\x03" + subscribed[2:4] + b"\1")  # SUBACK
+    time.sleep(0.1)
+
+
+@pytest.mark.soak
+@pytest.mark.players
+def test_a_broker_that_ends_each_connection_is_named_once_until_it_does_not():
+    broker = Endpoint("127.0.0.1", free_port())
+    with connecting(broker) as (link, notes):
+        with program(broker, ends_after_subscribing):
+            until(lambda: notes)
+            time.sleep(2.5)
+            assert notes == ["the broker ends each connection soon after it is made; retrying"]
+        with private_broker(broker):
+            until(lambda: not link.check() and link.fault is None, every_s=0.2)
+    assert notes[-1] == f"connected to the MQTT broker at {broker}"
+
+
 @pytest.mark.soak
 @pytest.mark.players
 def test_a_program_that_repeats_what_it_hears_is_named():
