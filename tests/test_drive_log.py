@@ -21,6 +21,8 @@ from runner.drive.log import Log, new_drive
 from runner.drive.read import read_drive
 from runner.errors import RunError, UserError
 from runner.records import LinesDropped, Note
+from tests.drives import write_drive
+from tests.helpers import Command
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 NOTES = """
@@ -339,6 +341,27 @@ def test_a_lone_surrogate_is_written(tmp_path: Path) -> None:
             lambda lines: [lines[0].replace('"format": 1', '"format": 9')],
             "{file}: line 1: format: 9: this version reads format 1",
         ),
+        (
+            lambda lines: [re.sub('"time": [0-9.]+', '"time": 1e18', lines[0])],
+            "{file}: line 1: time: 1e+18: must be at most 4294967295",
+        ),
+        (lambda lines: lines * 2, "{file}: line 4: a second drive begins here; each needs a directory of its own"),
+        (
+            lambda lines: [*lines, lines[1]],
+            "{file}: line 4: the drive ended with the line before; each drive needs a directory of its own",
+        ),
+        (
+            lambda lines: [lines[0], *(f'{{"t": {t}, "event": "clock_advanced"}}\n' for t in (1, 3, 2.9))],
+            "{file}: line 4: t: 2.9: must not decrease; the event before was at 3",
+        ),
+        (
+            lambda lines: [lines[0], '{"t": 1e9, "event": "clock_advanced"}\n'],
+            "{file}: line 2: t: 1000000000.0: must be at most a day after the line before, at 0.0",
+        ),
+        (
+            lambda lines: [lines[0], *(f'{{"t": {t}, "log": "note", "text": ""}}\n' for t in (3, 1.9))],
+            "{file}: line 3: t: 1.9: must not decrease; the line before was at 3",
+        ),
     ],
 )
 def test_an_invalid_drive_is_reported_with_its_line(tmp_path: Path, change: Any, expected: str) -> None:
@@ -350,6 +373,36 @@ def test_an_invalid_drive_is_reported_with_its_line(tmp_path: Path, change: Any,
     with pytest.raises(UserError) as error:
         read_drive(tmp_path)
     assert str(error.value).startswith(expected.format(file=file))
+
+
+def test_lines_of_several_threads_are_put_into_order(tmp_path: Path) -> None:
+    log = begun(tmp_path)
+    for t in (0.5, 0.2, 0.9):
+        log.record(Note(t, str(t)))
+    log.close()
+    assert [note.text for note in read_drive(tmp_path).sides["vehicle"].of(Note)] == ["0.2", "0.5", "0.9"]
+
+
+def test_every_verb_refuses_two_drives_in_one_file(tod: Command, tmp_path: Path) -> None:
+    drive = write_drive(tmp_path / "drive", seconds=5)
+    file = drive / "drive.jsonl"
+    lines = file.read_text().splitlines(keepends=True)
+    file.write_text("".join(lines + lines))
+    for verb, word in ("report", f"{drive}"), ("map", f"{drive}"), ("export", f"{drive}"), ("replay", f"input={drive}"):
+        done = tod(verb, word, f"output={tmp_path / 'out'}")
+        assert (done.status, done.err.splitlines()[-1]) == (
+            2,
+            f"{file}: line {len(lines) + 1}: a second drive begins here; each needs a directory of its own",
+        )
+
+
+def test_logs_of_two_vehicles_are_named(tmp_path: Path) -> None:
+    write_drive(tmp_path, ["vehicle"], seconds=3)
+    write_drive(tmp_path, ["operator"], seconds=3, overrides=["vehicle=delivery_robot"])
+    rule = "drive.jsonl of tum_q7 and operator.jsonl of delivery_robot; each needs a directory of its own"
+    with pytest.raises(UserError) as error:
+        read_drive(tmp_path)
+    assert str(error.value) == f"{tmp_path}: holds the logs of two vehicles, {rule}"
 
 
 def test_a_directory_without_a_drive_is_reported(tmp_path: Path) -> None:

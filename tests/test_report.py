@@ -311,7 +311,7 @@ def test_texts_of_the_drive_are_no_markup(tod: Command, tmp_path: Path) -> None:
         for entry in lines:
             for camera in entry["cameras"].values() if entry.get("log") in ("decision", "state") else ():
                 camera["reason"] = evil
-        return [*lines, {"t": 1.0, "log": "note", "text": evil}]
+        return [*lines, {"t": lines[-1]["t"], "log": "note", "text": evil}]
 
     path = write_drive(tmp_path / f"<b>{'x' * 20}", seconds=3, change=change)
     assert tod("report", str(path), f"output={tmp_path / 'out'}").status == 0

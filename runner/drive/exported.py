@@ -158,5 +158,5 @@ def cameras_of(drive: Drive) -> list[str]:
 def _span(drive: Drive) -> tuple[int, int]:
     """Start and end of the drive, ns since 1970."""
     began = [side.began_s for side in drive.sides.values()]
-    ended = [side.began_s + line.t for side in drive.sides.values() for line in side.lines[-1:]]
-    return round(min(began) * SECOND_NS), round(max([*began, *ended]) * SECOND_NS)
+    ended = [side.began_s + side.end for side in drive.sides.values()]
+    return round(min(began) * SECOND_NS), round(max(ended) * SECOND_NS)

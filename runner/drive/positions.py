@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from heapq import merge
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from runner.bag import POSITIONS, Bag, Fix
 from runner.bag.pictures import SECOND_NS
 from runner.core.events import PositionReported
 from runner.core.model import ModelError
-from runner.drive.read import Drive, read_drive
+from runner.drive.read import Drive, read_drive, time_span
 from runner.errors import ArgumentError, UserError
 
 ARGUMENTS = ("positions", "topic")  # of the command line
@@ -43,12 +42,6 @@ class RecordedPositions:
         """The error that no position falls into a drive; `drive` describes it with its times."""
         rule = f"no position falls into {drive}; both must have been recorded by the same clock"
         return ArgumentError(ARGUMENTS[0], f"{self.where}: {self.span}", rule)
-
-
-def time_span(began_s: float, ended_s: float) -> str:
-    """A span of time, s since 1970, as text."""
-    began, ended = (datetime.fromtimestamp(at, UTC).isoformat(timespec="seconds") for at in (began_s, ended_s))
-    return f"{began.removesuffix('+00:00')} to {ended.removesuffix('+00:00')} UTC"
 
 
 def reader(values: Mapping[str, str]) -> Callable[[Path], Drive]:
@@ -89,10 +82,9 @@ def with_positions(drive: Drive, recorded: RecordedPositions) -> Drive:
     """
     name = "vehicle" if "vehicle" in drive.sides else "operator"
     side = drive.sides[name]
-    end = max((line.t for line in side.lines), default=0.0)
-    new = [event for event in recorded.since(side.began_s) if event.t <= end]
+    new = [event for event in recorded.since(side.began_s) if event.t <= side.end]
     if not new:
-        raise recorded.no_overlap(f"{drive.path}: {time_span(side.began_s, side.began_s + end)}")
+        raise recorded.no_overlap(f"{drive.path}: {side.span}")
     kept = [line for line in side.lines if not isinstance(line, PositionReported)]
     lines = list(merge(kept, new, key=lambda line: line.t))
     return replace(drive, sides={**drive.sides, name: replace(side, lines=lines)})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from functools import cached_property, partial
 from pathlib import Path
 from statistics import median
@@ -32,7 +33,11 @@ T = TypeVar("T")
 DRIVEN = {"vehicle", "operator"}  # sides without which a directory holds no drive
 REPORTS = KINDS[ReceptionReported]
 # Kinds of lines in a vehicle's log, except events, reception reports and the first line.
-OTHER_KINDS = ("decision", "telemetry", "note", "video", "video_shift", "ended")
+OTHER_KINDS = ("decision", "telemetry", "note", "video", "video_shift")
+# Kinds that several threads write, perhaps in another order than they read the time; readers put them into order.
+OF_SEVERAL_THREADS = {"note", "state", "video", "video_shift", "dropped"}
+LATE_S = 1.0  # by how much such lines may be late
+LONGEST_GAP_S = 86_400.0  # between two lines of a drive: both sides log several times a second
 LONGEST_LINE = 1 << 24  # characters; the longest real line, the configuration, has a thousandth of that
 
 
@@ -51,6 +56,16 @@ class Side:
     def of(self, kind: type[T]) -> Iterator[T]:
         """Its lines of a kind."""
         return (line for line in self.lines if isinstance(line, kind))
+
+    @property
+    def end(self) -> float:
+        """Time of its last line."""
+        return self.lines[-1].t if self.lines else 0.0
+
+    @property
+    def span(self) -> str:
+        """When it was logged, as text."""
+        return time_span(self.began_s, self.began_s + self.end)
 
     @cached_property
     def began_s(self) -> float:
@@ -78,6 +93,12 @@ class Drive:
         return self.path.resolve().name
 
 
+def time_span(began_s: float, ended_s: float) -> str:
+    """A span of time, s since 1970, as text."""
+    began, ended = (datetime.fromtimestamp(at, UTC).isoformat(timespec="seconds") for at in (began_s, ended_s))
+    return f"{began.removesuffix('+00:00')} to {ended.removesuffix('+00:00')} UTC"
+
+
 def read_drive(directory: Path) -> Drive:
     """Everything in the directory of a drive.
 
@@ -96,9 +117,17 @@ def read_drive(directory: Path) -> Drive:
         warnings += [f"{path}: is empty: nothing was logged" for path in empty]
         present = logged
     sides = {side: _side(side, path, warnings) for side, path in present.items()}
+    _check_one_vehicle(where, sides)
     if not sides.keys() & DRIVEN:
         raise UserError(where, "", None, f"contains no drive log: neither {FILES['vehicle']} nor {FILES['operator']}")
     return Drive(directory, sides, warnings)
+
+
+def _check_one_vehicle(where: str, sides: Mapping[str, Side]) -> None:
+    names = {side: sides[side].began.config.get("name") for side in sorted(DRIVEN & sides.keys(), reverse=True)}
+    if len(set(names.values()) - {None}) > 1:
+        logs = " and ".join(f"{FILES[side]} of {name}" for side, name in names.items())
+        raise UserError(where, "", None, f"holds the logs of two vehicles, {logs}; each needs a directory of its own")
 
 
 def _side(side: str, path: Path, warnings: list[str]) -> Side:
@@ -111,7 +140,8 @@ def _side(side: str, path: Path, warnings: list[str]) -> Side:
     ended = bool(records) and isinstance(records[-1], Ended)
     if not ended:
         warnings.append(f"{path}: was not closed; the process was killed or is still running")
-    found = Side(began, records[:-1] if ended else records, ended)
+    in_order = sorted(records[:-1] if ended else records, key=lambda line: line.t)
+    found = Side(began, in_order, ended)
     if dropped := sum(line.lines for line in found.of(LinesDropped)):
         warnings.append(f"{path}: {dropped} lines were dropped, since the disk was too slow")
     return found
@@ -147,9 +177,9 @@ def read_lines(
 
     An incomplete last line of a drive, left by a killed process, is skipped with a warning.
 
-    raises  UserError with the number of the first invalid line
+    raises  UserError with the number of the first line that is invalid or out of order
     """
-    drive = False
+    drive, order = False, _Order()
     for number, text in enumerate(lines, 1):
         if len(text) > LONGEST_LINE:
             raise UserError(f"{name}: line {number}", "", None, f"must be at most {LONGEST_LINE} characters long")
@@ -159,12 +189,39 @@ def read_lines(
             if line["log"] in skipped:
                 continue
             problem = problem or log_problem(line)
+        problem = problem or order.problem(line)
         if problem and drive and not text.endswith("\n"):
             warnings.append(f"{name}: line {number} is truncated and was skipped")
             return
         if problem:
             raise UserError(f"{name}: line {number}", "", None, problem)
         yield number, line
+
+
+class _Order:
+    """Checks that lines are those of one drive, in the order of time."""
+
+    def __init__(self) -> None:
+        self._before: Json | None = None
+        self._last: dict[str, float] = {}  # by kind
+        self._latest = 0.0
+
+    def problem(self, line: Json) -> str | None:
+        """What is wrong with the next line, which satisfies its schema."""
+        before, self._before = self._before, line
+        kind, t = line["log"] if is_log(line) else "event", line["t"]
+        if kind == "began" and before:
+            return "a second drive begins here; each needs a directory of its own"
+        if before and before.get("log") == "ended":
+            return "the drive ended with the line before; each drive needs a directory of its own"
+        if kind in OF_SEVERAL_THREADS and t < self._latest - LATE_S:
+            return f"t: {t}: must not decrease; the line before was at {self._latest}"
+        if kind not in OF_SEVERAL_THREADS and t < self._last.get(kind, 0.0):
+            return f"t: {t}: must not decrease; the {kind} before was at {self._last[kind]}"
+        if self._last.get("began") is not None and t > self._latest + LONGEST_GAP_S:
+            return f"t: {t}: must be at most a day after the line before, at {self._latest}"
+        self._last[kind], self._latest = t, max(self._latest, t)
+        return None
 
 
 def read_line(text: str) -> tuple[Json, str | None]:

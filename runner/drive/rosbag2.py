@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 TEXT, FIX, VIDEO = "std_msgs/msg/String", "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/CompressedImage"
 GPS = 1  # SERVICE_GPS of sensor_msgs/NavSatStatus
 FRAME = "gps"
+LATEST_S = 2**31 - 1  # builtin_interfaces/Time counts in 32 bits
 
 
 def write_rosbag2(
@@ -92,6 +93,8 @@ class _Topics:
 
     def _header(self, ns: int, frame: str) -> Any:
         sec, nanosec = divmod(ns, SECOND_NS)
+        if sec > LATEST_S:
+            raise RunError("the bag cannot be written: times of ROS 2 end in January 2038, this drive's are later")
         types: Any = self._store.types
         stamp = types["builtin_interfaces/msg/Time"](sec=sec, nanosec=nanosec)
         return types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame)

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.core.events import BitratePredicted, Event, PositionReported
+from runner.drive.log import FILES
 from runner.drive.read import Drive, Side
 from runner.errors import UserError
 from runner.pqos.bandwidth_map import EARTH_M
@@ -263,7 +264,7 @@ class _Shifted(NamedTuple):
 
 def _series(drive: Drive, label: str) -> Series:
     leading = drive.sides.get("vehicle") or drive.sides["operator"]
-    began, end = leading.began_s, max((line.t for line in leading.lines), default=0.0)
+    began, end = leading.began_s, leading.end
     if end <= 0:
         raise UserError(str(drive.path), "", None, "is empty: only the first line was logged")
     sides = {name: _Shifted(side.lines, side.began_s - began) for name, side in drive.sides.items()}
@@ -305,7 +306,8 @@ def _series(drive: Drive, label: str) -> Series:
 def _warnings(sides: Mapping[str, Side], samples: Sequence[Any], cameras: Mapping[str, CameraSeries]) -> Iterator[str]:
     """Problems with the clocks of the two sides."""
     if {"vehicle", "operator"} <= sides.keys() and not samples:
-        yield "the two logs do not overlap in time: different drives, or clocks far apart"
+        spans = " and ".join(f"{FILES[side]} is of {sides[side].span}" for side in ("vehicle", "operator"))
+        yield f"the logs do not overlap: {spans}: different drives, or clocks far apart; the operator's is left out"
     received = [camera.received for camera in cameras.values() if camera.received]
     if _compared(received):
         return

@@ -215,7 +215,7 @@ def replay(
 
 def _with_positions(inputs: Iterable[InputEvent], recorded: RecordedPositions, began: Began) -> Iterator[InputEvent]:
     """The events with the positions of a bag in place of their own."""
-    from runner.drive.positions import time_span
+    from runner.drive.read import time_span
 
     waiting, last, found = deque(recorded.since(began.time)), 0.0, False
     for document, event in inputs:
@@ -280,9 +280,9 @@ def events(lines: Iterable[str], name: str, uplink: MeasuredUplink | None = None
     uplink  measures the link again from the drive's reception reports, in place of the drive's own measurements
     raises  UserError with the number of the line
     """
-    last, dropped, warnings, is_empty = 0.0, 0, list[str](), True
+    dropped, warnings, is_empty = 0, list[str](), True
     skipped = OTHER_KINDS if uplink else (*OTHER_KINDS, REPORTS)
-    for number, document in read_lines(lines, name, warnings, skipped=skipped):
+    for _, document in read_lines(lines, name, warnings, skipped=skipped):
         if is_log(document):
             if document["log"] == "dropped":
                 dropped += document["lines"]
@@ -294,10 +294,7 @@ def events(lines: Iterable[str], name: str, uplink: MeasuredUplink | None = None
             continue
         if uplink and document["event"] == NAMES[LinkMeasured] and "camera" not in document:
             continue
-        if document["t"] < last:
-            problem = f"t: {document['t']}: must not decrease; the event before was at {last}"
-            raise UserError(f"{name}: line {number}", "", None, problem)
-        last, is_empty = document["t"], False
+        is_empty = False
         yield document, parse(document)
     if is_empty:
         warnings.append(f"{name}: has no events, so there is nothing to replay")

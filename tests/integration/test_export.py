@@ -556,3 +556,11 @@ def test_a_bag_that_cannot_be_written_is_reported(tmp_path):
         2,
         f"command line: output: '{tmp_path}/none/bag': no such file or directory\n",
     )
+
+
+def test_a_time_that_ros_2_cannot_express_is_reported(tmp_path):
+    pytest.importorskip("rosbags")
+    write(tmp_path / "drive", "drive.jsonl", began("vehicle") | {"time": 4e9}, *VEHICLE, ENDED)
+    done = run("export", str(tmp_path / "drive"), "format=rosbag2")
+    rule = "the bag cannot be written: times of ROS 2 end in January 2038, this drive's are later\n"
+    assert (done.returncode, done.stderr) == (1, rule)
