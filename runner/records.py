@@ -447,7 +447,11 @@ class ReceptionReported:
 
 @dataclass(frozen=True, slots=True)
 class Began:
-    """First line of a log: side, versions and configuration. `time`: its start, s since 1970."""
+    """First line of a log: side, versions and configuration.
+
+    time      its start, s since 1970
+    replayed  words of the replay that decided it anew, without input and output; absent: it was driven
+    """
 
     t: float
     side: str
@@ -455,6 +459,7 @@ class Began:
     time: float
     versions: Mapping[str, str]
     config: Mapping[str, Any]
+    replayed: tuple[str, ...] | UnsetType = UNSET
 
 
 @dataclass(frozen=True, slots=True)
@@ -508,6 +513,14 @@ class LinkSample:
 
 
 @dataclass(frozen=True, slots=True)
+class ClockSet:
+    """The wall clock of this side's machine was set, forward by `by_s`; `t` does not follow it."""
+
+    t: float
+    by_s: float
+
+
+@dataclass(frozen=True, slots=True)
 class LinesDropped:
     """Number of lines that were not written because the disk was too slow."""
 
@@ -534,6 +547,7 @@ Record = (
     | VideoBegan
     | VideoShifted
     | LinkSample
+    | ClockSet
     | LinesDropped
     | Ended
 )
@@ -549,6 +563,7 @@ KINDS: dict[type[Any], str] = {  # value of a line's key `log`
     VideoBegan: "video",
     VideoShifted: "video_shift",
     LinkSample: "link",
+    ClockSet: "clock_set",
     LinesDropped: "dropped",
     Ended: "ended",
 }

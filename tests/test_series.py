@@ -160,6 +160,36 @@ def test_compared_clocks_align_the_sides_and_bound_the_latencies(tmp_path: Path)
     assert any(heading.startswith("arrival, ms ± 0.4") for heading in headings)
 
 
+@pytest.mark.parametrize("set_at, operator_until", [(9.0, 20.0), (15.0, 8.0), (1.0, 20.0)])
+def test_a_vehicle_that_began_in_1970_is_shown_when_it_drove(
+    tmp_path: Path, set_at: float, operator_until: float
+) -> None:
+    """Its clock is set during, after or before the operator's log."""
+    by_s = EPOCH - 100.0
+
+    def is_set(side: str, lines: Lines) -> Lines:
+        for entry in (entry for entry in lines if entry.get("log") == "sample"):
+            is_right = entry["t"] + OPERATOR_LATER_S >= set_at
+            entry |= {"clock_ahead_ms": 0.0 if is_right else -1000.0 * by_s, "clock_bound_ms": 0.4}
+        if side == "operator":
+            return [entry for entry in lines if entry["t"] < operator_until]
+        return sorted([*lines, {"t": set_at, "log": "clock_set", "by_s": by_s}], key=lambda entry: entry["t"])
+
+    path = write_drive(tmp_path / "drive", ["vehicle", "operator"], seconds=20, change=is_set, ended=False)
+    log = path / "drive.jsonl"
+    log.write_text(log.read_text().replace(f'"time": {EPOCH}', '"time": 100.0', 1))
+    read = read_drive(path)
+    drive = series(read)
+    received = drive.cameras["front_left"].received
+    assert received is not None
+    assert drive.began == EPOCH
+    assert received.t[0] == pytest.approx(OPERATOR_LATER_S)
+    vehicle, operator = read.sides["vehicle"], read.sides["operator"]
+    assert (vehicle.corrected(100.0, 0.0), vehicle.corrected(EPOCH + 16, 16.0)) == (EPOCH, EPOCH + 16)
+    assert operator.began_s == pytest.approx(EPOCH + OPERATOR_LATER_S)
+    assert "earlier times are corrected" in "".join(drive.warnings)
+
+
 @pytest.mark.parametrize("set_s", [30, -30, 2])
 def test_setting_the_operators_clock_makes_no_freeze(tmp_path: Path, set_s: int) -> None:
     """Arrivals are logged by the wall clock, samples by the monotonic one."""

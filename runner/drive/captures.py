@@ -59,11 +59,12 @@ def files(side: Side) -> dict[str, list[RecordedVideo]]:
     """By camera, its video files, in the order of their first frames."""
     shifts: dict[str, list[tuple[int, int]]] = {}
     for shift in side.of(VideoShifted):
-        shifted = (round(shift.after_s * SECOND_NS), round(shift.captured * SECOND_NS))
+        shifted = (round(shift.after_s * SECOND_NS), round(side.corrected(shift.captured, shift.t) * SECOND_NS))
         shifts.setdefault(shift.file, []).append(shifted)
     found: dict[str, list[RecordedVideo]] = {}
-    for line in sorted(side.of(VideoBegan), key=lambda line: line.captured):
-        times = ((0, round(line.captured * SECOND_NS)), *sorted(shifts.get(line.file, [])))
+    began = ((side.corrected(line.captured, line.t), line) for line in side.of(VideoBegan))
+    for captured, line in sorted(began, key=itemgetter(0)):
+        times = ((0, round(captured * SECOND_NS)), *sorted(shifts.get(line.file, [])))
         found.setdefault(line.camera, []).append(RecordedVideo(line.camera, line.file, times))
     return found
 
@@ -71,11 +72,12 @@ def files(side: Side) -> dict[str, list[RecordedVideo]]:
 def received(side: Side, camera: str) -> list[UnitTimes]:
     """Times of a camera's received frames, in the order of capture; empty if they were not logged."""
     found = (
-        UnitTimes(*(round((side.began.time + at + _ahead_s(sample)) * SECOND_NS) for at in (t - ms / 1000, t)))
+        UnitTimes(*(round((arrived - ago) * SECOND_NS) for ago in (ms / 1000, 0.0)))
         for sample in side.of(Sample)
         if camera in sample.cameras
         for t, ms in sample.cameras[camera].arrivals
         if ms is not None
+        for arrived in (side.corrected(side.began.time + t + _ahead_s(sample), sample.t),)
     )
     return sorted(found)
 

@@ -212,7 +212,7 @@ def _camera(
         if (scene := scene_at(pairs[number][0])) is not None:
             meter.add(number, scene, picture)
     scores = meter.close()
-    began = round(vehicle.began.time * SECOND_NS)
+    began = round(vehicle.began_s * SECOND_NS)
     unknown = [(moment - began) / SECOND_NS for moment, unit in displayed if unit in absent]
     ends = [(times[-1] - began) / SECOND_NS for times in (captured, [unit.captured for unit in units]) if times]
     stale = [moment - displayed > SAME_NS for moment, displayed in pairs]
@@ -272,7 +272,7 @@ def _moments(sent: Sequence[int], units: Sequence[UnitTimes], until: int, counts
 def _sends_whole(vehicle: Side, camera: Camera) -> Callable[[int], bool]:
     """Whether the whole image was sent at a time, ns since 1970; a region is not compared."""
     decisions = [line for line in vehicle.of(DecisionMade) if camera.name in line.cameras]
-    times = [round((vehicle.began.time + line.t) * SECOND_NS) for line in decisions]
+    times = [round((vehicle.began_s + line.t) * SECOND_NS) for line in decisions]
 
     def is_whole(ns: int) -> bool:
         at = bisect_right(times, ns) - 1

@@ -17,11 +17,14 @@ from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
+from msgspec import UNSET, UnsetType
+
 from runner.core.events import Event, describe, to_json
 from runner.core.step import Run
 from runner.errors import ArgumentError, RunError, UserError, reason
 from runner.records import (
     Began,
+    ClockSet,
     DecisionMade,
     Ended,
     Json,
@@ -36,6 +39,8 @@ from runner.records import (
     line_to_json,
 )
 from runner.redact import redacted
+from runner.system.clocks import STEP_S
+from runner.system.kernel_clock import NANO, ahead_of
 
 FORMAT = 1
 WITHOUT_LOG = "the drive continues without its log"
@@ -77,19 +82,22 @@ class Log:
         self._began: float | None = None
         self._past: float | None = None  # for a past drive, time of its last line
         self.time = 0.0  # of the start, s since 1970
+        self._ahead_s = 0.0  # of the wall clock, before a clock that is never set
         self._before_begin: list[Json] = []
         self._writer: _Writer | None = None
 
-    def begin(self, at: float | None = None) -> None:
+    def begin(self, at: float | None = None, replayed: tuple[str, ...] | UnsetType = UNSET) -> None:
         """Set time 0 of the drive.
 
-        at  s since 1970, for a past drive whose lines carry their own times; None: now
+        at        s since 1970, for a past drive whose lines carry their own times; None: now
+        replayed  see `Began`
         """
         self.time = time.time() if at is None else at
         versions = {"tod-runner": version("tod-runner"), "Python": platform.python_version(), **self._versions}
-        first = Began(0.0, self._side, FORMAT, self.time, versions, redacted(self._config))
+        first = Began(0.0, self._side, FORMAT, self.time, versions, redacted(self._config), redacted(replayed))
         with self._lock:
             self._began, self._past = time.monotonic(), None if at is None else 0.0
+            self._ahead_s = _wall_ahead_s()
             if self._file and at is None:
                 self._writer = _Writer(self._file, self._dropped, self._on_report)
             for line in (line_to_json(first), *self._before_begin):
@@ -122,9 +130,18 @@ class Log:
             if self._began is None:
                 self._before_begin.append(line)
                 return
-            if self._past is not None:
+            if self._past is None:
+                self._look_at_clock()
+            else:
                 self._past = line["t"]
             self._put(line)
+
+    def _look_at_clock(self) -> None:
+        """Write by how much the wall clock has been set since the line before."""
+        by_s = _wall_ahead_s() - self._ahead_s
+        if abs(by_s) > STEP_S and abs(by_s := _wall_ahead_s() - self._ahead_s) > STEP_S:  # the first reading may be off
+            self._ahead_s += by_s
+            self._put(line_to_json(ClockSet(self.now(), round(by_s, 6))))
 
     def video(self, camera: str, file: str, captured: float) -> None:
         """A video file has started; `captured`: capture time of its first frame, s since 1970."""
@@ -162,6 +179,11 @@ class Log:
 
     def _dropped(self, lines: int) -> bytes:
         return _encoded(line_to_json(LinesDropped(self.now(), lines)))
+
+
+def _wall_ahead_s() -> float:
+    """How far the wall clock is ahead of one that is never set, and also runs while the machine is suspended, s."""
+    return NANO * ahead_of(lambda: time.clock_gettime_ns(time.CLOCK_BOOTTIME))
 
 
 def _encoded(line: Mapping[str, Any]) -> bytes:

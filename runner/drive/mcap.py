@@ -44,7 +44,7 @@ def write_mcap(
     with foxglove.open_mcap(out, context=context, writer_options=options) as writer:
         channels = _Channels(context, cameras_of(drive))
         for name, side in drive.sides.items():
-            writer.write_metadata(f"{name} began", _texts(line_to_json(side.began)))
+            writer.write_metadata(f"{name} began", _texts(line_to_json(side.first)))
         count = write_all(drive, channels, read_video, on_warning, on_progress, out.check)
     out.check()
     return count

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Container, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from functools import cached_property, partial
+from functools import partial
+from itertools import accumulate
 from pathlib import Path
 from statistics import median
 from typing import Any, TextIO, TypeVar
+
+from msgspec import UNSET
 
 from runner.core.events import Event, parse
 from runner.drive.log import FILES, FORMAT
@@ -17,6 +20,7 @@ from runner.errors import UserError, os_errors_as
 from runner.records import (
     KINDS,
     Began,
+    ClockSet,
     Ended,
     Json,
     LinesDropped,
@@ -33,10 +37,11 @@ T = TypeVar("T")
 DRIVEN = {"vehicle", "operator"}  # sides without which a directory holds no drive
 REPORTS = KINDS[ReceptionReported]
 # Kinds of lines in a vehicle's log, except events, reception reports and the first line.
-OTHER_KINDS = ("decision", "telemetry", "note", "video", "video_shift")
+OTHER_KINDS = ("decision", "telemetry", "note", "video", "video_shift", "clock_set")
 # Kinds that several threads write, perhaps in another order than they read the time; readers put them into order.
-OF_SEVERAL_THREADS = {"note", "state", "video", "video_shift", "dropped"}
+OF_SEVERAL_THREADS = {"note", "state", "video", "video_shift", "clock_set", "dropped"}
 LATE_S = 1.0  # by how much such lines may be late
+SET_S = 1.0  # a measured difference of the clocks that changes by more: one was set
 LONGEST_GAP_S = 86_400.0  # between two lines of a drive: both sides log several times a second
 LONGEST_LINE = 1 << 24  # characters; the longest real line, the configuration, has a thousandth of that
 
@@ -45,17 +50,28 @@ LONGEST_LINE = 1 << 24  # characters; the longest real line, the configuration, 
 class Side:
     """The log of one side.
 
-    lines  events and records between its first line and the end, in order
-    ended  whether it was closed cleanly
+    began        its first line, with the time of its own clock
+    began_s      its start, s since 1970 by the vehicle's clock as it was set last; by its own clock if the difference
+                 of the two was not measured
+    corrections  what has to be added to times of the vehicle's clock before each time at which it was set, s; last 0
+    lines        events and records between its first line and the end, in order
+    ended        whether it was closed cleanly
     """
 
     began: Began
+    began_s: float
+    corrections: tuple[float, ...]
     lines: list[Event | Record]
     ended: bool
 
     def of(self, kind: type[T]) -> Iterator[T]:
         """Its lines of a kind."""
         return (line for line in self.lines if isinstance(line, kind))
+
+    @property
+    def first(self) -> Began:
+        """Its first line with the corrected start."""
+        return replace(self.began, time=self.began_s)
 
     @property
     def end(self) -> float:
@@ -67,13 +83,12 @@ class Side:
         """When it was logged, as text."""
         return time_span(self.began_s, self.began_s + self.end)
 
-    @cached_property
-    def began_s(self) -> float:
-        """Its start, s since 1970 by the vehicle's clock; by its own if the clock difference was not measured."""
-        measured = [(s.t, s.clock_ahead_ms or 0.0) for s in self.of(Sample) if s.clock_bound_ms is not None]
-        # `t` does not follow a clock that is set later.
-        ahead_ms = [ahead_ms for t, ahead_ms in measured if t - measured[0][0] <= KEPT_S]
-        return self.began.time + (median(ahead_ms) / 1000 if ahead_ms else 0.0)
+    def corrected(self, shown_s: float, t: float) -> float:
+        """A time by the vehicle's clock as it was near time `t` of this log, by the clock as it is in the end.
+
+        shown_s  s since 1970
+        """
+        return min((shown_s + by_s for by_s in self.corrections), key=lambda at: abs(at - self.began_s - t))
 
 
 @dataclass(frozen=True)
@@ -91,6 +106,12 @@ class Drive:
     @property
     def name(self) -> str:
         return self.path.resolve().name
+
+    @property
+    def replayed(self) -> tuple[str, ...] | None:
+        """Words of the replay that decided it; None: it was driven."""
+        leading = self.sides.get("vehicle") or self.sides["operator"]
+        return None if leading.began.replayed is UNSET else leading.began.replayed
 
 
 def time_span(began_s: float, ended_s: float) -> str:
@@ -120,6 +141,8 @@ def read_drive(directory: Path) -> Drive:
     _check_one_vehicle(where, sides)
     if not sides.keys() & DRIVEN:
         raise UserError(where, "", None, f"contains no drive log: neither {FILES['vehicle']} nor {FILES['operator']}")
+    if sides.keys() >= DRIVEN:
+        sides["operator"] = _by_clock_of(sides["vehicle"], sides["operator"])
     return Drive(directory, sides, warnings)
 
 
@@ -141,10 +164,61 @@ def _side(side: str, path: Path, warnings: list[str]) -> Side:
     if not ended:
         warnings.append(f"{path}: was not closed; the process was killed or is still running")
     in_order = sorted(records[:-1] if ended else records, key=lambda line: line.t)
-    found = Side(began, in_order, ended)
+    found = _by_last_clock(Side(began, began.time, (0.0,), in_order, ended))
     if dropped := sum(line.lines for line in found.of(LinesDropped)):
         warnings.append(f"{path}: {dropped} lines were dropped, since the disk was too slow")
+    for was in found.of(ClockSet):
+        warnings.append(f"{path}: the clock was set by {was.by_s:+.6g} s at {was.t:.1f} s; earlier times are corrected")
     return found
+
+
+# --- clocks -----------------------------------------------------------------------------------------------------------
+
+
+def _by_last_clock(side: Side) -> Side:
+    """A side with its start by the vehicle's clock as its own log knows it, in the end."""
+    ahead_s = _ahead_s(side)
+    if ahead_s:
+        return replace(side, began_s=side.began.time + ahead_s[-1], corrections=_corrections(ahead_s))
+    corrections = _corrections([0.0, *accumulate(line.by_s for line in side.of(ClockSet))])
+    return replace(side, began_s=side.began.time + corrections[0], corrections=corrections)
+
+
+def _by_clock_of(vehicle: Side, operator: Side) -> Side:
+    """The operator's side with its start by the vehicle's clock in the end, which may have been set after its end."""
+    ahead_s = _ahead_s(operator)
+    if not ahead_s:
+        return replace(operator, corrections=vehicle.corrections)
+
+    def overlap_s(began_s: float) -> float:
+        end = min(began_s + operator.end, vehicle.began_s + vehicle.end)
+        return end - max(began_s, vehicle.began_s)
+
+    began_s = max((operator.began.time + ahead_s[0] + by_s for by_s in reversed(vehicle.corrections)), key=overlap_s)
+    return replace(operator, began_s=began_s, corrections=vehicle.corrections)
+
+
+def _corrections(ahead_s: Sequence[float]) -> tuple[float, ...]:
+    return tuple(ahead_s[-1] - each for each in ahead_s)
+
+
+def _ahead_s(side: Side) -> list[float]:
+    """How far the vehicle's clock was ahead of this side's own if that had never been set, s, as measured.
+
+    One value for each setting of the vehicle's clock; none if the difference was not measured.
+    """
+    found: list[list[tuple[float, float]]] = []  # by setting, time and difference
+    own_s = 0.0
+    for line in side.lines:
+        if isinstance(line, ClockSet):
+            own_s += line.by_s
+        elif isinstance(line, Sample) and line.clock_bound_ms is not None:
+            measured = (line.t, (line.clock_ahead_ms or 0.0) / 1000 + own_s)
+            if not found or abs(found[-1][-1][1] - measured[1]) > SET_S:
+                found.append([])
+            found[-1].append(measured)
+    # The clocks drift, and `t` does not follow one that is slewed.
+    return [median(ahead_s for t, ahead_s in each if t - each[0][0] <= KEPT_S) for each in found]
 
 
 def check_began(line: Json | None, name: str) -> Began:

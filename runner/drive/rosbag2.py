@@ -52,7 +52,7 @@ def write_rosbag2(
         Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as writer,
     ):
         for name, side in drive.sides.items():
-            writer.set_custom_data(f"{name} began", json.dumps(line_to_json(side.began), ensure_ascii=False))
+            writer.set_custom_data(f"{name} began", json.dumps(line_to_json(side.first), ensure_ascii=False))
         return write_all(drive, _Topics(writer), read_video, on_warning, on_progress)
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -18,13 +18,14 @@ from numpy.typing import NDArray
 
 from runner.core.events import BitratePredicted, Event, PositionReported
 from runner.drive.log import FILES
-from runner.drive.read import Drive, Side
+from runner.drive.read import SET_S, Drive, Side
 from runner.errors import UserError
 from runner.pqos.bandwidth_map import EARTH_M
 from runner.records import (
     CameraDecision,
     CameraSample,
     CameraTelemetry,
+    ClockSet,
     DecisionMade,
     LinkSample,
     Note,
@@ -34,14 +35,13 @@ from runner.records import (
     Telemetry,
     VehicleState,
 )
-from runner.system.clocks import CLOCKS_APART_MS, TRUSTED_AGAIN_S
+from runner.system.clocks import CLOCKS_APART_MS, STEP_S, TRUSTED_AGAIN_S
 
 FloatSeries = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 T = TypeVar("T")
 
 RATE_WINDOW_S = 1.0  # rates of sent video are measured over at least this long, as the operator's are
-SET_S = 1.0  # a clock that was set by less is not recognised: samples follow their arrivals by a third of a second
 DOWN_DEG = 25.0  # a camera pitched down by this much is a top view, as on the operator's page
 PANEL_CAMERAS = 4  # number of curves distinguishable in one panel; more are split if the mounting gives no groups
 
@@ -129,6 +129,11 @@ class CameraSeries:
         source = self.received or self.sent
         return TimeSeries(source.t, source.kbps) if source else EMPTY
 
+    @property
+    def allocated(self) -> TimeSeries:
+        """The bitrate as decided, a step function; nan while the camera should not send."""
+        return TimeSeries(self.decided.t, np.where(self.decided.sending, self.decided.kbps, np.nan))
+
 
 @dataclass(frozen=True, slots=True)
 class Positions:
@@ -172,6 +177,7 @@ class Series:
     """A drive over time.
 
     label      its name among others
+    replayed   words of the replay that decided it; None: it was driven
     began      s since 1970 at t = 0
     end        s; the last line of the side that gives the axis
     measured   "received" or "sent": what `actual` is; "" if neither was logged
@@ -184,6 +190,7 @@ class Series:
 
     label: str
     path: str
+    replayed: tuple[str, ...] | None
     vehicle: str
     began: float
     end: float
@@ -274,13 +281,14 @@ def _series(drive: Drive, label: str) -> Series:
     if not decisions:
         raise UserError(str(drive.path), "", None, "contains no decision")
     config = leading.began.config
-    samples = [at for at in operator.of(Sample) if 0 <= at[0] <= end]
+    samples = [at for at in _by_steady_clock(operator) if 0 <= at[0] <= end]
     telemetry = vehicle.of(Telemetry)
     names = list(config.get("cameras") or decisions[0][1].cameras)
     cameras = _with_known_latencies({name: _camera(name, config, decisions, samples, telemetry) for name in names})
     return Series(
         label=label,
         path=str(drive.path),
+        replayed=drive.replayed,
         vehicle=str(config.get("name", "")),
         began=began,
         end=end,
@@ -301,6 +309,20 @@ def _series(drive: Drive, label: str) -> Series:
         ended={name: side.ended for name, side in drive.sides.items()},
         config=config,
     )
+
+
+def _by_steady_clock(operator: _Shifted) -> Iterator[tuple[float, Sample]]:
+    """The samples with their arrivals, logged by the operator's wall clock, by one that was not set."""
+    set_s = [0.0, *accumulate(line.by_s for _, line in operator.of(ClockSet))]
+    for t, line in operator.of(Sample):
+        yield t, line if len(set_s) == 1 else replace(line, cameras=dict(_unset(line, set_s)))
+
+
+def _unset(line: Sample, set_s: Sequence[float]) -> Iterator[tuple[str, CameraSample]]:
+    """The cameras of a sample, with arrivals before it by the clock as it was at the start."""
+    for name, camera in line.cameras.items():
+        near = ((min((at - by_s for by_s in set_s), key=lambda t: abs(t - line.t)), ms) for at, ms in camera.arrivals)
+        yield name, replace(camera, arrivals=tuple(near))
 
 
 def _warnings(sides: Mapping[str, Side], samples: Sequence[Any], cameras: Mapping[str, CameraSeries]) -> Iterator[str]:
@@ -468,12 +490,17 @@ def _with_known_latencies(cameras: Mapping[str, CameraSeries]) -> dict[str, Came
     known = dict(cameras)
     for name, got in received.items():
         if compared:
-            arrival_ms, latency_ms = np.maximum(got.arrival_ms, 0.0), got.latency_ms
+            arrival_ms, latency_ms = _within(got.arrival_ms, got.bound_ms), got.latency_ms
         else:
             arrival_ms = _known(got.arrival_t, got.arrival_ms, apart)
             latency_ms = _known(got.t, got.latency_ms, apart)
         known[name] = replace(cameras[name], received=replace(got, arrival_ms=arrival_ms, latency_ms=latency_ms))
     return known
+
+
+def _within(ms: FloatSeries, bound_ms: FloatSeries) -> FloatSeries:
+    """Latencies that are negative only within their bound; nan where a clock was set between capture and arrival."""
+    return np.where(ms < -float(np.nanmax(bound_ms, initial=0.0)) - 1000 * STEP_S, np.nan, np.maximum(ms, 0.0))
 
 
 def _compared(received: Iterable[ReceivedSeries]) -> bool:

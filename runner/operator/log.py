@@ -8,6 +8,9 @@ from typing import Any
 from runner.drive.log import Log
 from runner.operator.station import Listener, Station
 from runner.records import CameraSample, Note, Offline, Sample, VehicleState
+from runner.system.clocks import latency
+
+LONGEST_MS = 60_000.0  # of a frame that arrives: beyond, a clock was set in between
 
 
 class DriveLog(Listener):
@@ -35,7 +38,10 @@ class DriveLog(Listener):
     def _arrival(self, name: str, arrived: float, captured: float | None) -> tuple[float, float | None]:
         """Arrival time of a unit, s since the beginning, and its latency since capture, ms."""
         clock = self._station.clock
-        known = captured is not None and clock is not None and not self._station.untimed(name)
-        # May be negative within the bound, so that a reader can recover the capture time.
-        ms = round(1000 * (arrived + clock.ahead_s - captured), 2) if known else None  # type: ignore[union-attr, operator]
+        ms = None
+        if captured is not None and clock is not None and not self._station.untimed(name):
+            apart_ms = 1000 * (arrived - captured)
+            if latency(apart_ms, clock) is not None and apart_ms + 1000 * clock.ahead_s < LONGEST_MS:
+                # May be negative within the bound, so that a reader can recover the capture time.
+                ms = round(apart_ms + 1000 * clock.ahead_s, 2)
         return round(arrived - self._log.time, 4), ms

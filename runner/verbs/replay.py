@@ -41,9 +41,12 @@ import sys
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
+
+from msgspec import UNSET
 
 from runner.configuration.config import Base, configuration
 from runner.core.decision import Decision
@@ -53,7 +56,7 @@ from runner.core.step import Run, start, step
 from runner.drive.log import FILES, Log, check_free, log_run
 from runner.drive.read import OTHER_KINDS, REPORTS, check_began, is_log, read_line, read_lines, text_lines
 from runner.errors import ArgumentError, UserError, os_errors_as
-from runner.records import Began, ReceptionReported, decision_to_json, line_from_json
+from runner.records import KINDS, Began, ClockSet, ReceptionReported, decision_to_json, line_from_json
 from runner.schema import log_problem
 from runner.system.files import whole_file
 from runner.verbs import Arguments
@@ -64,6 +67,7 @@ if TYPE_CHECKING:
     from runner.vehicle.uplink import MeasuredUplink
 
 InputEvent = tuple[dict[str, Any], Event]  # an event, as JSON and parsed
+CHANGING = ("link", "positions", "topic")  # arguments that change the events
 NOTHING_PREDICTED = (
     "the source of predictions on the command line has predicted nothing from this input (a map needs positions in it);"
     " the input's own predictions are ignored"
@@ -87,6 +91,7 @@ def run(arguments: Arguments) -> int:
         return _sweep(arguments)
     with _input(arguments) as (name, text):
         lines, began = _begin(text, name)
+        began = began and _corrected(began, arguments)
         one = _prepare(arguments, name, began, _positions(arguments, began))
         _check(arguments)
         with _output(arguments) as output:
@@ -101,6 +106,7 @@ def _sweep(arguments: Arguments) -> int:
         raise ArgumentError("-m", None, "reads the events once for each run: give input=FILE")
     with _input(arguments) as (name, text):
         _, began = _begin(text, name)
+    began = began and _corrected(began, arguments)
     positions = _positions(arguments, began)
     runs = prepare_all(arguments, lambda own: _prepare(own, name, began, positions))
     logged = [one._replace(arguments=one.arguments.in_directory(str(n), ["log"])) for n, (_, one) in enumerate(runs)]
@@ -175,6 +181,17 @@ def _begin(text: Iterable[str], name: str) -> tuple[Iterable[str], Began | None]
     return chain(first, lines), began
 
 
+def _corrected(began: Began, arguments: Arguments) -> Began:
+    """The first record with the start by the clock as it was set last; from standard input, as it was logged."""
+    if arguments.path("input") is None:
+        return began
+    with _input(arguments) as (_, text):
+        steps = (read_line(line)[0] for line in text if KINDS[ClockSet] in line)
+        return replace(
+            began, time=began.time + sum(step["by_s"] for step in steps if step.get("log") == KINDS[ClockSet])
+        )
+
+
 def _base(name: str, began: Began | None) -> Base | None:
     """The configuration of a drive."""
     return (dict(began.config), f"{name}: line 1: config") if began else None
@@ -189,12 +206,19 @@ def _log(arguments: Arguments, config: Mapping[str, Any], began: Began | None) -
         return
     log = Log(directory, "vehicle", config, {}, lambda what: print(what, file=sys.stderr))
     try:
-        log.begin(began.time if began else 0.0)
+        log.begin(began.time if began else 0.0, _words(arguments, began))
         yield log
     except BaseException:
         log.discard()
         raise
     log.close()
+
+
+def _words(arguments: Arguments, began: Began | None) -> tuple[str, ...]:
+    """What distinguishes this replay from the drive; a replay may be replayed in turn."""
+    before = began.replayed if began and began.replayed is not UNSET else ()
+    chosen = (f"{name}={arguments.values[name]}" for name in CHANGING if name in arguments.values)
+    return (*before, *arguments.overrides, *chosen)
 
 
 def replay(
