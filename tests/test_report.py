@@ -22,7 +22,7 @@ from runner.core.events import CameraSwitched
 from runner.drive import quality_file
 from runner.drive.checks import ClaimCheck
 from runner.drive.colours import DAY, NIGHT
-from runner.drive.figures import Figure, figures
+from runner.drive.figures import Figure, bitrates, figures
 from runner.drive.quality_file import DeliveredQuality
 from runner.drive.read import read_drive
 from runner.drive.series import series
@@ -237,6 +237,29 @@ def test_several_drives(tod: Command, drive: Path, tmp_path: Path) -> None:
     assert "all drives" in out
     taller, single = (image.open(tmp_path / "out" / f"{name}.png").height for name in ("totals", "bitrate_on_track"))
     assert taller > single
+
+
+def test_a_replay_is_compared_by_what_it_allocated(tod: Command, drive: Path, tmp_path: Path) -> None:
+    """It used to leave an empty axis, and a row of dashes."""
+    replayed = tmp_path / "steadier"
+    assert tod("replay", f"input={drive}", "modes=steady", f"log={replayed}").status == 0
+    config = json.loads((drive / "drive.jsonl").read_text().splitlines()[0])["config"]
+    models = write_models(tmp_path / "models", config)
+    status, out, _ = tod("report", str(drive), str(replayed), f"output={tmp_path / 'out'}", f"models={models}")
+    assert status == 0
+    driven, decided = document(tmp_path / "out")["drives"]
+    assert (driven["label"], decided["label"]) == ("test_drive", "steadier (replay: modes=steady)")
+    assert (driven["replayed"], decided["replayed"]) == (None, ["modes=steady"])
+    mean = decided["allocated_kbps"]
+    assert mean == pytest.approx(driven["allocated_kbps"], rel=0.05)
+    assert decided["quality"]["mean"] == pytest.approx(driven["quality"]["mean"], abs=0.01)
+    row = out.partition("all drives")[2].partition("steadier (replay: modes=steady) ")[2].partition("\n")[0]
+    assert f" {mean:.0f} " in row
+    assert f" {decided['quality']['mean']:.3f} MSSIM, as allocated" in row
+    each = [statistics(series(read_drive(path))) for path in (drive, replayed)]
+    rows = bitrates(each)
+    assert {chart.y.title for row in rows for chart in row} == {"allocated bitrate in kbit/s"}
+    assert all(np.isfinite(curve.y).all() and curve.y.max() > 100 for row in rows for ch in row for curve in ch.curves)
 
 
 @pytest.mark.parametrize(

@@ -57,6 +57,7 @@ def _drive(drive: DriveStatistics, checks: Sequence[ClaimCheck]) -> dict[str, An
     return {
         "label": series.label,
         "path": series.path,
+        "replayed": None if series.replayed is None else list(series.replayed),
         "vehicle": series.vehicle,
         "began": when(series),
         "duration_s": number(series.end, 3),

@@ -174,19 +174,22 @@ def totals(drives: Drives) -> Rows:
     return [[_over_time(drives, at, _label(drives, at), y, each, hover=KBPS)] for at, each in enumerate(found)]
 
 
-def bitrates(drives: Drives) -> Rows | str:
-    """Actual bitrate of each camera (paper, Fig. 6)."""
-    kinds = {drive.series.measured for drive in drives} - {""}
-    if not kinds:
-        return "neither sent nor received video was logged"
+def bitrates(drives: Drives) -> Rows:
+    """Actual bitrate of each camera (paper, Fig. 6); what was allocated if that is all that is known of a drive."""
+    kinds = {drive.series.measured for drive in drives}
+    actual = "" not in kinds
 
     def curves(drive: DriveStatistics, panel: Panel) -> Iterable[Curve]:
         for dash, names in enumerate(coinciding(drive.series, panel, _allocated)):
-            lines = [drive.series.cameras[name].actual for name in names]
-            yield _mean(_named(names, panel, ": mean and range"), lines, _place(drive, names), dash)
+            if actual:
+                lines = [drive.series.cameras[name].actual for name in names]
+                yield _mean(_named(names, panel, ": mean and range"), lines, _place(drive, names), dash)
+            else:
+                line = drive.series.cameras[names[0]].allocated
+                yield _steps(_named(names, panel), line, drive.series, _place(drive, names), dash=dash)
 
-    title = f"{kinds.pop() if len(kinds) == 1 else 'actual'} bitrate in kbit/s"
-    return _by_panel(drives, curves, lambda _, found: Axis(title, 0.0, _top(found)), KBPS)
+    kind = "allocated" if not actual else kinds.pop() if len(kinds) == 1 else "actual"
+    return _by_panel(drives, curves, lambda _, found: Axis(f"{kind} bitrate in kbit/s", 0.0, _top(found)), KBPS)
 
 
 def scaling(drives: Drives) -> Rows:
@@ -303,7 +306,7 @@ def coinciding(
 
 
 def _allocated(camera: CameraSeries) -> tuple[FloatSeries, FloatSeries]:
-    return camera.decided.t, np.where(camera.decided.sending, camera.decided.kbps, np.nan)
+    return camera.allocated
 
 
 def _factor(camera: CameraSeries) -> tuple[FloatSeries, FloatSeries]:

@@ -154,11 +154,13 @@ def _drive_section(drive: DriveStatistics, *, several: bool) -> str:
         ("logs", ends),
         ("predicted", f"{shown(drive.predicted_min)} to {shown(drive.predicted_max)} kbit/s"),
         ("allocated, mean", f"{shown(drive.allocated)} kbit/s"),
-        (f"{series.measured or 'actual'}, mean", f"{shown(drive.kbps)} kbit/s"),
+        *([(f"{series.measured}, mean", f"{shown(drive.kbps)} kbit/s")] if series.measured else []),
         ("modes", ", ".join(f"{mode} from {t:.1f} s" for t, mode in series.modes)),
         ("rules", _rules(series)),
         ("refused requests", str(series.refused)),
     ]
+    if series.replayed is not None:
+        facts.insert(1, ("replayed with", " ".join(series.replayed) or "nothing changed"))
     if series.link:
         facts.append(("dropped on the link", f"{series.link.dropped[-1]:.0f} packets"))
     return _section(series.label if several else "Drive", _list(facts))

@@ -35,6 +35,7 @@ FREEZE_MORE_S = 0.15  # over the mean gap
 FREEZE_STALLED_S = 2.0  # a stream that stops for this long before the criterion applies
 FREEZE_FIRST = 5  # gaps before a gap can be judged; the specification leaves it open, libwebrtc uses the same
 SECOND_S = 1.0
+SAMPLED_S = 0.25  # as the operator samples bitrates
 NAN = float("nan")
 UNKNOWN: FloatSeries = np.empty(0)
 
@@ -249,7 +250,7 @@ def camera_statistics(
         lost=int(received.lost[-1]) if received else None,
         rebuilt=int(received.rebuilt[-1]) if received else None,
         damaged=ratio(float(received.damaged[-1]), float(received.frames[-1])) if received else NAN,
-        quality=estimate(camera, model, frozen_spans or ()) if model else None,
+        quality=estimate(camera, model, frozen_spans or (), None if source else end) if model else None,
         delivered=delivered,
     )
 
@@ -262,7 +263,7 @@ def _arrivals_logged(received: ReceivedSeries) -> bool:
 def _notes(drive: Series, cameras: Mapping[str, CameraStatistics]) -> Iterable[str]:
     """Missing data, and caveats of the quality estimates."""
     if not drive.measured:
-        yield "neither sent nor received video was logged: only decisions are known"
+        yield "neither sent nor received video was logged: bitrates and quality are those of what was allocated"
     if drive.positions is None:
         yield "no positions were logged: not drawn on the map"
     for camera in drive.cameras.values():
@@ -433,15 +434,18 @@ def rate_curves(document: Mapping[str, Any]) -> Model:
     return Model(metric, {factor: RateCurve(*np.array(sorted(group)).T) for factor, group in groups.items()})
 
 
-def estimate(camera: CameraSeries, model: Model, frozen_spans: Sequence[Freeze] = ()) -> Estimate:
+def estimate(
+    camera: CameraSeries, model: Model, frozen_spans: Sequence[Freeze] = (), allocated_until: float | None = None
+) -> Estimate:
     """Quality of a camera's pictures by its rate-quality model.
 
     At each sample: the curve of the factor in force, at the actual bitrate as the full image would have it at the same
     bits per pixel (paper, left side of Eq. 4), linear between measured points in log bitrate.
 
-    frozen_spans  when the picture was frozen: it keeps the quality it had before, see `Estimate`
+    frozen_spans     when the picture was frozen: it keeps the quality it had before, see `Estimate`
+    allocated_until  end of a drive of which only decisions are known: allocated bitrates are taken
     """
-    t, kbps = camera.actual
+    t, kbps = camera.actual if allocated_until is None else _sampled(camera.allocated, allocated_until)
     decided = camera.decided
     factors = np.round(held(TimeSeries(decided.t, np.where(decided.sending, decided.scaling, np.nan)), t), 6)
     full = kbps / held(TimeSeries(decided.t, decided.roi_share), t)
@@ -460,6 +464,12 @@ def estimate(camera: CameraSeries, model: Model, frozen_spans: Sequence[Freeze] 
     known = np.isfinite(quality) & moving
     clamped = ratio(int((outside & known).sum()), int(known.sum()))
     return Estimate(model.metric, TimeSeries(t, quality), mean(quality[moving]), clamped, tuple(unknown))
+
+
+def _sampled(line: TimeSeries, end: float) -> TimeSeries:
+    """A step function at regular times."""
+    t = np.arange(0.0, end, SAMPLED_S)
+    return TimeSeries(t, held(line, t))
 
 
 def _hold_quality(quality: FloatSeries, moving: Flags, t: FloatSeries, freeze: Freeze) -> None:

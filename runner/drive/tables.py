@@ -37,6 +37,7 @@ def drive_rows(drives: Sequence[DriveStatistics]) -> tuple[TableRow, list[TableR
     headings = (
         "drive",
         "s",
+        "allocated kbit/s",
         "MSSIM delivered, worst camera",
         "quality estimated",
         "time frozen",
@@ -79,8 +80,9 @@ def _drive(drive: DriveStatistics) -> TableRow:
     return (
         drive.series.label,
         shown(drive.series.end, 1),
+        shown(drive.allocated),
         NOTHING if math.isnan(drive.delivered) else f"{drive.delivered:.3f}, {drive.delivered_worst:.3f}",
-        f"{shown(drive.quality, 3)} {drive.metric.upper()}" if drive.metric else NOTHING,
+        f"{shown(drive.quality, 3)} {drive.metric.upper()}{_basis(drive)}" if drive.metric else NOTHING,
         percent(drive.frozen),
         _latency(arrived) + _bound(arrived),
         counted(drive.freezes),
@@ -90,6 +92,10 @@ def _drive(drive: DriveStatistics) -> TableRow:
         percent(drive.share),
         shown(drive.kbps),
     )
+
+
+def _basis(drive: DriveStatistics) -> str:
+    return "" if drive.series.measured else ", as allocated"
 
 
 def _latency(latency: Latency) -> str:

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from textwrap import shorten
 from typing import TYPE_CHECKING
 
 from runner.configuration.files import conf_directories
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 
 PAGE, DOCUMENT = "index.html", "report.json"
 MARK = '<meta name="generator" content="tod-runner report">'  # in each page, see runner/drive/static/report.html
+WORDS_SHOWN = 60  # characters of what a replay changed, in a label
 MARK_WITHIN = 1000  # characters from the start of a page
 
 
@@ -142,14 +144,22 @@ def _measured(
 
 
 def labels(drives: Sequence[Drive]) -> list[str]:
-    """Short names that distinguish drives: the directory's, with more of its path if two have the same name."""
+    """Short names that distinguish drives: the directory's, with more of its path if two have the same name.
+
+    That of a replay states what it changed.
+    """
     paths = [drive.path.resolve() for drive in drives]
     found: list[str] = []
-    for number, path in enumerate(paths):
+    for number, (drive, path) in enumerate(zip(drives, paths, strict=True)):
         others = [other for other in paths if other != path]
         depth = 1
         while depth < len(path.parts) - 1 and any(other.parts[-depth:] == path.parts[-depth:] for other in others):
             depth += 1
         again = paths[:number].count(path)
-        found.append("/".join(path.parts[-depth:]) + (f" ({again + 1})" if again else ""))
+        name = "/".join(path.parts[-depth:]) + (f" ({again + 1})" if again else "")
+        found.append(name if drive.replayed is None else f"{name} (replay: {_shortened(drive.replayed)})")
     return found
+
+
+def _shortened(words: Sequence[str]) -> str:
+    return shorten(" ".join(words) or "unchanged", WORDS_SHOWN, placeholder=" ...")
