@@ -10,6 +10,8 @@ arrives. Words are overrides of the vehicle.
 
 from __future__ import annotations
 
+import needs_tests  # noqa: F401 (first: makes parts of the tests importable)  # isort: skip
+
 import argparse
 import json
 import subprocess
@@ -26,7 +28,6 @@ from typing import IO, Any, NamedTuple
 from table import Row, show
 from usage import memory_mb, processor_s
 
-sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "integration"))
 from rig import Operator, answers, free_port, until
 from runner.apply import check_plan
 from runner.configuration.config import configuration

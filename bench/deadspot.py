@@ -9,9 +9,10 @@ each picture over time. Needs chromium; run it on an otherwise idle machine.
 
 from __future__ import annotations
 
+import needs_tests  # noqa: F401 (first: makes parts of the tests importable)  # isort: skip
+
 import argparse
 import io
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -22,7 +23,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 from playwright.sync_api import Browser, sync_playwright
 
-sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "integration"))
 from browser import measure, opened
 from rig import BROWSER, CHROMIUM_FLAGS, answers, free_port, process, until
 from runner.drive.read import read_drive

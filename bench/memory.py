@@ -10,6 +10,8 @@ them; memory that one frees for a later one, such as a buffer pool, does not sho
 
 from __future__ import annotations
 
+import needs_tests  # noqa: F401 (first: makes parts of the tests importable)  # isort: skip
+
 import argparse
 import json
 import subprocess
@@ -22,6 +24,7 @@ from typing import Any
 from cost import WORDS
 from table import Row, show
 
+from rig import free_port
 from runner.apply import check_plan
 from runner.configuration.config import configuration
 from runner.core.commands import wanted
@@ -30,9 +33,6 @@ from runner.graph import launch, turn_elements
 from runner.mqtt.broker import private_broker
 from runner.plans import compile_plans
 from runner.verbs.print import decide
-
-sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "integration"))
-from rig import free_port
 
 RUNS = 3
 LIMIT_S = 120.0

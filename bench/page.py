@@ -13,11 +13,12 @@ display's own delay is not included. Needs chromium. Run it on an otherwise idle
 
 from __future__ import annotations
 
+import needs_tests  # noqa: F401 (first: makes parts of the tests importable)  # isort: skip
+
 import argparse
 import math
 import shutil
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -31,7 +32,6 @@ from playwright.sync_api import Browser, Page, sync_playwright
 from table import Row, show, spread
 from usage import processor_s
 
-sys.path.append(str(Path(__file__).resolve().parents[1] / "tests" / "integration"))
 from rig import CHROMIUM_FLAGS, Operator, answers, free_port, process, repeating, until
 from runner.configuration.config import configuration
 from runner.core.model import Endpoint

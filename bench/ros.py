@@ -13,6 +13,8 @@ topics are in a bag (MCAP), and the demo's own table shows what arrived.
 
 from __future__ import annotations
 
+import needs_tests  # noqa: F401 (first: makes parts of the tests importable)  # isort: skip
+
 import argparse
 import json
 import subprocess
@@ -25,8 +27,6 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-
-sys.path += [str(Path(__file__).resolve().parents[1] / "tests" / name) for name in (".", "integration")]
 from bags import BEGAN_NS, image, typestore, write_bag
 from ros_domain import MISSING, Ros, running
 

@@ -10,9 +10,10 @@ ROS needs `make ros2` and `make ros1`; the row of a version that is missing says
 
 from __future__ import annotations
 
+import needs_tests  # noqa: F401 (first: makes parts of the tests importable)  # isort: skip
+
 import argparse
 import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -23,14 +24,12 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+from bags import compressed
 from cost import WAIT_S, Frame, child_of, read_frames, write_line
 from ros import above, bag_of, pictures_of, publishing, raw
+from ros_domain import MISSING, running
 from uplinks import row
 from usage import processor_s
-
-sys.path += [str(Path(__file__).resolve().parents[1] / "tests" / name) for name in (".", "integration")]
-from bags import compressed
-from ros_domain import MISSING, running
 
 from rig import answers, children_named, free_port, passes, until
 from runner.configuration.config import configuration

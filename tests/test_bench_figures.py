@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
 import sys
 from dataclasses import replace
 from fractions import Fraction
@@ -18,11 +20,17 @@ from runner.records import LinkSample
 
 pytestmark = pytest.mark.slow  # imports matplotlib
 NOTHING = np.array([])
+BENCH = Path(__file__).resolve().parents[1] / "bench"
+WITHOUT_PYTEST = """
+import importlib.util
+find_spec = importlib.util.find_spec
+importlib.util.find_spec = lambda name, *more: None if name == "pytest" else find_spec(name, *more)
+"""
 
 
 @pytest.fixture(scope="module", autouse=True)
 def _path() -> Any:
-    path = str(Path(__file__).resolve().parents[1] / "bench")
+    path = str(BENCH)
     sys.path.append(path)
     yield
     sys.path.remove(path)
@@ -132,3 +140,17 @@ def test_a_row_is_void_if_the_cameras_do_not_use_their_bitrates(uplinks: ModuleT
     assert "| right (void) |" in rows[94.0]
     busy = list(uplinks.table({"lte": {"right": [one, {**one, "dropped": 1.5}]}}, {"lte": 100.0}))[-1]
     assert "| right (void) |" in busy
+
+
+@pytest.mark.parametrize("script", ["ros", "sources", "deadspot"])
+def test_a_benchmark_without_the_packages_of_tests_says_what_installs_them(tmp_path: Path, script: str) -> None:
+    """As after `make setup`."""
+    (tmp_path / "sitecustomize.py").write_text(WITHOUT_PYTEST)
+    command = [sys.executable, str(BENCH / f"{script}.py"), "CLIP.mp4"]
+    env = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (
+        1,
+        f"{script}.py: needs packages that only tests install (pytest): "
+        "run `make test` first, or install the extra: .venv/bin/pip install -e '.[dev]'\n",
+    )
