@@ -14,6 +14,7 @@ from helpers import Command
 from runner.drive.capacity import CapacitySample, cells, limited_samples
 from runner.drive.read import read_drive
 from runner.drive.series import series
+from runner.records import ReceptionReport, ReceptionReported, UnitReceived, line_to_json
 
 pytestmark = pytest.mark.slow  # draws figures of drives
 
@@ -38,6 +39,23 @@ def test_squares_are_square_at_every_latitude_and_across_the_180th_meridian() ->
         assert 3 <= len(cells(row, 50, 100)) <= 4
 
 
+def measured(side: str, lines: Lines) -> Lines:
+    """As if the vehicle had measured the link, and that had limited the total."""
+    for line in lines:
+        if line.get("log") == "state":
+            line["asked_kbps"] = 2 * line["total_kbps"]
+    if side != "vehicle":
+        return lines
+    events = ({"event": "link_measured", "kbps": 1000, "queue_ms": 60, "state": "filling"} for _ in lines)
+    return [each for line in lines for each in (line, {"t": line["t"], **next(events)})]
+
+
+def reported(t: float, late_s: float) -> dict[str, Any]:
+    """A reception report of a frame that the vehicle sent late."""
+    report = ReceptionReport(t, t, (UnitReceived("front_left", 0.01, 0.1, 1000),), 1, 0)
+    return line_to_json(ReceptionReported(t, "operator", True, report, late_s=(late_s,)))
+
+
 def test_samples_count_only_where_the_link_was_the_limit(tmp_path: Path) -> None:
     """Frames queue from 4 to 6 s, packets are lost from 8 s to 9 s; otherwise the link has spare capacity."""
 
@@ -46,7 +64,7 @@ def test_samples_count_only_where_the_link_was_the_limit(tmp_path: Path) -> None
             for camera in line["cameras"].values() if line.get("log") == "sample" else ():
                 camera["arrivals"] = [[t, 100.0 if 4 <= t < 6 else 10.0] for t, _ in camera["arrivals"]]
                 camera["lost"] = round(np.interp(line["t"], [8, 9], [0, 20]))
-        return lines
+        return measured(side, lines)
 
     drive = series(read_drive(write_drive(tmp_path / "drive", seconds=14, change=change)))
     samples = limited_samples(drive)
@@ -60,9 +78,41 @@ def test_samples_count_only_where_the_link_was_the_limit(tmp_path: Path) -> None
     assert all(0 < sample.kbps < 9000 for sample in samples)
 
 
+def test_frames_that_a_machine_held_up_do_not_count(tod: Command, tmp_path: Path) -> None:
+    """Everything queues from 4 to 6 s and the total is cut: by the link, or since the vehicle sent frames late."""
+
+    def change(side: str, lines: Lines) -> Lines:
+        for line in lines:
+            for camera in line["cameras"].values() if line.get("log") == "sample" else ():
+                camera["arrivals"] = [[t, 100.0 if 4 <= t < 6 else 10.0] for t, _ in camera["arrivals"]]
+                camera["lost"] = 0
+        return measured(side, lines)
+
+    def held_up(side: str, lines: Lines) -> Lines:
+        late = [reported(t / 10, 0.2) for t in range(55, 80)] if side == "vehicle" else []
+        return sorted([*change(side, lines), *late], key=lambda line: line["t"])
+
+    def uncut(side: str, lines: Lines) -> Lines:
+        found = change(side, lines)
+        for line in found:
+            line.pop("asked_kbps", None)
+        return found
+
+    by_link = write_drive(tmp_path / "link", seconds=14, change=change)
+    by_machine = write_drive(tmp_path / "machine", seconds=14, change=held_up)
+    never_cut = write_drive(tmp_path / "uncut", seconds=14, change=uncut)
+    output = tmp_path / "map.csv"
+    for path in (by_machine, never_cut):
+        done = tod("map", str(path), f"output={output}")
+        assert (done.status, done.err.partition(" samples ")[0].rpartition(" ")[0]) == (1, "no map: in none of")
+        assert not output.exists()
+    assert tod("map", str(by_link), f"output={output}").status == 0
+
+
 def test_the_verb_writes_a_map_that_pqos_reads(tod: Command, tmp_path: Path) -> None:
     drives = [
-        str(write_drive(tmp_path / name, seconds=40, seed=seed, congested=3.0)) for name, seed in (("a", 1), ("b", 2))
+        str(write_drive(tmp_path / name, seconds=40, seed=seed, congested=3.0, change=measured))
+        for name, seed in (("a", 1), ("b", 2))
     ]
     output = tmp_path / "map.csv"
     result = tod("map", *drives, f"output={output}", "percentile=20", "cell_m=20")
@@ -80,7 +130,7 @@ def test_drives_that_yield_no_map_are_reported(tod: Command, tmp_path: Path) -> 
         for line in lines:
             for camera in line["cameras"].values() if line.get("log") == "sample" else ():
                 camera |= {"arrivals": [[t, 10.0] for t, _ in camera["arrivals"]], "lost": 0}
-        return lines
+        return measured(side, lines)
 
     good = write_drive(tmp_path / "good", seconds=5, change=roomy)
     output = f"output={tmp_path / 'map.csv'}"

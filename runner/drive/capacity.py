@@ -1,7 +1,8 @@
 """A bandwidth map from drives: the received rate wherever the link was the bottleneck. Pure.
 
 The received rate shows the capacity of a link only while more than that is sent; at all other times it shows how much
-was sent. A sample counts if packets were lost or frames queued during its second: its rate is then the capacity.
+was sent. A sample counts if packets were lost or frames queued during its second, the measured link limited the total,
+and neither machine was held up, which delays frames as a link does: its rate is then the capacity.
 """
 
 from __future__ import annotations
@@ -11,11 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from runner.drive.series import FloatSeries, Positions, Series
+from runner.drive.series import Flags, FloatSeries, Positions, Series, held
 from runner.pqos.bandwidth_map import offset
 
 WINDOW_S = 1.0  # over which the rates of the samples are measured
 QUEUED_MS = 50.0  # above the lowest latency of the drive: the queue in front of the link was filling
+AFTER_S = 0.5  # after a side was held up: what had piled up is delivered
 GAP_S = 2.0  # positions further apart say nothing about the time between
 
 
@@ -40,6 +42,8 @@ def capacity_problem(drive: Series) -> str | None:
     """Why a drive does not show the capacity of the link; None if it does."""
     if not any(camera.received for camera in drive.cameras.values()):
         return "has no operator's log"
+    if not drive.measured_t.size:
+        return "has no measurements of the link: needs the vehicle's log, and rules that measure it (modes=safe)"
     return None if drive.positions else "has no positions"
 
 
@@ -52,6 +56,7 @@ def limited_samples(drive: Series) -> list[CapacitySample]:
     limited = np.zeros(t.shape, dtype=bool)
     for camera in received:
         limited |= _lost(t, camera.t, camera.lost) | _queued(t, camera.arrival_t, camera.clocks_ms)
+    limited &= _measured_limit(drive, t) & ~_held_up(drive, t)
     lat, lon = _positions_at(drive.positions, t)
     known = limited & np.isfinite(kbps) & np.isfinite(lat)
     return [CapacitySample(*map(float, row)) for row in zip(lat[known], lon[known], kbps[known], strict=True)]
@@ -83,16 +88,14 @@ def _square(sample: CapacitySample, origin: CapacitySample, cell_m: float) -> tu
     return int(np.floor(east / cell_m)), int(np.floor(north / cell_m))
 
 
-def _lost(at: FloatSeries, t: FloatSeries, lost: FloatSeries) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+def _lost(at: FloatSeries, t: FloatSeries, lost: FloatSeries) -> Flags:
     """Whether packets were lost in the second before each time."""
     before = np.interp(at - WINDOW_S, t, lost)
-    more: np.ndarray[tuple[int, ...], np.dtype[np.bool_]] = np.interp(at, t, lost) > before
+    more: Flags = np.interp(at, t, lost) > before
     return more
 
 
-def _queued(
-    at: FloatSeries, t: FloatSeries, latency_ms: FloatSeries
-) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+def _queued(at: FloatSeries, t: FloatSeries, latency_ms: FloatSeries) -> Flags:
     """Whether half of the frames that arrived in the second before each time had been queued."""
     queued = np.zeros(at.shape, dtype=bool)
     if not np.isfinite(latency_ms).any():
@@ -103,6 +106,20 @@ def _queued(
     frames = ends - begins
     queued[frames > 0] = (2 * (count[ends] - count[begins]) >= frames)[frames > 0]
     return queued
+
+
+def _measured_limit(drive: Series, at: FloatSeries) -> Flags:
+    """Whether the total was below what was asked for, and the link measured in the second before each time."""
+    ends, begins = (np.searchsorted(drive.measured_t, t, "right") for t in (at, at - WINDOW_S))
+    return np.asarray((held(drive.capped, at) == 1) & (ends > begins))
+
+
+def _held_up(drive: Series, at: FloatSeries) -> Flags:
+    """Whether a side was held up in the second before each time, or so shortly before that frames were still late."""
+    found = np.zeros(at.shape, dtype=bool)
+    for begin, end in drive.held_up:
+        found |= (begin <= at) & (at - WINDOW_S - AFTER_S <= end)
+    return found
 
 
 def _positions_at(positions: Positions, t: FloatSeries) -> tuple[FloatSeries, FloatSeries]:

@@ -14,9 +14,10 @@ from itertools import accumulate, pairwise
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
+from msgspec import UNSET
 from numpy.typing import NDArray
 
-from runner.core.events import BitratePredicted, Event, PositionReported
+from runner.core.events import BitratePredicted, Event, LinkMeasured, PositionReported
 from runner.drive.log import FILES
 from runner.drive.read import SET_S, Drive, Side
 from runner.errors import UserError
@@ -30,6 +31,7 @@ from runner.records import (
     LinkSample,
     Note,
     Position,
+    ReceptionReported,
     Record,
     Sample,
     Telemetry,
@@ -42,6 +44,10 @@ Flags = NDArray[np.bool_]
 T = TypeVar("T")
 
 RATE_WINDOW_S = 1.0  # rates of sent video are measured over at least this long, as the operator's are
+# How often the vehicle's loop, the operator's sampling and its reports write a line; one that is later was held up.
+LOOP_S, SAMPLE_S, REPORT_S = 0.1, 0.25, 0.04
+HELD_UP_S = 0.1
+LATE_S = 0.05  # that the vehicle was late to send a frame
 DOWN_DEG = 25.0  # a camera pitched down by this much is a top view, as on the operator's page
 PANEL_CAMERAS = 4  # number of curves distinguishable in one panel; more are split if the mounting gives no groups
 
@@ -182,6 +188,9 @@ class Series:
     end        s; the last line of the side that gives the axis
     measured   "received" or "sent": what `actual` is; "" if neither was logged
     predicted, allocated  step functions: each value is in force until the next
+    capped     whether rules lowered the total below what was asked for, a step function; empty if not logged
+    measured_t when the vehicle measured the link, s
+    held_up    (from s, to s), when a side's process was held up, or the vehicle sent frames late
     modes      (from s, mode)
     notes      (s, text)
     refused    number of requests
@@ -200,6 +209,9 @@ class Series:
     allocated: TimeSeries
     actual: TimeSeries
     measured: str
+    capped: TimeSeries
+    measured_t: FloatSeries
+    held_up: tuple[tuple[float, float], ...]
     link: LinkSeries | None
     positions: Positions | None
     modes: tuple[tuple[float, str], ...]
@@ -298,6 +310,9 @@ def _series(drive: Drive, label: str) -> Series:
         allocated=_line((t, sum(camera.kbps for camera in line.cameras.values())) for t, line in decisions),
         actual=_total(samples, cameras),
         measured="received" if samples else "sent" if telemetry else "",
+        capped=_capped(operator),
+        measured_t=np.array([t for t, event in vehicle.of(LinkMeasured) if event.kbps is not None], dtype=float),
+        held_up=tuple(_held_up(vehicle, samples)),
         link=_link([at for at in link.of(LinkSample) if 0 <= at[0] <= end]),
         positions=_positions(_Shifted(leading.lines, 0.0), samples),
         modes=tuple(_modes(decisions)),
@@ -363,6 +378,29 @@ def _total(samples: Sequence[Any], cameras: Mapping[str, CameraSeries]) -> TimeS
         return TimeSeries(t, _settled(t, y, np.asarray(np.sum([each.frames for each in received], axis=0))))
     sent = [camera.sent for camera in cameras.values() if camera.sent]
     return TimeSeries(sent[0].t, np.asarray(np.sum([each.kbps for each in sent], axis=0))) if sent else EMPTY
+
+
+def _capped(operator: _Shifted) -> TimeSeries:
+    states = operator.of(VehicleState)
+    return _line((t, state.total_kbps < state.asked_kbps) for t, state in states if state.asked_kbps is not None)
+
+
+def _held_up(vehicle: _Shifted, samples: Sequence[tuple[float, Sample]]) -> Iterator[tuple[float, float]]:
+    """Gaps between lines that a side writes regularly, and frames that the vehicle sent late."""
+    reported = vehicle.of(ReceptionReported)
+    yield from _gaps([t + vehicle.shift for t in sorted({line.t for line in vehicle.lines})], LOOP_S)
+    yield from _gaps([t for t, _ in samples], SAMPLE_S)
+    for (_, before), (t, line) in pairwise(reported):
+        apart_s = line.report.at - before.report.at
+        if before.operator == line.operator and apart_s > REPORT_S + HELD_UP_S:
+            yield t - apart_s, t
+    for t, line in reported:
+        if line.late_s is not UNSET and (late_s := max(line.late_s, default=0.0)) > LATE_S:
+            yield t - late_s, t
+
+
+def _gaps(times: Sequence[float], every_s: float) -> Iterator[tuple[float, float]]:
+    return ((before, t) for before, t in pairwise(times) if t - before > every_s + HELD_UP_S)
 
 
 def _link(lines: Sequence[Any]) -> LinkSeries | None:

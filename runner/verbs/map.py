@@ -2,8 +2,9 @@
 
 Makes a bandwidth map from drives, for pqos=map: per square of the ground, a percentile of the received rate, in kbit/s
 of video. Only samples in which the link was the bottleneck count: over the second before, packets were lost, or half of
-the frames of a camera arrived 50 ms later than its fastest. All others show how much was sent, not what the link can
-carry. The operator's log is needed (demo and operator with log=DIR).
+the frames of a camera arrived 50 ms later than its fastest; the measured link limited the total; and neither machine
+was held up. All others show how much was sent, or how busy a machine was, not what the link can carry. Both logs are
+needed (log=DIR), of a drive with rules that measure the link (modes=safe).
 
 positions= is a ROS bag with the vehicle's positions during the drives (sensor_msgs/NavSatFix), which replace those in
 their logs; topic= is needed if it has several such topics.
@@ -42,8 +43,8 @@ def run(arguments: Arguments) -> int:
         samples += limited_samples(drive)
         seen += len(drive.actual.t)
     if not samples:
-        rule = "no packet was lost and no frame was late: the received bitrate does not show the link's capacity"
-        reasons = [f"in none of {seen} samples was the link the limit; {rule}"] if seen else []
+        rule = "packets lost or frames late, the measured link limiting the total, and no machine held up"
+        reasons = [f"in none of {seen} samples was the link the limit: {rule}"] if seen else []
         raise RunError(f"no map: {'; '.join([*unusable, *reasons])}")
     squares = cells(samples, percentile, cell_m)
     _write(output, squares)
