@@ -98,7 +98,7 @@ def _run(words: list[str]) -> int:
     from runner.verbs import VERBS, Arguments, unknown_flag
 
     if not words or words[0] in ("-h", "--help", "help"):
-        print(USAGE.format(verbs="\n".join(f"  {name:10}{verb.summary}" for name, verb in VERBS.items())))
+        print(USAGE.format(verbs="\n".join(f"  {name:11}{verb.summary}" for name, verb in VERBS.items())))
         return 0 if words else 2
     if words[0] == "--version":
         from importlib.metadata import version

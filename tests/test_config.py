@@ -10,6 +10,7 @@ import pytest
 from helpers import CONF, Command, UserConf, process, vehicle
 
 from runner.configuration.config import configuration
+from runner.configuration.rule_lists import OWN_RULES
 from runner.core.model import Mode
 from runner.errors import ConfigError, Problem
 
@@ -239,7 +240,8 @@ def test_the_three_messages_of_the_style_guide(
     assert sorted(messages) == [
         "conf/cameras/rear_center.yaml: heigth_px: unknown key, did you mean height_px?",
         f"conf/cameras/rear_center.yaml: rate_quality.b_min_kbps: [0, 400, 400]: {RISING}",
-        "conf/modes/paper.yaml: automatic[2]: 'share_by_demnd': unknown rule, did you mean share_by_demand?",
+        "conf/modes/paper.yaml: automatic[2]: 'share_by_demnd': unknown rule, did you mean share_by_demand?"
+        + OWN_RULES,
     ]
     assert summary == "3 problems, nothing was started"
 
@@ -325,7 +327,7 @@ REAR, GRAPH, PAPER, ROBOT = (
         (
             PAPER,
             {"share_by_demand": "share_by_demnd"},
-            "automatic[2]: 'share_by_demnd': unknown rule, did you mean share_by_demand?",
+            "automatic[2]: 'share_by_demnd': unknown rule, did you mean share_by_demand?" + OWN_RULES,
         ),
         (PAPER, {"start_kbps: 3000": "start_kbp: 1"}, "start_kbp: 1: unknown parameter, did you mean start_kbps?"),
         (PAPER, {"start_kbps: 3000": ""}, "start_kbps: missing: required by this rule"),
@@ -606,7 +608,7 @@ def test_all_problems_are_reported_at_once_in_one_run(conf: UserConf, tod: Comma
             "~/cameras/top_view.yaml: rate_quality.b_full_kbps: 400: must be above the last b_min, 400",
             f"~/{GRAPH}: knobs.sending[0].element: 'gaet': no such element, did you mean gate?",
             f"~/{PAPER}: singel: unknown key, did you mean single?",
-            f"~/{PAPER}: automatic[2]: 'shareby_demand': unknown rule, did you mean share_by_demand?",
+            f"~/{PAPER}: automatic[2]: 'shareby_demand': unknown rule, did you mean share_by_demand?" + OWN_RULES,
             "command line: fps_max: -1: must be above 0",
             "command line: cameras.top_rear.weigth: unknown key, did you mean weight?",
             "command line: media.port: 99999: must be at most 65535",

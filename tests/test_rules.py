@@ -13,7 +13,7 @@ from helpers import CONF, Drive, vehicle
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from runner.configuration.rule_lists import call_rule, check_order
+from runner.configuration.rule_lists import OWN_RULES, call_rule, check_order
 from runner.core import events as core_events
 from runner.core import rules
 from runner.core.events import Attention, BitratePredicted, parse
@@ -494,7 +494,7 @@ def test_a_list_in_the_wrong_order_is_refused(names: tuple[str, ...], problems: 
 @pytest.mark.parametrize(
     "name, parameters, message",
     [
-        ("share_by_demnd", {}, ": 'share_by_demnd': unknown rule, did you mean share_by_demand?"),
+        ("share_by_demnd", {}, ": 'share_by_demnd': unknown rule, did you mean share_by_demand?" + OWN_RULES),
         ("share_by_demand", {"x": 1}, "share_by_demand.x: 1: unknown parameter; share_by_demand takes none"),
         ("hold_upscaling", {"fo_s": 1}, "hold_upscaling.fo_s: 1: unknown parameter, did you mean for_s?"),
         ("hold_upscaling", {}, "hold_upscaling.for_s: missing: required by this rule"),

@@ -17,6 +17,7 @@ from runner.configuration.combinations import SECTIONS, Combinations, words_of
 from runner.configuration.compose import compose
 from runner.configuration.config import configuration
 from runner.configuration.files import GROUPS, options
+from runner.configuration.rule_lists import OWN_RULES
 from runner.plans import compile_plans
 from runner.system import spawned
 from runner.verbs import validate
@@ -175,7 +176,7 @@ def test_problems_that_only_composition_shows(tod: Command, conf: UserConf) -> N
     conf.change("cameras/mast_1200p.yaml", {"[0, 300]": "[0, 0]"})
     conf.change("modes/paper.yaml", {"share_by_demand": "share_by_demnd"})
     assert sorted(problems(tod, conf, *one("modes")), reverse=True) == [
-        "~/modes/paper.yaml: automatic[2]: 'share_by_demnd': unknown rule, did you mean share_by_demand?",
+        "~/modes/paper.yaml: automatic[2]: 'share_by_demnd': unknown rule, did you mean share_by_demand?" + OWN_RULES,
         "~/cameras/mast_1200p.yaml: rate_quality.b_min_kbps: [0, 0]: must start at 0 and be strictly increasing",
     ]
 
@@ -295,6 +296,18 @@ def test_recording_files_are_checked_although_none_is_chosen(
     conf.change("recording/ffv1.yaml", {old: new})
     (found,) = problems(tod, conf, *one("recording"))
     assert found.startswith(f"~/recording/ffv1.yaml: {expected}")
+
+
+@pytest.mark.gst
+@pytest.mark.skipif(importlib.util.find_spec("gi") is None, reason="PyGObject is not installed")
+def test_media_that_do_not_fit_are_named_with_what_would(tod: Command, conf: UserConf) -> None:
+    """Not only `could not link sent to pay0`, which names elements between which nothing is wrong."""
+    conf.change("graph/h264_rtsp.yaml", {"element: rtph264pay": "element: rtph265pay"})
+    found = problems(tod, conf, *one(), "graph=h264_rtsp")
+    message = (
+        "could not link sent to pay0: x264enc gives video/x-h264, rtph265pay takes video/x-h265; in place of rtph265pay"
+    )
+    assert any(f"{message}: " in problem and "rtph264pay" in problem for problem in found), found
 
 
 def test_a_study_is_checked(tod: Command, conf: UserConf) -> None:

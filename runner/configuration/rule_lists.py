@@ -13,6 +13,8 @@ from runner.core import rules
 from runner.core.model import Mode, ModelError, exact, suggest
 from runner.core.rules import Rule, RuleCall
 
+OWN_RULES = "; one of your own needs the entry point tod_runner.rules, see docs/rules.md"
+
 
 def find_rule(name: str) -> Rule:
     """The rule of that name, from this package or from an entry point.
@@ -29,7 +31,7 @@ def find_rule(name: str) -> Rule:
                 rule = f"{entry.value} cannot be imported: {type(error).__name__}: {error}"
                 raise ModelError("", repr(name), rule) from None
     if name not in rules.RULES:
-        raise ModelError("", repr(name), f"unknown rule{suggest(name, rules.RULES)}")
+        raise ModelError("", repr(name), f"unknown rule{suggest(name, rules.RULES)}{OWN_RULES}")
     return rules.RULES[name]
 
 

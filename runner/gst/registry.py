@@ -149,7 +149,8 @@ def _check_links(plan: Plan, parts: Collection[str]) -> list[ModelError]:
     errors: dict[str, str] = {}
     for where, line in _lines(plan, parts):
         if where not in errors and (message := _unlinkable(line)):
-            errors[where] = message
+            part = plan.operator if where == "graph.operator" else (*plan.source, *plan.vehicle)
+            errors[where] = message + _misfit(message, [(each.name, each.factory) for each in part])
     return [ModelError(where, None, message) for where, message in errors.items()]
 
 
@@ -182,6 +183,41 @@ def _unlinkable(line: str) -> str | None:
     except GLib.Error as error:
         return str(error.message)
     return None
+
+
+def _misfit(message: str, elements: Sequence[tuple[str, str]]) -> str:
+    """Which media do not fit where GStreamer could not link two elements, and what would; "" if that is not why."""
+    factories, found = dict(elements), re.match(r"could not link (\S+) to ([^\s,]+)", message)
+    if not found or not {*found.groups()} <= factories.keys():
+        return ""
+    names = list(factories)
+    before = [factories[name] for name in reversed(names[: names.index(found[1]) + 1])]
+    source = next((factory for factory in before if _media(factory, Gst.PadDirection.SRC)), None)
+    sink = factories[found[2]]
+    takes = _media(sink, Gst.PadDirection.SINK)
+    gives = _media(source, Gst.PadDirection.SRC) if source else frozenset()
+    if not gives or not takes or gives & takes:
+        return ""
+    fitting = [name for name in _like(sink) if gives <= _media(name, Gst.PadDirection.SINK)]
+    instead = f"; in place of {sink}: {', '.join(fitting)}, and what receives it at the other side" if fitting else ""
+    return f": {source} gives {', '.join(sorted(gives))}, {sink} takes {', '.join(sorted(takes))}{instead}"
+
+
+def _media(factory: str, direction: Gst.PadDirection) -> frozenset[str]:
+    """Media types of an element's pads by their templates; none if it takes any."""
+    templates = Gst.ElementFactory.find(factory).get_static_pad_templates()
+    every = [template.get_caps() for template in templates if template.direction == direction]
+    if any(caps.is_any() for caps in every):
+        return frozenset()
+    return frozenset(caps.get_structure(n).get_name() for caps in every for n in range(caps.get_size()))
+
+
+def _like(factory: str) -> list[str]:
+    """Elements of the same class, those of the highest rank first."""
+    wanted = Gst.ElementFactory.find(factory).get_metadata("klass")
+    every = Gst.Registry.get().get_feature_list(Gst.ElementFactory)
+    alike = [each for each in every if each.get_metadata("klass") == wanted and each.get_rank()]
+    return [each.get_name() for each in sorted(alike, key=lambda each: (-each.get_rank(), each.get_name()))]
 
 
 @lru_cache(maxsize=None, typed=True)

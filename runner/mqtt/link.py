@@ -22,6 +22,7 @@ from runner.core.model import Endpoint
 from runner.errors import RunError, UserError
 from runner.mqtt.login import Login
 from runner.mqtt.messages import JsonObject, MqttMessage
+from runner.security.exposure import is_loopback
 from runner.system.reports import LimitedReports
 
 CONNECT_S = 1.0  # one attempt to connect
@@ -333,7 +334,7 @@ class ControlLink:
     def _on_connect_fail(self, error: BaseException | None) -> None:
         from runner.mqtt import refusal
 
-        why = refusal.of_failure(error, tls=self._login is not None)
+        why = refusal.of_failure(error, tls=self._login is not None) + self._remedy(error)
         self._failed_to_connect(why, perhaps_keys=isinstance(error, ssl.SSLError))
 
     def _failed_to_connect(self, why: str, perhaps_keys: bool = False) -> None:
@@ -350,6 +351,14 @@ class ControlLink:
         if why not in self._reported and len(self._reported) < MOST_REASONS:
             self._reported.add(why)
             self._on_report(f"{self.fault}; retrying")
+
+    def _remedy(self, error: BaseException | None) -> str:
+        if not isinstance(error, ConnectionRefusedError):
+            return ""
+        if is_loopback(self._broker.host):
+            return f" (start one on this machine: mosquitto -p {self._broker.port})"
+        return " (does one run there, reachable from other machines? See docs/deployment.md)"
+
 
 
 def _is_one_of(kinds: set[str], topic: str) -> bool:

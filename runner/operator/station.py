@@ -581,4 +581,6 @@ def _stages(received: StreamCounters, measured: CameraTelemetry | None) -> Laten
     buffer, decode, total = received.waited_ms, received.decode_ms, received.latency_ms
     parts = [part for part in (capture, encode, buffer, decode) if part is not None]
     link = total - sum(parts) if total is not None and len(parts) == 4 else None
+    if link is not None and link < 0:  # the parts are of other pictures than the latency, by up to a second
+        link = None
     return LatencyStages(*(None if ms is None else round(ms, 2) for ms in (capture, encode, link, buffer, decode)))

@@ -3,7 +3,7 @@
 Measures glass-to-glass latency: a camera of the vehicle films this machine's screen, on which one page shows a
 counter, and another page shows the camera's picture and reads the counter in it. Both pages use this machine's clock,
 so no clocks are compared. The vehicle must be running. Ends duration_s after the first counter was read, with Ctrl-C,
-or if no counter was read for five minutes.
+or if no counter was read for five minutes. Without a vehicle it ends after 20 s.
 
 Prints the measured latency; the latency from capture to drawing that the operator's page states for the same pictures;
 the difference, which camera and screen add; and latency.fixed_ms, for the vehicle's file (latency: {fixed_ms: ...}) or
@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING
 
 from runner.configuration.config import configuration
 from runner.core.model import Camera, Vehicle, suggest
-from runner.errors import ArgumentError
+from runner.errors import ArgumentError, RunError
 from runner.operator.station import Listener
 from runner.records import Note
 from runner.security.exposure import KeysOfAll, page_keyring
@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from runner.vehicle.live import LiveVehicle
 
 DURATION_S = 20.0
+START_S = 20.0  # how long the vehicle may take to answer
 SHOWN_S = 300.0  # how long the user may take to show the counter to the camera
 SAY_S = 2.0  # between two lines of progress
 LOOK_S = 0.1
@@ -144,12 +145,12 @@ def _collect(
     """Wait until the counter was read for long enough, or was not read at all.
 
     returns  capture to decoding, ms, of each sample since the counter was first read
-    raises   RunError if receiving has ended
+    raises   RunError if receiving has ended, or no vehicle answered
     """
     decoded_ms: list[float] = []
     first: float | None = None
     began = reported = time.monotonic()
-    before = None
+    before, seen = None, False
     while operator.runs(LOOK_S):
         now, sampled = time.monotonic(), operator.station.samples
         if first is None and _count_read(readings):
@@ -157,12 +158,21 @@ def _collect(
         if first and sampled is not before and (received := sampled.get(camera)) and received.latency_ms is not None:
             decoded_ms.append(received.latency_ms)
         before = sampled
+        seen = seen or operator.station.state is not None
+        if not seen and now - began > START_S:
+            raise RunError(_no_vehicle(operator.vehicle))
         if now - reported >= SAY_S and readings:
             reported = now
             say(f"counter read in {_count_read(readings)} of {len(readings)} pictures")
         if now - began > SHOWN_S if first is None else now - first > duration_s:
             break
     return decoded_ms
+
+
+def _no_vehicle(vehicle: Vehicle) -> str:
+    broker = f"{vehicle.control.host}:{vehicle.control.port}"
+    rule = "start it with `tod-runner vehicle`, or check name=, control.host= and control.port="
+    return f"no vehicle {vehicle.name} has answered for {START_S:.0f} s over the broker at {broker}: {rule}"
 
 
 def _count_read(readings: Collection[CounterReading]) -> int:

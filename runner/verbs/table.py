@@ -28,6 +28,11 @@ from runner.verbs.screen import forgiving
 PLAIN_EVERY_S = 5.0
 NOTES = 4
 MAX_PENDING = 1000
+WHY = "why"
+HEADINGS = ("fps", "kbit/s", "allocated", "demand", "size", "factor", "latency ms", "lost", WHY)
+NARROW = ("fps", "kbit/s", "allocated", "size", "factor", "latency ms", "lost")
+WHOLE = 110  # columns from which all of these fit
+MOST_NAME = 20  # columns that a camera's name keeps on a narrow terminal
 
 
 class LiveTable(Listener):
@@ -61,10 +66,10 @@ class LiveTable(Listener):
             if not self._live:
                 self._console.print(line, markup=False, highlight=False)
         if self._live:
-            self._live.update(Group(_table(rows, headline), *map(Text, self._notes)), refresh=True)
+            self._live.update(Group(_table(rows, headline, self._console.width), *map(Text, self._notes)), refresh=True)
         elif time.monotonic() - self._shown >= PLAIN_EVERY_S:
             self._shown = time.monotonic()
-            self._console.print(_table(rows, headline))
+            self._console.print(_table(rows, headline, self._console.width))
 
 
 def _console() -> Console:
@@ -77,29 +82,35 @@ def _show_cursor() -> None:
         os.write(sys.stdout.fileno(), b"\x1b[?25h\n")
 
 
-def _table(rows: Sequence[CameraRow], headline: str) -> RichTable:
+def _table(rows: Sequence[CameraRow], headline: str, width: int) -> RichTable:
+    """Cameras by row, in so many columns of the terminal: a narrow one shows what was received, not why."""
+    cells = {row.name: _cells(row) for row in rows}
+    shown = NARROW if width < WHOLE else HEADINGS
     table = RichTable(title=headline, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
-    table.add_column("camera")
-    for heading in ("fps", "kbit/s", "allocated", "demand", "size", "factor", "latency ms", "lost"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    table.add_column("why", overflow="fold")
-    for row in rows:
-        received, state = row.received, row.state
-        size = f"{received.width}x{received.height}" if received.width and row.rates.fps else "-"
-        latency = f"{received.latency_ms:.1f}" if received.latency_ms is not None else "-"
-        table.add_row(
-            row.name,
-            f"{row.rates.fps:.1f}",
-            f"{row.rates.kbps:.0f}",
-            str(state.kbps) if state else "-",
-            f"{state.demand_kbps:.0f}" if state else "-",
-            Text(size, style=_size_style(row)),
-            str(state.scaling or "off") if state else "-",
-            latency,
-            str(received.lost),
-            state.reason if state else "",
+    table.add_column("camera", overflow="fold", min_width=min(MOST_NAME, max(map(len, cells), default=0)))
+    for heading in shown:
+        table.add_column(
+            heading, justify="left" if heading == WHY else "right", no_wrap=heading != WHY, overflow="fold"
         )
+    for name, each in cells.items():
+        table.add_row(name, *(each[heading] for heading in shown))
     return table
+
+
+def _cells(row: CameraRow) -> dict[str, str | Text]:
+    received, state = row.received, row.state
+    size = f"{received.width}x{received.height}" if received.width and row.rates.fps else "-"
+    return {
+        "fps": f"{row.rates.fps:.1f}",
+        "kbit/s": f"{row.rates.kbps:.0f}",
+        "allocated": str(state.kbps) if state else "-",
+        "demand": f"{state.demand_kbps:.0f}" if state else "-",
+        "size": Text(size, style=_size_style(row)),
+        "factor": str(state.scaling or "off") if state else "-",
+        "latency ms": f"{received.latency_ms:.1f}" if received.latency_ms is not None else "-",
+        "lost": str(received.lost),
+        WHY: state.reason if state else "",
+    }
 
 
 def _size_style(row: CameraRow) -> str:

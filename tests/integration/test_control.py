@@ -236,7 +236,8 @@ def test_both_sides_wait_for_a_broker(stack):
         output[verb] = []
         reader = threading.Thread(target=lambda c=child, v=verb: output[v].extend(c.stdout), daemon=True)
         reader.start()
-    wanted = f"no control link: MQTT broker at {broker}: connection refused; retrying"
+    remedy = f"start one on this machine: mosquitto -p {broker.port}"
+    wanted = f"no control link: MQTT broker at {broker}: connection refused ({remedy}); retrying"
     until(lambda: any(wanted in line for line in output["vehicle"]))
     time.sleep(2)
     with private_broker(broker):

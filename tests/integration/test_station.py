@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import json
 import time
 
 import pytest
+from rich.console import Console
 
 from rig import RecordingListener, free_port, passes, until
 from runner.configuration.config import configuration
@@ -15,8 +17,10 @@ from runner.gst.receiver import Reception
 from runner.mqtt.broker import private_broker
 from runner.mqtt.link import ControlLink
 from runner.mqtt.messages import OFFLINE, topic
-from runner.operator.station import SILENT_S, Listener, Station
-from runner.records import Arrival, Arrivals
+from runner.operator.meter import MeasuredRates
+from runner.operator.station import SILENT_S, CameraRow, Listener, Station, _stages
+from runner.records import Arrival, Arrivals, CameraTelemetry
+from runner.verbs.table import _table
 
 pytestmark = pytest.mark.gst
 
@@ -379,3 +383,22 @@ def test_a_vehicle_that_signs_off_is_offline_immediately(both):
     until(lambda: not station.state)
     assert listener.notes[1:] == ["the vehicle is offline"]
     assert listener.received[-1] == ("state", None)
+
+
+@pytest.mark.parametrize("width", [80, 150])
+def test_the_table_shows_the_names_of_cameras_on_a_narrow_terminal(width):
+    names = ("front_center", "top_left")
+    received = Reception(frames=9, width=1920, height=1040, latency_ms=123.4, latency_at=time.monotonic())
+    rows = [CameraRow(name, MeasuredRates(15.0, 1234.0), received, None) for name in names]
+    console = Console(width=width, record=True, file=io.StringIO())
+    console.print(_table(rows, "the vehicle is online", width))
+    lines = console.export_text().splitlines()
+    assert [line.split()[0] for line in lines[4:6]] == list(names)
+    assert ("demand" in lines[2], "1920x1040" in lines[4]) == (width > 80, True)
+
+
+def test_no_part_of_a_latency_is_negative():
+    """The parts are those of other pictures than the sum."""
+    received = Reception(waited_ms=30.0, decode_ms=20.0, latency_ms=40.0)
+    stages = _stages(received, CameraTelemetry({}, 1, 1, capture_ms=5.0, encode_ms=6.0))
+    assert (stages.link, stages.buffer) == (None, 30.0)
