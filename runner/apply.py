@@ -299,12 +299,12 @@ class VehicleSide:
         if self._server:
             self._server.controller = operator
 
-    def push(self, camera: str, frame: Any) -> bool:
-        """Push a frame, captured now, of a camera whose frames come from Python; see `runner.live.LiveVehicle`."""
+    def push(self, camera: str, frame: Any, form: str | None = None, captured: float | None = None) -> bool:
+        """Push a frame of a camera whose frames come from Python; see `runner.live.LiveVehicle`."""
         if camera not in self._wanted:
             raise ValueError(f"camera {camera!r}: no such camera{suggest(camera, self._wanted)}")
         pipeline = self._pipeline(camera)
-        return pipeline is not None and pipeline.push(frame)
+        return pipeline is not None and pipeline.push(frame, form, captured)
 
     def push_shared(self, camera: str, picture: SharedPicture) -> bool:
         """Push a picture in shared memory, with its capture time; returns False if nobody is watching."""

@@ -12,7 +12,7 @@ from helpers import CONF, Command, UserConf, process, vehicle
 from runner.configuration.config import configuration
 from runner.configuration.rule_lists import OWN_RULES
 from runner.core.model import Mode
-from runner.errors import ConfigError, Problem
+from runner.errors import ConfigError, Problem, UserError
 
 TOP_KEYS = "mode, fps_max, media, control, page, latency, log, name, cameras, modes, graph, source, pqos, ..."
 CAMERA_KEYS = (
@@ -631,3 +631,14 @@ def test_the_environment_does_not_affect_the_configuration(conf: UserConf) -> No
     conf.write("vehicle/mine.yaml", MINE + "media: {host: '${oc.env:KIND}'}\n")
     result = process(*words, env={**os.environ, "KIND": "top_view"})
     assert result.err.splitlines()[0].endswith("media.host: Unsupported interpolation type oc.env")
+
+
+def test_a_program_names_its_directory_like_the_command_line(conf: UserConf) -> None:
+    """As an override, as text or as a path, but not two of them."""
+    conf.write("vehicle/mine.yaml", "# @package _global_\ndefaults: [delivery_robot, _self_]\nname: mine\n")
+    path = conf.path
+    for words, named in (([f"conf={path}"], None), ([], str(path)), ([], path), ([f"conf={path}"], path)):
+        assert configuration(["vehicle=mine", *words], named).vehicle().name == "mine"
+    with pytest.raises(UserError) as error:
+        configuration(["vehicle=mine", "conf=other"], path)
+    assert str(error.value) == f"command line: conf: 'other': must name one directory; {path} was named, too"

@@ -11,6 +11,7 @@ from runner.configuration.build import Builder, PlanCheck
 from runner.configuration.compose import compose, recompose
 from runner.configuration.files import conf_directories
 from runner.core.model import Vehicle
+from runner.errors import ArgumentError
 
 if TYPE_CHECKING:
     from runner.configuration.experiment import Experiment, LinkSettings
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from runner.pqos.track import Track
     from runner.rate_quality.study import Study
 
+CONF = "conf="
 Base = tuple[dict[str, Any], str]  # a configuration composed before, and its location
 
 
@@ -113,9 +115,20 @@ class Configuration:
         return Builder.of(self._composed, self._runnable, self._bags, self._check, self._fits)
 
 
+def _directory(overrides: Sequence[str], user: Path | str | None) -> tuple[Sequence[str], Path | None]:
+    """The overrides without conf=DIR, and that directory, or the one named separately.
+
+    raises  ArgumentError if they differ
+    """
+    named = [*([Path(user)] if user else []), *(Path(w.removeprefix(CONF)) for w in overrides if w.startswith(CONF))]
+    if len(set(named)) > 1:
+        raise ArgumentError("conf", named[-1], f"must name one directory; {named[0]} was named, too")
+    return [word for word in overrides if not word.startswith(CONF)], named[0] if named else None
+
+
 def configuration(
     overrides: Sequence[str] = (),
-    user: Path | None = None,
+    user: Path | str | None = None,
     *,
     base: Base | None = None,
     runnable: bool = True,
@@ -123,9 +136,11 @@ def configuration(
 ) -> Configuration:
     """Compose files and overrides.
 
-    overrides  Hydra overrides, as on the command line
+    overrides  Hydra overrides, as on the command line, also conf=DIR
+    user       directory of files of your own; None: that of conf=, or none
     base       configuration to which the overrides apply; None: the packaged and the user's files
     raises     ConfigError if they cannot be composed
     """
+    overrides, user = _directory(overrides, user)
     composed = recompose(*base, overrides, user) if base else compose(overrides, user)
     return Configuration(composed, user, runnable=runnable, check=check)

@@ -15,6 +15,7 @@ from runner.gst.arriving import CAPTURE_ID
 from runner.gst.knobs import KnobPanel
 from runner.gst.picture_rate import PictureRate
 from runner.gst.probes import BufferProbe, PassingBuffer, TypeProbe
+from runner.gst.pushed import PushedPictures
 from runner.gst.rate_limit import RateLimits
 from runner.gst.repeats import RepeatDetector
 from runner.gst.requests import RequestLimit
@@ -79,6 +80,7 @@ class CameraPipeline:
         self._rate, self._on_report = PictureRate(float(plan.camera.fps)), on_report
         self._restarts_after_gaps = is_restarted_after_gaps(plan.camera.graph)
         self._is_gap = False
+        self._pushed = PushedPictures(plan.camera.source_size, plan.camera.fps)
         self._elements = [pipeline.get_by_name(element.name) for element in plan.vehicle]
         self._encoder = EncoderWatch(self._elements)
         entry = self._elements[0].get_static_pad("sink")
@@ -140,18 +142,17 @@ class CameraPipeline:
         bitrate = self.knobs.applied.get("bitrate", 0)
         return bitrate if isinstance(bitrate, int) else 0
 
-    def push(self, frame: Any) -> bool:
-        """Hand one frame to the source, which must be an appsrc.
+    def push(self, frame: Any, form: str | None = None, captured: float | None = None) -> bool:
+        """Hand one frame to the source, which must be an appsrc; see `runner.gst.pushed`.
 
-        raises  ValueError unless the frame's length is width * height * 3 / 2
+        raises  ValueError
         """
-        width, height = self._plan.camera.source_size
-        data = bytes(memoryview(frame).cast("B"))
-        if len(data) != width * height * 3 // 2:
-            rule = f"must have {width * height * 3 // 2}, I420 of {width}x{height}"
-            raise ValueError(f"camera {self._plan.camera.name}: a frame of {len(data)} bytes {rule}")
+        camera = self._plan.camera
         source = self._pipeline.get_by_name(self._plan.source[0].name)
-        return bool(source.emit("push-buffer", Gst.Buffer.new_wrapped(data)) == Gst.FlowReturn.OK)
+        try:
+            return self._pushed.push(source, frame, form, captured)
+        except ValueError as error:
+            raise ValueError(f"camera {camera.name}: {error}") from None
 
     def push_shared(self, picture: SharedPicture) -> bool:
         """Hand one picture in shared memory to the source, which must be an appsrc."""

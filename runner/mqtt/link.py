@@ -334,12 +334,13 @@ class ControlLink:
     def _on_connect_fail(self, error: BaseException | None) -> None:
         from runner.mqtt import refusal
 
-        why = refusal.of_failure(error, tls=self._login is not None) + self._remedy(error)
-        self._failed_to_connect(why, perhaps_keys=isinstance(error, ssl.SSLError))
+        why = refusal.of_failure(error, tls=self._login is not None)
+        self._failed_to_connect(why, self._remedy(error), perhaps_keys=isinstance(error, ssl.SSLError))
 
-    def _failed_to_connect(self, why: str, perhaps_keys: bool = False) -> None:
+    def _failed_to_connect(self, why: str, remedy: str = "", perhaps_keys: bool = False) -> None:
         """Report once why there is no control link.
 
+        remedy        said once, beside the reason
         perhaps_keys  a certificate of this side that does not count is the cause
         """
         self._is_explained = True
@@ -350,7 +351,7 @@ class ControlLink:
         self.fault = f"no control link: MQTT broker at {self._broker}: {why}"
         if why not in self._reported and len(self._reported) < MOST_REASONS:
             self._reported.add(why)
-            self._on_report(f"{self.fault}; retrying")
+            self._on_report(f"{self.fault}{remedy}; retrying")
 
     def _remedy(self, error: BaseException | None) -> str:
         if not isinstance(error, ConnectionRefusedError):

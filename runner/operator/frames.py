@@ -79,7 +79,7 @@ class Frames:
 @contextmanager
 def live_frames(
     overrides: Sequence[str] = (),
-    conf: Path | None = None,
+    conf: Path | str | None = None,
     *,
     cameras: Sequence[str] | None = None,
     report: Callable[[str, str], None] = lambda camera, what: None,
@@ -88,7 +88,8 @@ def live_frames(
 
     A camera that stays silent may be off; its pipeline is rebuilt less often.
 
-    overrides  Hydra overrides, as on the command line
+    overrides  Hydra overrides, as on the command line, also conf=DIR
+    conf       directory of files of your own, which shadow the packaged ones
     cameras    names; None: all
     report     called with camera and what happened to it
     raises     ConfigError; UserError for an unknown camera or missing keys

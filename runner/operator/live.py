@@ -217,11 +217,12 @@ def _ros_pictures(vehicle: Vehicle, station: Station) -> DecodedPictures | None:
 
 @contextmanager
 def live_operator(
-    overrides: Sequence[str] = (), conf: Path | None = None, *, log: Path | None = None
+    overrides: Sequence[str] = (), conf: Path | str | None = None, *, log: Path | None = None
 ) -> Iterator[LiveOperator]:
     """Run an operator's side; at the end it signs off from the vehicle and stops.
 
-    overrides  Hydra overrides, as on the command line
+    overrides  Hydra overrides, as on the command line, also conf=DIR
+    conf       directory of files of your own, which shadow the packaged ones
     log        directory that the drive is recorded to
     raises     ConfigError, RunError, UserError if the directory already holds a drive
     """

@@ -3,7 +3,7 @@
 with live_vehicle(["source=appsrc"]) as vehicle:
     vehicle.start()                               # the loop runs in its own thread
     while driving:
-        vehicle.push("front_left", frame)         # I420, bytes or a contiguous array
+        vehicle.push("front_left", frame, format="bgr")    # an array of height x width x 3
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from msgspec import UNSET
 
@@ -65,6 +65,7 @@ if TYPE_CHECKING:
     from runner.apply import VehicleSide
     from runner.ros.cameras import RosCameras, SharedPicture
 
+PictureFormat = Literal["i420", "bgr", "rgb", "grey"]
 STUCK_S = 2.0  # a thread that finishes nothing for this long is stuck
 WATCH_S = 0.25  # how often that is checked
 END_S = 5.0  # a loop that does not end within this is abandoned
@@ -121,14 +122,20 @@ class LiveVehicle:
             self.failure = error
             self.loop.on_report(str(error))
 
-    def push(self, camera: str, frame: Any) -> bool:
-        """One frame of a camera whose source is `appsrc`, captured now.
+    def push(
+        self, camera: str, frame: Any, *, format: PictureFormat | None = None, captured: float | None = None
+    ) -> bool:
+        """One frame of a camera whose source is `appsrc`, of the camera's (native) size; in order of capture.
 
-        frame    I420 of the camera's (native) size: width * height * 3 / 2 bytes
-        returns  False if nobody is watching: the frame was discarded
-        raises   ValueError for a frame of the wrong length or an unknown camera
+        frame     bytes, or an array of uint8: height x width is grey, height * 3 / 2 x width, like bytes, I420, and
+                  height x width x 3 needs `format`
+        format    what it is; None: by its shape
+        captured  s since 1970 by this machine's clock; None: now
+        returns   False if the frame was discarded: nobody is watching, or it was captured before the last one
+        raises    ValueError for a frame of another size, a capture time more than a minute from now, or an unknown
+                  camera
         """
-        return self.side.push(camera, frame)
+        return self.side.push(camera, frame, format, captured)
 
     def fail(self, error: RunError) -> None:
         """End with an error, from any thread."""
@@ -338,14 +345,15 @@ def ros_cameras(
 @contextmanager
 def live_vehicle(
     overrides: Sequence[str] = (),
-    conf: Path | None = None,
+    conf: Path | str | None = None,
     *,
-    log: Path | None = None,
+    log: Path | str | None = None,
     say: Callable[[str], None] = print,
     progress: Progress = lambda what, done: None,
 ) -> Iterator[LiveVehicle]:
     """Run the vehicle's side; at the end it is stopped and disconnected.
 
+    overrides, conf  as in `live_operator`
     log       directory that the drive is recorded to
     say       called, from a separate thread, with one line per event
     progress  called with the progress of rendering a synthetic drive
@@ -353,6 +361,7 @@ def live_vehicle(
     """
     from runner import apply
 
+    log = Path(log) if log else None
     config = configuration(overrides, conf, check=apply.check_vehicle)
     (pqos, track), vehicle, document = config.pqos(), config.vehicle(), config.document
     keyring = vehicle_keyring(vehicle)

@@ -30,7 +30,7 @@ NOTES = 4
 MAX_PENDING = 1000
 WHY = "why"
 HEADINGS = ("fps", "kbit/s", "allocated", "demand", "size", "factor", "latency ms", "lost", WHY)
-NARROW = ("fps", "kbit/s", "allocated", "size", "factor", "latency ms", "lost")
+NARROW = ("fps", "kbit/s", "allocated", "size", "latency ms", "lost")
 WHOLE = 110  # columns from which all of these fit
 MOST_NAME = 20  # columns that a camera's name keeps on a narrow terminal
 

@@ -7,7 +7,9 @@ import socket
 import subprocess
 import sys
 import time
+from fractions import Fraction
 
+import numpy as np
 import pytest
 
 from rig import CLIPS, NOISE, Client, streaming, until, watching
@@ -15,6 +17,7 @@ from runner.core.commands import Command
 from runner.core.model import Roi
 from runner.errors import RunError
 from runner.gst.knobs import KnobPanel
+from runner.gst.pushed import PushedPictures
 
 CAMERA = "front_left"
 
@@ -261,6 +264,53 @@ def test_a_native_crop_comes_before_the_roi():
         picture = received(side, plan, "front", frame)
         # Rows 240 to 960 of the native picture: the border between top and bottom at 480 is a third from the top.
         assert [colour(picture[row, 100]) for row in (20, 100, 140, 340)] == [BRIGHT, BRIGHT, BLUE, BLUE]
+
+
+def test_arrays_are_pushed_by_shape_and_format_with_their_capture_times():
+    red = np.zeros((1040, 1920, 3), np.uint8)
+    red[..., 0] = 220
+    with streaming("source=appsrc") as (side, _, (plan,), _reported):
+        turn(side, size=(480, 260), bitrate=2000)
+
+        def shown(frame, **more):
+            while True:
+                until(lambda: time.sleep(0.02) or side.push(CAMERA, frame, captured=time.time() - 0.5, **more))
+                yield colour(client.picture()[130, 240]) if client.frames_with_retry() > 5 else None
+
+        client = Client(plan, pictures=True)
+        try:
+            for frame, more, expected in (
+                (red, {"form": "rgb"}, RED),
+                (red[::-1, ::-1], {"form": "bgr"}, BLUE),
+                (np.full((1040, 1920), 230, np.uint8), {}, BRIGHT),
+                (quadrants(1920, 1040), {}, DARK),
+            ):
+                pictures = shown(frame, **more)
+                until(lambda pictures=pictures, expected=expected: next(pictures) == expected)
+            capture_ms, _ = until(lambda: (next(pictures), side.stages().get(CAMERA))[1])
+            assert 500 <= capture_ms < 1500
+            assert not side.push(CAMERA, red, "rgb", captured=time.time() - 5)  # older than the last one
+        finally:
+            client.close()
+
+
+@pytest.mark.parametrize(
+    ("frame", "more", "rule"),
+    [
+        (np.zeros((2, 3, 3), np.uint8), {}, r"shape \(2, 3, 3\) needs format='bgr' or format='rgb'"),
+        (np.zeros((2, 3, 3), np.uint8), {"form": "bgr"}, r"\(2, 3, 3\) must have \(1040, 1920, 3\), BGR of 1920x1040"),
+        (np.zeros((1040, 1920)), {}, r"numbers of 8 bytes must have numbers of one byte \(uint8\)"),
+        (b"", {"form": "yuv"}, r"format: 'yuv': must be one of i420, bgr, rgb, grey"),
+        (
+            np.zeros((1040, 1920), np.uint8),
+            {"captured": 17.0},
+            r"captured: 17.0: must be s since 1970, within",
+        ),
+    ],
+)
+def test_frames_that_are_refused(frame, more, rule):
+    with pytest.raises(ValueError, match=rule):
+        PushedPictures((1920, 1040), Fraction(40)).push(None, frame, more.get("form"), more.get("captured"))
 
 
 def test_a_frame_of_another_size_is_refused():

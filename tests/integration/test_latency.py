@@ -149,6 +149,17 @@ def test_speed_is_advised_by_latency_and_not_without_it(broker):
         link.close(("tod/test", {}))
 
 
+@pytest.mark.soak
+@pytest.mark.sources
+def test_without_a_vehicle_nothing_is_measured_for_five_minutes(broker):
+    words = ("camera=front", "vehicle=delivery_robot", f"control.port={broker.port}", f"page.port={free_port()}")
+    began = time.monotonic()
+    done = run("latency", *words, f"media.port={free_port()}")
+    assert done.returncode == 1
+    assert f"no vehicle delivery_robot has answered for 20 s over the broker at 127.0.0.1:{broker.port}" in done.stderr
+    assert time.monotonic() - began < 60
+
+
 def test_without_the_fixed_part_no_speed_is_advised(broker):
     with process("vehicle", *ROBOT, f"control.port={broker.port}", f"media.port={free_port()}"):
         operator = Operator(broker)
