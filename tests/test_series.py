@@ -214,6 +214,27 @@ def test_setting_the_operators_clock_makes_no_freeze(tmp_path: Path, set_s: int)
         assert gaps == pytest.approx(same[: len(gaps)], abs=0.01)
 
 
+def test_setting_the_clock_of_both_sides_makes_no_freeze(tmp_path: Path) -> None:
+    """As of a demo on one machine: the difference of the clocks shows nothing, only the lines of both logs."""
+
+    def is_set(side: str, lines: Lines) -> Lines:
+        at = 8.0 if side == "operator" else 8.0 + OPERATOR_LATER_S
+        for entry in (entry for entry in lines if entry.get("log") == "sample"):
+            entry |= {"clock_ahead_ms": 0.0, "clock_bound_ms": 0.4}
+            for camera in entry["cameras"].values():
+                camera["arrivals"] = [[t + 3600 * (t >= at), ms] for t, ms in camera["arrivals"]]
+        return sorted([*lines, {"t": at, "log": "clock_set", "by_s": 3600}], key=lambda entry: entry["t"])
+
+    drive = series(read_drive(write_drive(tmp_path / "drive", seconds=20, change=is_set)))
+    plain = series(read_drive(write_drive(tmp_path / "plain", seconds=20)))
+    assert drive.began == EPOCH + 3600
+    for name, camera in drive.cameras.items():
+        received, expected = camera.received, plain.cameras[name].received
+        assert received is not None
+        assert expected is not None
+        assert received.arrival_t == pytest.approx(expected.arrival_t, abs=1e-3)
+
+
 def test_clocks_that_differ_are_reported(tmp_path: Path) -> None:
     def early(side: str, lines: Lines) -> Lines:
         for entry in lines:
