@@ -361,7 +361,6 @@ class ControlLink:
         return " (does one run there, reachable from other machines? See docs/deployment.md)"
 
 
-
 def _is_one_of(kinds: set[str], topic: str) -> bool:
     return bool(kinds.intersection(topic.split("/")[2:3]))
 
