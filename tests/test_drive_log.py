@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import queue
 import re
 import signal
 import subprocess
@@ -123,7 +124,7 @@ def test_a_full_disk_ends_the_log_and_not_the_drive(tmp_path: Path) -> None:
     with child(tmp_path, "100", limit) as process:
         output, _ = process.communicate(timeout=60)
     assert process.returncode == 0
-    first = "the drive continues without its log: drive.jsonl: file too large"
+    first = f"the drive continues without its log: {tmp_path}/drive.jsonl: file too large; retrying"
     assert re.fullmatch(rf"2 {first} drive.jsonl: \d+ lines were not written\n", output)
     drive = read_drive(tmp_path)
     assert 10 <= len(drive.sides["vehicle"].lines) <= 14
@@ -156,8 +157,8 @@ def test_a_log_continues_when_the_disk_has_room_again(tmp_path: Path) -> None:
     )
     done = run(code, tmp_path)
     assert done.stdout.splitlines() == [
-        "the drive continues without its log: drive.jsonl: file too large",
-        "the log continues: drive.jsonl",
+        f"the drive continues without its log: {tmp_path}/drive.jsonl: file too large; retrying",
+        f"the log continues: {tmp_path}/drive.jsonl",
     ], done.stderr
     drive = read_drive(tmp_path)
     assert drive.warnings == []
@@ -219,7 +220,7 @@ def test_a_hanging_disk_does_not_block_and_dropped_lines_are_counted(
     """The file is a pipe that is not read until all notes are queued."""
     monkeypatch.setattr(f"runner.drive.log.{limit}", most)
     read_end, write_end = os.pipe()
-    monkeypatch.setattr("runner.drive.log._create", lambda directory, side: write_end)
+    monkeypatch.setattr("runner.drive.log._create", lambda path: write_end)
     log = begun(tmp_path)
     for number in range(1000):  # would never end if any of them waited for the disk
         log.note(f"{number} " + "x" * 5000)
@@ -241,7 +242,7 @@ def test_a_disk_that_hangs_forever_does_not_keep_the_process_alive(
 ) -> None:
     monkeypatch.setattr("runner.drive.log.CLOSE_S", 0.1)
     read_end, write_end = os.pipe()
-    monkeypatch.setattr("runner.drive.log._create", lambda directory, side: write_end)
+    monkeypatch.setattr("runner.drive.log._create", lambda path: write_end)
     messages: list[str] = []
     log = Log(tmp_path, "vehicle", {}, {}, messages.append)
     log.begin()
@@ -271,13 +272,48 @@ def test_lines_of_many_threads_are_not_mixed(tmp_path: Path) -> None:
         assert [text.split()[1] for text in texts if text[0] == name] == [str(n) for n in range(200)]
 
 
-def test_an_unwritable_directory_is_reported_before_the_drive(tmp_path: Path) -> None:
+def test_a_misnamed_directory_is_reported_before_the_drive(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match=r"command line: log: '.*/file': cannot be created: .*/file is not a directory"):
+    with pytest.raises(UserError, match=r"command line: log: '.*/file': not a directory"):
         begun(tmp_path / "file")
     begun(tmp_path / "drive").close()
     with pytest.raises(UserError, match=r"already contains a drive \(drive.jsonl\), choose another directory"):
         Log(tmp_path / "drive", "vehicle", {}, {}, print)
+
+
+def test_a_drive_begins_without_a_disk_and_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("runner.drive.log.RETRY_S", 0.01)
+    (tmp_path / "disk").symlink_to("/proc/self/task")  # there nothing can be made, also not by root
+    messages: queue.Queue[str] = queue.Queue()
+    log = Log(tmp_path / "disk" / "drive", "vehicle", {}, {}, messages.put)
+    log.begin()
+    log.note("first")
+    path = tmp_path / "disk" / "drive" / "drive.jsonl"
+    said = messages.get(timeout=5)
+    assert said == f"the drive continues without its log: {path}: no such file or directory; retrying"
+    (tmp_path / "disk").unlink()
+    (tmp_path / "disk").mkdir()
+    assert messages.get(timeout=5) == f"the log continues: {path}"
+    log.close()
+    drive = read_drive(path.parent)
+    assert ([note.text for note in drive.sides["vehicle"].of(Note)], drive.warnings) == (["first"], [])
+
+
+def test_a_service_drives_although_its_directory_holds_a_drive(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its manager would start it again for ever."""
+    begun(tmp_path).close()
+    before = written(tmp_path)
+    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "manager"))
+    messages: queue.Queue[str] = queue.Queue()
+    log = Log(tmp_path, "vehicle", {}, {}, messages.put)
+    log.begin()
+    rule = "already contains a drive (drive.jsonl), choose another directory"
+    said = messages.get(timeout=5)
+    log.close()
+    assert said == f"the drive continues without its log: {tmp_path / 'drive.jsonl'}: {rule}; retrying"
+    assert written(tmp_path) == before
 
 
 def test_a_log_that_never_begins_leaves_no_file(tmp_path: Path) -> None:

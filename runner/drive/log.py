@@ -41,6 +41,7 @@ from runner.records import (
 from runner.redact import redacted
 from runner.system.clocks import STEP_S
 from runner.system.kernel_clock import NANO, ahead_of
+from runner.system.service import is_managed
 
 FORMAT = 1
 WITHOUT_LOG = "the drive continues without its log"
@@ -49,6 +50,7 @@ QUEUED_LINES = 10_000  # more than two minutes of a vehicle with eight cameras
 QUEUED_BYTES = 64_000_000  # reports of others are logged, too, each up to 64 kB long
 # Records of numbers and the rules' own texts; redacting a decision takes twenty times as long as making it.
 WITHOUT_ADDRESSES = (DecisionMade, LinkSample, ReceptionReported, Telemetry)
+_MISNAMED = (FileExistsError, NotADirectoryError, BlockingIOError)  # faults of the argument, not of the disk
 SYNC_S = 1.0  # a power failure loses about as much, and the queued lines
 RETRY_S = 1.0  # time between attempts to write to a full disk
 CLOSE_S = 5.0  # a disk that is stuck for longer does not keep the process from ending
@@ -61,11 +63,13 @@ class Log:
     config     the composed configuration; passwords in addresses are removed
     versions   of the software used, by name
     on_report  called, from the log's thread, when the file cannot be written, and when it can again
-    raises     UserError if the directory already contains a drive, or cannot be written
+    raises     UserError if the directory already contains a drive, is none, or is in use; under a service manager,
+               which would start it again for ever, this is only reported
 
-    Lines wait in a bounded queue for a thread that writes each, normally with one system call, so that a killed process
-    loses at most the queued lines. Lines are dropped while the queue is full, and a line of kind "dropped" counts them.
-    Lines written before `begin` are kept until then.
+    A file that cannot be made, for example on a full or read-only disk, is tried again: no drive needs its log. Lines
+    wait in a bounded queue for a thread that writes each, normally with one system call, so that a killed process loses
+    at most the queued lines. Lines are dropped while the queue is full, and a line of kind "dropped" counts them. Lines
+    written before `begin` are kept until then.
     """
 
     def __init__(
@@ -76,7 +80,9 @@ class Log:
         versions: Mapping[str, str],
         on_report: Callable[[str], None],
     ) -> None:
-        self._file = None if directory is None else _new_file(directory, side)
+        self._file = None if directory is None else _File(directory / FILES[side])
+        if self._file:
+            self._file.open_first()
         self._side, self._config, self._versions, self._on_report = side, config, versions, on_report
         self._lock = threading.Lock()
         self._began: float | None = None
@@ -192,30 +198,55 @@ def _encoded(line: Mapping[str, Any]) -> bytes:
 
 
 class _File:
-    """A file of complete lines only: a partly written line is removed.
+    """A new file of complete lines only: a partly written line is removed."""
 
-    new  whether its directory was made for it
-    """
-
-    def __init__(self, path: Path, fd: int, new: bool) -> None:
-        self.path, self._fd, self._new = path, fd, new
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._fd: int | None = None  # None: not made yet
         self._size = 0
+        self._new = False  # whether its directory was made for it
+
+    def open_first(self) -> None:
+        """Make the file if possible; otherwise `append` tries it again.
+
+        raises  UserError if a user has to name another directory
+        """
+        try:
+            self._open()
+        except _MISNAMED as error:
+            if not is_managed():
+                raise _refused(self.path.parent, reason(error)) from None
+        except OSError:
+            pass
+
+    def _open(self) -> int:
+        if self._fd is None:
+            new = not self.path.parent.exists()
+            self._fd = _create(self.path)
+            self._new = new
+        return self._fd
 
     def append(self, data: bytes) -> str | None:
         """Write a line; returns why it was not written, None if it was."""
         rest = data
         try:
+            file = self._open()
+        except OSError as error:
+            return reason(error)
+        try:
             while rest:  # a signal may interrupt a write, and a disk may have space for a part
-                rest = rest[os.write(self._fd, rest) :]
+                rest = rest[os.write(file, rest) :]
         except OSError as error:
             with suppress(OSError):
-                os.ftruncate(self._fd, self._size)
+                os.ftruncate(file, self._size)
             return reason(error)
         self._size += len(data)
         return None
 
     def sync(self) -> str | None:
         """Flush it to the disk; returns why lines may be missing, None if none are."""
+        if self._fd is None:
+            return None
         try:
             os.fdatasync(self._fd)
         except OSError as error:
@@ -224,6 +255,8 @@ class _File:
 
     def close(self, keep: bool) -> str | None:
         """Close or remove it; returns as `sync`."""
+        if self._fd is None:
+            return None
         why = self.sync() if keep else None
         try:
             os.close(self._fd)
@@ -303,25 +336,29 @@ class _Writer:
         why = self._file.append(data)
         if why is None:
             return True
-        self._on_report(f"{WITHOUT_LOG}: {self._file.path.name}: {why}")
+        self._on_report(f"{WITHOUT_LOG}: {self._file.path}: {why}; retrying")
         while self._file.append(data):
             if self._closing.wait(RETRY_S):
                 return False
-        self._on_report(f"the log continues: {self._file.path.name}")
+        self._on_report(f"the log continues: {self._file.path}")
         return True
 
 
 def check_free(directory: Path, side: str) -> None:
     """raises UserError if this side of a drive already exists, empty files not counting, or cannot be created"""
-    path = directory / FILES[side]
     above = next((each for each in (directory, *directory.absolute().parents) if os.path.lexists(each)), directory)
     if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
         raise _refused(directory, f"cannot be created: {above} is not a directory that you may write to")
     try:
-        if os.path.lexists(path) and not (path.is_file() and path.stat().st_size == 0):
-            raise _refused(directory, f"already contains a drive ({FILES[side]}), choose another directory")
+        _check_untaken(directory / FILES[side])
     except OSError as error:
         raise _refused(directory, reason(error)) from None
+
+
+def _check_untaken(path: Path) -> None:
+    """raises OSError if a file exists; an empty one is of a process that ended before its drive began"""
+    if os.path.lexists(path) and not (path.is_file() and path.stat().st_size == 0):
+        raise FileExistsError(errno.EEXIST, f"already contains a drive ({path.name}), choose another directory")
 
 
 def new_drive(parent: Path) -> Path:
@@ -331,27 +368,32 @@ def new_drive(parent: Path) -> Path:
     return next(parent / each for each in names if not os.path.lexists(parent / each))
 
 
-def _new_file(directory: Path, side: str) -> _File:
-    new = not directory.exists()
-    return _File(directory / FILES[side], _create(directory, side), new)
+def _create(path: Path) -> int:
+    """A new file of a drive, open for appending.
 
-
-def _create(directory: Path, side: str) -> int:
-    """A new file of a drive, open for appending."""
-    check_free(directory, side)
+    raises  OSError
+    """
+    if path.parent.exists() and not path.parent.is_dir():
+        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR))
+    _check_untaken(path)
     try:
-        _remove_abandoned(directory / FILES[side])
-        directory.mkdir(parents=True, exist_ok=True)
-        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC
-        file = os.open(directory / FILES[side], flags, 0o666)
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # until it is closed, also by the end of this process
-        return file
-    except BlockingIOError:
-        raise _refused(
-            directory, f"another process is about to write {FILES[side]}, choose another directory"
-        ) from None
-    except OSError as error:
-        raise _refused(directory, reason(error)) from None
+        _remove_abandoned(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC, 0o666)
+        return _locked(file)
+    except BlockingIOError as error:
+        rule = f"another process is about to write {path.name}, choose another directory"
+        raise BlockingIOError(error.errno, rule) from None
+
+
+def _locked(file: int) -> int:
+    """The file, locked until it is closed, also by the end of this process; closed if that fails."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(file)
+        raise
+    return file
 
 
 def _remove_abandoned(path: Path) -> None:

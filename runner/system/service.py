@@ -7,6 +7,11 @@ import socket
 from contextlib import suppress
 
 
+def is_managed() -> bool:
+    """Whether a service manager runs this process, and will start it again whenever it ends."""
+    return bool(os.environ.get("NOTIFY_SOCKET"))
+
+
 def notify(state: str) -> None:
     """Send a state to the service manager; without one nothing happens.
 

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import signal
 import socket
 import subprocess
 import time
+from pathlib import Path
 
 import pytest
 from recipes import TWO_MACHINES, lines
 
-from rig import CHECKOUT, ROBOT, free_port, process, until
+from rig import CHECKOUT, ROBOT, free_port, needs_root, process, until
 from runner.drive.read import read_drive
 
 SYSTEMD = CHECKOUT / "deploy" / "systemd"
@@ -42,6 +44,28 @@ def test_a_side_reports_to_its_service_manager(verb, tmp_path, broker):
             assert b"STOPPING=1" in _drain(manager)
     (drive,) = (tmp_path / "drives").iterdir()
     assert list(read_drive(drive).sides) == [verb]
+
+
+@needs_root
+@pytest.mark.soak
+@pytest.mark.sources
+@pytest.mark.parametrize("disk", ["ro", "nr_inodes=1"])
+@pytest.mark.parametrize("verb", ["vehicle", "operator"])
+def test_a_side_drives_while_its_disk_cannot_be_written(verb, disk, tmp_path, broker):
+    """The disk is mounted for this side only, and can be written once it is mounted again."""
+    (tmp_path / "disk").mkdir()
+    mounted = f'mount -t tmpfs -o {disk} tmpfs {tmp_path}/disk && exec "$@"'
+    before = ("unshare", "--mount", "sh", "-c", mounted, "sh")
+    words = (*ROBOT, f"media.port={free_port()}", f"control.port={broker.port}", f"drives={tmp_path}/disk")
+    with process(verb, *words, before=before) as side:
+        until(lambda: "continues without its log" in side.stdout.readline())
+        again = ("mount", "-o", "remount,rw,nr_inodes=100", f"{tmp_path}/disk")
+        subprocess.run(["nsenter", f"--mount=/proc/{side.pid}/ns/mnt", *again], check=True)
+        until(lambda: "the log continues" in side.stdout.readline())
+        (file,) = Path(f"/proc/{side.pid}/root{tmp_path}/disk").glob("*/*.jsonl")
+        assert json.loads(file.open().readline())["log"] == "began"
+        side.send_signal(signal.SIGTERM)
+        side.wait(20)
 
 
 def _drain(manager):
