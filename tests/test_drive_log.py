@@ -299,9 +299,7 @@ def test_a_drive_begins_without_a_disk_and_loses_nothing(tmp_path: Path, monkeyp
     assert ([note.text for note in drive.sides["vehicle"].of(Note)], drive.warnings) == (["first"], [])
 
 
-def test_a_service_drives_although_its_directory_holds_a_drive(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_service_drives_although_its_directory_holds_a_drive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its manager would start it again for ever."""
     begun(tmp_path).close()
     before = written(tmp_path)
