@@ -37,10 +37,11 @@ class Login:
         self._refused = 0  # logins in a row
         self._until = 0.0  # s by the monotonic clock
         self._reason: str | None = None
+        self._unknown_login: str | None = None  # why GStreamer cannot log in
 
     def log_in(self, pipeline: Gst.Bin) -> str | None:
-        """Likewise as the function `log_in`."""
-        self._stamp = self._current_stamp()
+        """As the function `log_in`, for the next attempt."""
+        self._stamp, self._until = self._current_stamp(), 0.0
         return log_in(pipeline, self._plan)
 
     @property
@@ -58,7 +59,7 @@ class Login:
         changes = ""
         if self._file is not None:
             what, changes = f"refuses the user or the password of {self._file}", ", or once this file has changed"
-        self._reason = f"the camera {what}"
+        self._reason = self._unknown_login or f"the camera {what}"
         self._on_report(f"{self._reason}; next attempt after {pause:g} s{changes}")
         if self._refused == 1:
             address = client.get_property("location")
@@ -71,9 +72,10 @@ class Login:
     def _ask(self, address: str) -> None:
         """Ask the camera which logins it accepts: only after a refusal, and without trying one."""
         with suppress(OSError, ValueError):  # what it said before has been reported
-            if why := describe(address, ASKED_S).unknown_login:
-                self._reason = why
-                self._on_report(why)
+            self._unknown_login = describe(address, ASKED_S).unknown_login
+            if self._unknown_login:
+                self._reason = self._unknown_login
+                self._on_report(self._unknown_login)
 
     def _current_stamp(self) -> tuple[int, ...] | None:
         if self._file is None:

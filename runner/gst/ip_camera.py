@@ -65,7 +65,7 @@ class CameraClient:
         kind, code, _text = message.parse_progress()
         self._heard = time.monotonic()
         if kind == Gst.ProgressType.START:
-            self._is_opening = True  # also once it has failed over UDP, and tries TCP
+            self._is_opening, self._last = True, ()  # also once it has failed over UDP, and tries TCP
         elif kind != Gst.ProgressType.CONTINUE:
             self._asked = None
             self.has_failed = kind == Gst.ProgressType.ERROR
@@ -82,10 +82,9 @@ class CameraClient:
         kinds = [sdp.get_media(number).get_media() for number in range(sdp.medias_len())]
         video = [number for number, kind in enumerate(kinds) if kind == "video"]
         self._chosen = video[self._medium] if self._medium < len(video) else None
-        if self._chosen is not None:
-            _accept_sent(sdp.get_media(self._chosen))
-            return
-        client.post_message(Gst.Message.new_error(client, GLib.Error(_why_none(kinds, len(video), self._medium)), ""))
+        if self._chosen is None:
+            why = _why_none(kinds, len(video), self._medium)
+            client.post_message(Gst.Message.new_error(client, GLib.Error(why), ""))
 
     def _on_select(self, _client: Gst.Element, number: int, _caps: Gst.Caps) -> bool:
         return number == self._chosen
@@ -97,22 +96,15 @@ class CameraClient:
         this = (name, uri, request.get_header(GstRtsp.RTSPHeaderField.TRANSPORT, 0)[1] or "")
         self._sends = self._sends + 1 if this == self._last else 1
         self._last = this
-        if name not in OPENING or self._has_streamed:
+        if name not in OPENING or (self._has_streamed and name == "OPTIONS"):  # to keep the session alive
             return True
         if self._sends > SENDS:
             return False  # the client then reports the last answer
-        client.set_property("tcp-timeout", round(self._reply_s * 1e6))  # not before: connecting has the usual limit
         self._heard = time.monotonic()
-        if self._is_opening:
+        if not self._has_streamed:
+            client.set_property("tcp-timeout", round(self._reply_s * 1e6))  # not before: connecting has the usual limit
             self._asked = (name, self._heard)
         return True
-
-
-def _accept_sent(medium: GstSdp.SDPMedia) -> None:
-    """Drop `sendonly` of a video medium: some cameras state their own point of view, and the client ignores it then."""
-    for index in reversed(range(medium.attributes_len())):
-        if medium.get_attribute(index).key == "sendonly":
-            medium.remove_attribute(index)
 
 
 def _why_none(kinds: Sequence[str], video: int, medium: int) -> str:

@@ -164,7 +164,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
 
     def _on_error(self, message: Gst.Message) -> None:
         error = message.parse_error()[0]
-        if was_refused(error):
+        if self._client and was_refused(error):
             self._login.refuse(message.src)
         if self._decoders:
             self._decoders.handle(error)
