@@ -10,11 +10,13 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from runner.core.commands import Command, KnobValue
+from runner.core.decision import NOTHING
 from runner.core.model import Media, suggest
 from runner.errors import RunError
 from runner.graph import Plan, launch, may_lack_parameter_sets
@@ -24,6 +26,7 @@ from runner.gst.clocks import captured_at
 from runner.gst.credentials import Login, log_in
 from runner.gst.decoders import DecoderWatch
 from runner.gst.ip_camera import follow_cameras
+from runner.gst.lost import LostCameras
 from runner.gst.outage import ReportMerger
 from runner.gst.pipeline import CameraPipeline
 from runner.gst.probes import PassingBuffer
@@ -43,6 +46,7 @@ from runner.gst.supervised import CameraCaller
 from runner.gst.timers import every
 from runner.gst.video_files import VideoFile, VideoFiles
 from runner.gst.watched import WatchedSource
+from runner.inputs import input_problem
 from runner.records import Arrivals, SentFrame
 
 if TYPE_CHECKING:
@@ -93,17 +97,20 @@ TAILS_MS = 10  # how often receivers check for frames whose end is missing
 STOP_S = 2.0  # how long teardown waits for pipelines to stop
 
 
-def check_machine(plans: Sequence[Plan]) -> None:
+def check_machine(plans: Sequence[Plan], *, strict: bool = True) -> dict[str, str]:
     """Check that every plugin of the vehicle's side is installed and every source (file, device) opens.
 
-    raises  RunError with the remedy, for all cameras at once
+    strict   a source that does not open is an error
+    returns  by camera whose source does not open, why
+    raises   RunError with the remedy, for all cameras at once
     """
     missing = dict.fromkeys(sentence for plan in plans for sentence in missing_plugins(plan, ("vehicle",)))
     if missing:
         raise RunError("\n".join(missing))
-    refused = [f"camera {plan.camera.name}: {why}" for plan in plans if (why := _source_problem(plan))]
-    if refused:
-        raise RunError("\n".join(refused))
+    refused = {plan.camera.name: why for plan in plans if (why := _source_problem(plan))}
+    if refused and strict:
+        raise RunError("\n".join(f"camera {name}: {why}" for name, why in refused.items()))
+    return refused
 
 
 def check_recorders(plans: Sequence[Plan]) -> None:
@@ -117,7 +124,9 @@ def check_recorders(plans: Sequence[Plan]) -> None:
 
 
 def _source_problem(plan: Plan) -> str | None:
-    """GStreamer's error when the source is opened; None if it opens. Devices are opened on the way to READY."""
+    """Why a source does not open; None if it opens. GStreamer opens devices on the way to READY, and clips later."""
+    if absent := input_problem(plan.camera):
+        return str(absent)
     pipeline = Gst.parse_launch(f"{launch(plan.source)} ! fakesink")
     try:
         if problem := log_in(pipeline, plan):
@@ -234,6 +243,7 @@ class VehicleSide:
     on_report  called, from another thread, when a camera's pipeline starts, stops or fails
     video      where to store the sent streams; None: nowhere
     keyring    of this vehicle: viewers authenticate, and everything is encrypted; None: neither
+    lost       by camera whose source does not open, why: it is tried again, and started once it does
     raises     RunError if the port is in use, or a plugin that `video` needs is not installed
 
     `on_turned` is called, from any thread, after knobs were set and read back: `applied` may have changed.
@@ -246,6 +256,7 @@ class VehicleSide:
         on_report: OnReport,
         video: VideoFiles | None = None,
         keyring: Keyring | None = None,
+        lost: Mapping[str, str] = NOTHING,
     ) -> None:
         self._on_report, self._video = on_report, video
         passphrase = keyring.watched_passphrase(lambda what: on_report("keys", what)).get if keyring else None
@@ -263,12 +274,14 @@ class VehicleSide:
             if not p.serves
         }
         served = [plan for plan in plans if plan.serves]
+        self._lost = LostCameras(plans, lost, _source_problem, self._on_found)
 
         def start() -> None:
             if served:
-                self._server = CameraServer(served, media, self._build, on_report, keyring, self._refusal)
-            for caller in self._callers.values():
-                caller.start()
+                self._server = CameraServer(served, media, self._build, self._lost, on_report, keyring, self._refusal)
+            for name, caller in self._callers.items():
+                if name not in lost:
+                    caller.start()
             self._looking = every(LOOK_MS, self._look, lambda what: on_report("senders", what))
 
         self._glib.call("starting the cameras", start)
@@ -359,6 +372,10 @@ class VehicleSide:
         faults = {name: (p.source_fault if p else None) or self._refusal(name) for name, p in pipelines.items()}
         return {name: fault for name, fault in faults.items() if fault}
 
+    def lost(self) -> dict[str, str]:
+        """By camera whose source cannot be opened, why."""
+        return self._lost.reasons()
+
     def untimed(self) -> frozenset[str]:
         """Cameras whose source does not know the capture time of its last picture."""
         pipelines = ((name, self._pipeline(name)) for name in self._wanted)
@@ -370,6 +387,8 @@ class VehicleSide:
         return {name: slow for name, pipeline in pipelines.items() if (slow := pipeline.slow_fps)}
 
     def stop(self) -> None:
+        self._lost.stop()
+
         def stop() -> None:
             GLib.source_remove(self._looking)
             for caller in self._callers.values():
@@ -378,6 +397,12 @@ class VehicleSide:
                 self._server.stop()
 
         self._glib.end(stop)
+
+    def _on_found(self, name: str) -> None:
+        """From the thread that tries again. A viewer makes the server open its camera."""
+        if name in self._callers:
+            with suppress(RunError):  # GStreamer hangs, or ends
+                self._glib.call(f"starting {name}", self._callers[name].start)
 
     def _build(self, pipeline: Gst.Bin, plan: Plan) -> CameraPipeline:
         """Set up a newly built pipeline, with every knob at its wanted value."""

@@ -30,6 +30,7 @@ EXAMPLES: list[dict[str, Any]] = [
     {"t": 0.8, "event": "link_measured", "kbps": 780, "queue_ms": 12.5, "loss": 0.01, "state": "filling", "rtt_ms": 48},
     {"t": 0.8, "event": "link_measured", "queue_ms": 0, "state": "stalled"},
     {"t": 0.8, "event": "copies_counted", "copies": {"front_left": 2}},
+    {"t": 0.8, "event": "source_reported", "camera": "front_left", "works": False, "reason": "no such device"},
     {"t": 0.8, "event": "control_passed", "operator": "me"},
     {"t": 0.8, "event": "attention_changed", "attention": "hidden"},
     {"t": 0.8, "event": "attention_changed"},

@@ -452,7 +452,7 @@ def test_a_name_has_one_role(tmp_path, capsys):
 
 # --- roles x events ---------------------------------------------------------------------------------------------------
 
-OWN = ("link_measured", "copies_counted", "control_passed", "attention_changed", "clock_advanced")
+OWN = ("link_measured", "copies_counted", "source_reported", "control_passed", "attention_changed", "clock_advanced")
 PRESENCE = ("operator_connected", "operator_disconnected")
 ALLOWED = {
     Role.CONTROLLER: {*EVENTS} - {*OWN, "bitrate_predicted", "position_reported", "steering_reported"},

@@ -110,6 +110,29 @@ def test_a_step_that_fails_does_not_stop_the_others(monkeypatch: pytest.MonkeyPa
     assert watched.loop.errors > 2
 
 
+def test_cameras_that_are_lost_are_logged_and_stated_and_found_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    watched = Watched("modes=paper", "pqos.kbps=3000")
+    lost = {"mast": "no such device"}
+    monkeypatch.setattr(watched.side, "lost", lambda: dict(lost))
+
+    def camera(name: str) -> Any:
+        return watched.of(VehicleState)[-1].cameras[name]
+
+    with watched.running():
+        until(lambda: watched.of(VehicleState))
+        first = watched.of(VehicleState)[0].cameras
+        assert (first["mast"].on, first["mast"].sending, first["mast"].fault) == (True, False, "no such device")
+        assert sum(each.kbps for each in first.values()) == pytest.approx(3000, abs=2)
+        lost["mast"] = "permission denied"
+        until(lambda: camera("mast").fault == "permission denied")
+        lost.clear()
+        until(lambda: camera("mast").sending)
+        assert camera("mast").fault is None
+    said = ["mast: lost: no such device; trying again", "mast: lost: permission denied; trying again"]
+    assert [line for line in watched.reports if line.startswith("mast: ")] == [*said, "mast: found again"]
+    assert watched.loop.errors == 0
+
+
 def test_an_operator_returns_though_control_cannot_be_given(monkeypatch: pytest.MonkeyPatch) -> None:
     watched = Watched("modes=safe")
 
@@ -217,6 +240,7 @@ EXAMPLES: tuple[dict[str, Any], ...] = (
     {"event": "weights_set", "weights": {"front": 2.5}},
     {"event": "link_measured", "kbps": 780},
     {"event": "copies_counted", "copies": {"front": 2}},
+    {"event": "source_reported", "camera": "front", "works": False, "reason": "no such device"},
     {"event": "control_passed", "operator": "a-watcher"},
     {"event": "attention_changed", "attention": "hidden"},
     {"event": "operator_connected"},

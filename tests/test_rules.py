@@ -377,6 +377,7 @@ EVENTS: dict[str, dict[str, st.SearchStrategy[Any]]] = {
         "state": st.sampled_from(["clear", "filling", "draining", "stalled"]),
     },
     "copies_counted": {"copies": st.dictionaries(st.sampled_from(list(TUM.cameras)), st.sampled_from([1, 2, 3]))},
+    "source_reported": {**FRONT_LEFT, "works": st.booleans(), "reason": st.just("no such device")},
     "control_passed": {"operator": st.sampled_from(["a", "b", ""])},
     "attention_changed": {"attention": st.sampled_from(list(map(str, Attention)))},
     "operator_connected": {},

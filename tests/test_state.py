@@ -35,6 +35,39 @@ def test_cameras_may_be_switched_in_every_mode(mode: Mode) -> None:
     assert drive.sent("front_left") == (545, 0.25)
 
 
+@pytest.mark.parametrize("modes", ["paper", "safe"])
+@pytest.mark.parametrize("mode", list(Mode))
+def test_a_camera_that_is_lost_is_off_to_the_rules_until_it_is_found(mode: Mode, modes: str) -> None:
+    drive = Drive(f"modes={modes}", f"mode={mode}")
+    before = drive.sent("front_left")
+    drive.accept("source_reported", **LEFT, works=False, reason="no such device")
+    lost = drive["front_left"]
+    assert (lost.on, lost.sending, lost.demand, lost.kbps, lost.scaling) == (True, False, 0, 0, None)
+    assert lost.reason == "lost: no such device"
+    drive.accept("mode_selected", mode="single")  # which keeps the settings of all cameras, also of this one
+    drive.accept("mode_selected", mode=str(mode))
+    drive.accept("camera_switched", **LEFT, on=False)
+    assert drive["front_left"].reason == "switched off"
+    drive.accept("camera_switched", **LEFT, on=True)
+    assert drive["front_left"].reason == "lost: no such device"
+    drive.accept("source_reported", **LEFT, works=True)
+    kbps, factor = drive.sent("front_left")
+    assert (kbps, factor) == (pytest.approx(before[0], abs=1), before[1])  # S keeps whole kbit/s
+
+
+def test_the_others_get_the_share_of_a_camera_that_is_lost() -> None:
+    drive = Drive("modes=paper")
+    drive.accept("bitrate_predicted", kbps=3000)
+    everyone = {name: drive[name] for name in drive.vehicle.cameras}
+    drive.accept("source_reported", **LEFT, works=False, reason="no such device")
+    demand = sum(setting.demand for setting in everyone.values())
+    left = demand - everyone["front_left"].demand
+    for name, setting in everyone.items():
+        share = 0 if name == "front_left" else int(setting.demand * 3000 / left)
+        assert drive[name].kbps == share
+    assert drive.total == 3000
+
+
 REFUSED: list[tuple[str, str, dict[str, Any], str]] = [
     ("automatic", "roi_set", LEFT | ROI, "roi_set is accepted in mode single only, the mode is automatic"),
     ("collective", "roi_set", LEFT | ROI, "roi_set is accepted in mode single only, the mode is collective"),

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
 from ipaddress import IPv4Network, IPv6Network, ip_network
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from runner import schema
@@ -51,15 +50,14 @@ from runner.core.model import (
 from runner.core.rules import RuleCall
 from runner.errors import ConfigError, Problem
 from runner.graph import Plan, assignments, check_video, compile_graph
+from runner.inputs import bag_problem, clip_problem
 from runner.redact import has_password, redacted
-from runner.system.files import file_problem
 
 if TYPE_CHECKING:
     from runner.configuration.experiment import LinkSettings, TimedRequest
 
 SAMPLE_KNOBS: Mapping[str, KnobValue] = {"sending": True, "roi": Roi(0, 0, 16, 16), "size": (16, 16), "bitrate": 1}
 MOUNT_KEYS = ("device", "address", "clip", "bag", "topic")
-BAG_KEYS = ("bag", "topic")
 TOPIC = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")  # design.ros2.org, topic and service names
 TOPIC_RULE = "must be the name of a topic: letters, digits and _ between slashes, no part beginning with a digit"
 CAMERA_NEEDS = ("width_px", "height_px", "fps", "rate_quality")  # keys that the schema requires, set by the kind
@@ -83,6 +81,7 @@ class Builder:
 
     composed: Composed
     runnable: bool
+    files: bool
     bags: bool
     check: PlanCheck | None
     fits: Collection[str] = ()  # sections already known to satisfy the schemas
@@ -95,10 +94,16 @@ class Builder:
 
     @classmethod
     def of(
-        cls, composed: Composed, runnable: bool, bags: bool, check: PlanCheck | None, fits: Collection[str]
+        cls,
+        composed: Composed,
+        runnable: bool,
+        files: bool,
+        bags: bool,
+        check: PlanCheck | None,
+        fits: Collection[str],
     ) -> Builder:
         """The builder of a configuration, with its vehicle built."""
-        builder = cls(composed, runnable, bags, check, fits)
+        builder = cls(composed, runnable, files, bags, check, fits)
         builder.vehicle = builder._vehicle()
         builder._attribute_problems()
         return builder
@@ -113,7 +118,7 @@ class Builder:
         modes = {mode: self._rule_list(mode) for mode in Mode if self.is_valid("modes", mode)}
         mounted = document.get("cameras")
         cameras = {name: self._camera(name) for name in mounted} if isinstance(mounted, dict) else {}
-        sections = ("media", "control", "page", "log", "latency", "keys", "insecure", "metrics", "ros")
+        sections = ("media", "control", "page", "log", "latency", "keys", "insecure", "metrics", "ros", "strict")
         if not all(map(self.is_valid, sections)):
             return None
         media = self.part(("media",), _media)
@@ -144,8 +149,10 @@ class Builder:
                 self.attempt(("cameras", camera.name), lambda c=camera: view(c))  # type: ignore[misc]
             if self.runnable:
                 self._check_inputs(camera)
+            if self.files:
+                self._check_file(camera, clip_problem(camera))
             if self.bags:
-                self._check_bag(camera)
+                self._check_file(camera, bag_problem(camera))
         if self.problems or recording is None:
             return None
         return Vehicle(
@@ -163,6 +170,7 @@ class Builder:
             expires_s=float(document["control"]["expires_s"]),
             keys=keys,
             insecure=insecure is True,
+            strict=document.get("strict", False),  # older drives lack it
             private=private,
             metrics=MetricsPorts(**document.get("metrics", {})),
             ros=ros,
@@ -231,7 +239,7 @@ class Builder:
         """The builder of the configuration without a part."""
         if id(part) not in self.others:
             composed = without(self.composed, part) if self._is_determined else None
-            other = Builder(composed, self.runnable, self.bags, self.check) if composed else None
+            other = Builder(composed, self.runnable, self.files, self.bags, self.check) if composed else None
             if other:
                 other._vehicle()
             self.others[id(part)] = other
@@ -321,7 +329,7 @@ class Builder:
                     self.problems.append(self.composed.problem(path, name, f"unknown camera{suggest(name, known)}"))
 
     def _check_inputs(self, camera: Camera) -> None:
-        """Check that the clip, device or address that a camera's source needs is configured, and that a clip exists."""
+        """Check that the clip, device or address that a camera's source needs is configured."""
         source = camera.source
         needs = {"bag"} if source.plays_bags else source.needs.intersection(MOUNT_KEYS)
         needs |= {"topic"} if source.subscribes else set()
@@ -335,19 +343,10 @@ class Builder:
                 self._report(where, ModelError(key, repr(redacted(given)), rule))
             elif key == "topic" and not TOPIC.fullmatch(str(given)):
                 self._report(where, ModelError(key, repr(given), TOPIC_RULE))
-            elif key == "clip" and not Path(str(given)).is_file():
-                self._report(where, ModelError(key, repr(given), file_problem(Path(str(given)))))
 
-    def _check_bag(self, camera: Camera) -> None:
-        """Check that the bag that a camera's source plays has its topic, with pictures of a supported kind."""
-        given = {key: camera.mount.get(key, camera.source.settings.get(key)) for key in BAG_KEYS}
-        if not camera.source.plays_bags or given["bag"] is None:
-            return
-        from runner.bag import check_topic
-
-        try:
-            check_topic(Path(str(given["bag"])), None if given["topic"] is None else str(given["topic"]))
-        except ModelError as error:
+    def _check_file(self, camera: Camera, error: ModelError | None) -> None:
+        """Report a clip or bag that cannot be read."""
+        if error:
             where = ("cameras", camera.name) if error.key in camera.mount else self._of(camera.name, "source")
             self._report(where, error)
 

@@ -29,8 +29,9 @@ class Configuration:
 
     composed  with the origin of each value
     user      directory whose files shadow the packaged ones and may add others
-    runnable  also check what only a run needs: clips, devices and addresses are configured, and files exist
-    bags      also check that configured bags have pictures of each camera; None: if runnable
+    runnable  also check what only a run needs: clips, devices and addresses are configured
+    files     with that, also check that clips exist; None: if runnable
+    bags      also check that configured bags have pictures of each camera; None: as files
     check     further check of a compiled plan, against the GStreamer registry
     fits      sections already known to satisfy the schemas
 
@@ -44,12 +45,14 @@ class Configuration:
         user: Path | None = None,
         *,
         runnable: bool = True,
+        files: bool | None = None,
         bags: bool | None = None,
         check: PlanCheck | None = None,
         fits: Collection[str] = (),
     ) -> None:
         self._composed, self._user, self._runnable, self._check, self._fits = composed, user, runnable, check, fits
-        self._bags = runnable if bags is None else bags
+        self._files = runnable if files is None else files
+        self._bags = self._files if bags is None else bags
         self._bases = [*conf_directories(user), Path.cwd()]  # directories of relative paths
 
     def drivable(self, check: PlanCheck) -> Configuration:
@@ -112,7 +115,7 @@ class Configuration:
 
     @cached_property
     def _builder(self) -> Builder:
-        return Builder.of(self._composed, self._runnable, self._bags, self._check, self._fits)
+        return Builder.of(self._composed, self._runnable, self._files, self._bags, self._check, self._fits)
 
 
 def _directory(overrides: Sequence[str], user: Path | str | None) -> tuple[Sequence[str], Path | None]:
@@ -132,6 +135,7 @@ def configuration(
     *,
     base: Base | None = None,
     runnable: bool = True,
+    files: bool | None = None,
     check: PlanCheck | None = None,
 ) -> Configuration:
     """Compose files and overrides.
@@ -143,4 +147,4 @@ def configuration(
     """
     overrides, user = _directory(overrides, user)
     composed = recompose(*base, overrides, user) if base else compose(overrides, user)
-    return Configuration(composed, user, runnable=runnable, check=check)
+    return Configuration(composed, user, runnable=runnable, files=files, check=check)

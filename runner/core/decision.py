@@ -22,7 +22,7 @@ class Setting:
     demand         kbit/s, Eq. (1), 0 when off
     kbps           whole kbit/s, rounded down; 0 while nothing is sent
     given          the same, but kept while a rule stops all sending: the value with which the camera resumes
-    scaling        selected factor; None when off
+    scaling        selected factor; None when off, or when its source cannot be opened
     width, height  px of the encoded picture, 0 when off
     reason         for the operator; ignored in comparisons
     """

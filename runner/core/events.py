@@ -119,6 +119,18 @@ class CopiesCounted(_Event):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class SourceReported(_Event):
+    """Whether a camera's source can be opened; until it is reported, it can.
+
+    reason  why it cannot, for the operator; None: it can
+    """
+
+    camera: str
+    works: bool
+    reason: str | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ControlPassed(_Event):
     """Another operator is in control, "" for none; measurements of the previous one are no longer valid."""
 
@@ -172,6 +184,7 @@ Event = (
     | WeightsSet
     | LinkMeasured
     | CopiesCounted
+    | SourceReported
     | ControlPassed
     | AttentionChanged
     | OperatorConnected
@@ -190,6 +203,7 @@ EVENTS: dict[str, type[Event]] = {
     "weights_set": WeightsSet,
     "link_measured": LinkMeasured,
     "copies_counted": CopiesCounted,
+    "source_reported": SourceReported,
     "control_passed": ControlPassed,
     "attention_changed": AttentionChanged,
     "operator_connected": OperatorConnected,
@@ -199,6 +213,7 @@ EVENTS: dict[str, type[Event]] = {
 OWN = (
     LinkMeasured,
     CopiesCounted,
+    SourceReported,
     ControlPassed,
     AttentionChanged,
 )  # made by the vehicle itself; no operator may request them
@@ -245,7 +260,7 @@ def to_json(event: Event) -> dict[str, Any]:
 
 
 def describe(event: Event) -> str:
-    """An event in one line: its name, keys and values."""
+    """An event in one line: its name, keys and values; without a reason, which the decision states."""
     document = to_json(event)
-    words = (f"{key} {value}" for key, value in document.items() if key not in ("t", "event"))
+    words = (f"{key} {value}" for key, value in document.items() if key not in ("t", "event", "reason"))
     return " ".join((document["event"], *words))

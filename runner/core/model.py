@@ -458,6 +458,12 @@ class Camera:
         return str(address) if "address" in self.source.needs and address else None
 
     @property
+    def device(self) -> str | None:
+        """The device file that its source opens; None if it opens none, or none is configured."""
+        device = self.mount.get("device", self.source.settings.get("device"))
+        return str(device) if "device" in self.source.needs and device is not None else None
+
+    @property
     def topic(self) -> str | None:
         """The ROS topic that its source subscribes to; None if it does not, or none is configured."""
         topic = self.mount.get("topic", self.source.settings.get("topic"))
@@ -648,6 +654,7 @@ class Vehicle:
     keys       directory made for this side by `tod-runner keys`; None: nothing is encrypted or authenticated
     insecure   whether that is intended although video or control leave this machine
     private    network on whose addresses it is intended; None: none
+    strict     whether a vehicle starts only if every camera opens and its log can be written
     metrics    ports at which both sides serve metrics for Prometheus
     ros        the ROS node, for cameras whose source subscribes to topics
     dimensions None: unknown
@@ -669,6 +676,7 @@ class Vehicle:
     keys: str | None = None
     insecure: bool = False
     private: IPv4Network | IPv6Network | None = None
+    strict: bool = False
     metrics: MetricsPorts = MetricsPorts()
     ros: RosSettings = RosSettings()
     dimensions: Dimensions | None = None

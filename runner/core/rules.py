@@ -572,16 +572,19 @@ def _hold_back(
 def decide(vehicle: Vehicle, state: State, memory: Memory) -> tuple[Decision, Memory]:
     """Pure core of the runner: run the rules of the mode in force, in order.
 
+    To the rules, a camera that is lost is off: the others get its share.
+
     raises  RuleFailed, since rules may be the user's own
     """
     draft, asked = Draft(), None
+    seen = replace(state, on={**state.on, **dict.fromkeys(state.lost, False)}) if state.lost else state
     for call in vehicle.modes[state.mode]:
         before = draft
         try:
-            draft, memory = call(vehicle, state, draft, memory)
+            draft, memory = call(vehicle, seen, draft, memory)
         except (Exception, SystemExit) as error:
             raise RuleFailed(f"rule {call.name} failed: {type(error).__name__}: {error}") from error
-        if problem := _draft_problem(state, before, draft):
+        if problem := _draft_problem(seen, before, draft):
             raise RuleFailed(f"rule {call.name} failed: {problem}")
         asked = draft.total if asked is None else asked
     assert draft.total is not None and asked is not None
@@ -642,13 +645,14 @@ PARTS = (
 @cache
 def reads(vehicle: Vehicle, mode: Mode) -> frozenset[str]:
     """Fields of the state whose change triggers a new decision."""
-    return frozenset({"mode", "on", "rois"}).union(*(call.reads for call in vehicle.modes[mode]))
+    return frozenset({"mode", "on", "lost", "rois"}).union(*(call.reads for call in vehicle.modes[mode]))
 
 
 def _setting(state: State, draft: Draft, name: str) -> Setting:
-    roi = state.rois[name]
-    if not state.on[name]:
-        return Setting(False, False, allocation.ZERO, 0, 0, None, roi, 0, 0, "switched off")
+    roi, on = state.rois[name], state.on[name]
+    if not on or name in state.lost:
+        why = f"lost: {state.lost[name]}" if on else "switched off"
+        return Setting(on, False, allocation.ZERO, 0, 0, None, roi, 0, 0, why)
     kbps, factor = _whole(draft.bitrate[name]), draft.scaling[name]
     sending = draft.sending and kbps >= 1
     width, height = scaling.output_size(roi, factor)

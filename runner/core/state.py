@@ -30,6 +30,7 @@ class State:
     """Inputs of the rules. A value that no event has set yet is None.
 
     t                 seconds, time of the last event
+    on                by camera, whether the operator has it on; the rules see a camera that is lost as off
     manual            by camera: settings of mode single, or the last ones of a camera that is off
     prediction        the last one, whatever the mode when it arrived
     total_set         kbit/s, the operator's last total
@@ -38,6 +39,7 @@ class State:
     position          the newest one
     steering          the newest one
     copies            by camera, copies of its stream that leave the vehicle; 1 for cameras not named
+    lost              by camera whose source cannot be opened, why
     operator_since    t at which the operator's side connected, or took control of an unmeasured link; None: gone
     operator_lost     t at which the operator's side disconnected
     attention         of the driver, as the operator in control states it
@@ -59,6 +61,7 @@ class State:
     position: ev.PositionReported | None = None
     steering: ev.SteeringReported | None = None
     copies: Mapping[str, int] = field(default_factory=lambda: NOTHING)
+    lost: Mapping[str, str] = field(default_factory=lambda: NOTHING)
 
     @staticmethod
     def initial(vehicle: Vehicle, mode: Mode) -> State:
@@ -101,10 +104,12 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
             return {"total_set": kbps, "collective_total": kbps}
         case ev.CameraSwitched(camera=name, on=on):
             _known(vehicle, name)
-            # A camera switched on again in S gets its last values; in S these are the operator's, whatever cap applies.
-            kept = {} if on or state.mode is Mode.SINGLE else keep(in_force, name)
-            manual = {**state.manual, **kept} if kept else state.manual
-            return {"on": {**state.on, name: on}, "manual": manual}
+            return {"on": {**state.on, name: on}, "manual": _manual(state, in_force, name, on)}
+        case ev.SourceReported(camera=name, works=works, reason=reason):
+            _known(vehicle, name)
+            others = {other: why for other, why in state.lost.items() if other != name}
+            lost = others if works else {**others, name: reason or "its source does not open"}
+            return {"lost": lost, "manual": _manual(state, in_force, name, works)}
         case ev.RoiSet(camera=name, roi=roi):
             _only_in(Mode.SINGLE, state, event)
             _check_roi(_known(vehicle, name), roi)
@@ -147,6 +152,15 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
             return {}
         case _:
             assert_never(event)
+
+
+def _manual(state: State, in_force: Decision, name: str, is_sent: bool) -> Mapping[str, Manual]:
+    """The settings of mode single once a camera is sent or no longer sent.
+
+    One that is sent again in S gets its last values; in S these are the operator's, whatever cap applies.
+    """
+    kept = {} if is_sent or state.mode is Mode.SINGLE else keep(in_force, name)
+    return {**state.manual, **kept} if kept else state.manual
 
 
 def keep(in_force: Decision, *names: str) -> dict[str, Manual]:

@@ -10,7 +10,7 @@ from types import MappingProxyType
 from runner.core import rules
 from runner.core.commands import Command, KnobValues, after, difference
 from runner.core.decision import Decision
-from runner.core.events import CameraSwitched, Event, ModeSelected
+from runner.core.events import CameraSwitched, Event, ModeSelected, SourceReported
 from runner.core.model import Mode, Vehicle
 from runner.core.rules import Memory
 from runner.core.state import Refused, State, advance, keep
@@ -83,7 +83,7 @@ def step(vehicle: Vehicle, run: Run, event: Event) -> Run:
 
 def _to_keep(vehicle: Vehicle, run: Run, event: Event) -> Decision:
     """The decision whose settings outlast an event: without the cap by the measured link, which is temporary."""
-    if isinstance(event, (ModeSelected, CameraSwitched)) and run.decision.uncapped > run.decision.total:
+    if isinstance(event, (ModeSelected, CameraSwitched, SourceReported)) and run.decision.uncapped > run.decision.total:
         with suppress(rules.RuleFailed):
             return rules.decide_without_link(vehicle, run.state, run.memory)
     return run.decision

@@ -24,6 +24,7 @@ from runner.core.model import Media
 from runner.errors import RunError
 from runner.graph import Plan, rtsp_url
 from runner.gst.connections import RtspConnection
+from runner.gst.lost import LostCameras
 from runner.gst.memory import give_back
 from runner.gst.patient_media import PatientMedia
 from runner.gst.pipeline import Build, CameraPipeline
@@ -42,6 +43,7 @@ OnReport = Callable[[str, str], None]  # camera, what happened to it
 
 OPEN_S = 0.9  # a request for a camera that delivers nothing within this is answered 503; the camera continues to open
 OPENING_S = 0.02  # between two looks whether an IP camera has answered
+SLOW_S = 3.0  # a camera that has delivered nothing this long after a viewer's request counts as lost until it does
 HELD_S = 5.0  # how long an open camera then waits for the next request
 CLOSE_S = 2.0  # how long connections may take to end when the server stops
 TEARDOWN_S = 5.0  # how long a camera that is reopened waits for the end of its previous pipeline
@@ -103,10 +105,12 @@ class _Factory(GstRtspServer.RTSPMediaFactory):  # type: ignore[misc]
 class _Opening:
     """An attempt to open a camera, in a separate thread.
 
-    held  set when a client holds the opened camera
+    held     set when a client holds the opened camera
+    problem  the first error of its pipeline
     """
 
     def __init__(self) -> None:
+        self.since, self.problem = time.monotonic(), ""
         self.held = threading.Event()
         self.over = self.failed = False
 
@@ -133,6 +137,7 @@ class CameraServer:
     """RTSP server with one mount point per camera.
 
     build      makes a `CameraPipeline` from each new pipeline
+    lost       cameras that do not open: each is opened again when that is due
     on_report  called when pipelines start and stop, and when viewers are disconnected
     keyring    of this vehicle; None: anyone may watch, and nothing is encrypted
     refusal    returns why a camera must not be opened now; None: it may
@@ -145,6 +150,7 @@ class CameraServer:
         plans: Sequence[Plan],
         media: Media,
         build: Build,
+        lost: LostCameras,
         on_report: OnReport,
         keyring: Keyring | None = None,
         refusal: Callable[[str], str | None] = lambda _: None,
@@ -157,7 +163,7 @@ class CameraServer:
 
             self._viewers = ViewerCheck(keyring, lambda what: on_report("keys", what), self._on_refused)
         self._report_refusal = LimitedReports(lambda what: on_report("keys", what))
-        self._media, self._build, self._on_report = media, build, on_report
+        self._media, self._build, self._lost, self._on_report = media, build, lost, on_report
         self.controller, self._refusal = "", refusal
         self.pipelines: dict[str, CameraPipeline] = {}
         self._changed = threading.Condition()  # a camera's stage; also guards the state shared by clients' threads
@@ -282,6 +288,8 @@ class CameraServer:
             if camera.bus is not bus or camera.stage is _Stage.ENDING:
                 return  # elements fail while the pipeline is being stopped, and after the one that has failed first
             camera.stage = _Stage.ENDING
+            if camera.opening and not camera.opening.problem:
+                camera.opening.problem = message.parse_error()[0].message
             affected = [c for c in self._connections.values() if camera.name in (c.described, *c.cameras)]
         self._on_report(camera.name, message.parse_error()[0].message)
         # The library ends the pipeline when the last of them has left; until then no new viewer is admitted.
@@ -294,7 +302,8 @@ class CameraServer:
         The library would open it in the client's thread and answer only after 20 s. Here it is opened in a separate
         thread, so that a camera that is slow to start is open when the client retries.
         """
-        if not camera.is_open and self._is_waiting(camera.name):
+        if not camera.is_open and self._is_waiting(camera):
+            self._note_slow(camera)
             return False
         deadline = time.monotonic() + OPEN_S
         while True:
@@ -312,14 +321,22 @@ class CameraServer:
                 if opening:
                     opening.held.set()
                 return True
+            self._note_slow(camera)
             if (opening and opening.failed) or self._stopped.is_set() or time.monotonic() >= deadline:
                 return False
             # Otherwise its last viewer has just left, and it is ending.
 
-    def _is_waiting(self, name: str) -> bool:
+    def _is_waiting(self, camera: _Camera) -> bool:
         """Whether it is known that a camera cannot be opened within OPEN_S."""
-        pipeline = self.pipelines.get(name)
-        return self._refusal(name) is not None or (pipeline is not None and pipeline.has_waited(OPEN_S))
+        pipeline = self.pipelines.get(camera.name)
+        waited = self._refusal(camera.name) is not None or (pipeline is not None and pipeline.has_waited(OPEN_S))
+        return waited or not (camera.opening or self._lost.may_open(camera.name))
+
+    def _note_slow(self, camera: _Camera) -> None:
+        """Let the other cameras have the share of one that takes long to open."""
+        opening = camera.opening
+        if opening and not opening.over and time.monotonic() - opening.since > SLOW_S:
+            self._lost.delay(camera.name, f"it has delivered nothing for {SLOW_S:g} s")
 
     def _is_settled(self, camera: _Camera, opening: _Opening | None) -> bool:
         """Whether waiting for a camera to open is over."""
@@ -343,6 +360,10 @@ class CameraServer:
             if media is not None and CONSTRUCTS_LOCKED:
                 media.unlock()
             opening.failed = media is None or not self._prepare(media, thread, camera)
+            if opening.failed:
+                self._lost.fail(camera.name, opening.problem or "it delivers nothing")
+            else:
+                self._lost.open(camera.name)
             if media is not None and not opening.failed:
                 if camera.is_open:
                     opening.held.wait(HELD_S)

@@ -175,6 +175,7 @@ class CameraCaller:
         self._used = ""  # the passphrase of the current pipeline
         name = plan.camera.name
         self.pipeline: CameraPipeline | None = None
+        self._watch: int | None = None  # None: it has not been started
         self._on_fault = lambda what: on_report(name, what)
         self._supervised = SupervisedPipeline(plan.pipeline, self._on_built, self._on_fault)
         self._supervised.must_wait = lambda: refusal(name) is not None
@@ -184,6 +185,8 @@ class CameraCaller:
         self._watch = every(WATCH_MS, self._check, self._on_fault)
 
     def stop(self) -> None:
+        if self._watch is None:
+            return
         GLib.source_remove(self._watch)
         self.pipeline = None
         self._supervised.stop()

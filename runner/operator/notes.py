@@ -17,6 +17,7 @@ CAUSES = {
     "weights_set": "Weights set",
     "link_measured": "Link measured",
     "copies_counted": "Number of viewers changed",
+    "source_reported": "{camera}'s source",
     "control_passed": "Control passed",
     "attention_changed": "Attention changed",
     "operator_connected": "Operator connected",
@@ -77,4 +78,6 @@ def _change(was: CameraState, now: CameraState) -> str:
 def _factor(camera: CameraState) -> str:
     if not camera.on:
         return "off"
+    if camera.scaling is None:
+        return "lost"
     return f"{camera.scaling:g}" if camera.sending else "paused"

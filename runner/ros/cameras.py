@@ -77,9 +77,9 @@ class RosCameras:
                 self._streams.setdefault(camera.topic, []).append(CameraStream(camera, on_report))
         self._node = NodeProcess(settings, self._take, self._report, pictures=self._streams, insecure=insecure)
 
-    def start(self) -> None:
-        """raises RunError if the node does not start"""
-        self._node.start()
+    def start(self, *, patient: bool = False) -> None:
+        """raises RunError if the node does not start; see `NodeProcess.start`"""
+        self._node.start(patient=patient)
 
     def close(self) -> None:
         self._node.close()

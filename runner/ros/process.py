@@ -130,23 +130,28 @@ class NodeProcess:
         self._closing, self._tried = threading.Event(), threading.Event()
         self._is_ready, self._fatal = False, ""  # of the current process
         self._fault = ""  # as reported
+        self._patient = False  # whether a node that does not start is tried again
         self._thread = threading.Thread(target=self._run, name="ros", daemon=True)
 
-    def start(self) -> None:
+    def start(self, *, patient: bool = False) -> None:
         """Start the node and wait until it works, or has reported that it waits for the ROS 1 master.
 
-        raises  RunError with the remedy
+        patient  a node that does not start is reported and tried again
+        raises   RunError with the remedy, unless patient
         """
+        self._patient = patient
         python = self._settings.interpreter
-        if shutil.which(python) is None:
+        if shutil.which(python) is None and not patient:
             raise RunError(f"ros.python: {python}: no such program; {INSTALL_HINT[self._settings.version]}")
         self._thread.start()
-        if not self._tried.wait(START_S):
-            self.close()
-            raise RunError(f"the ROS node did not start within {START_S:g} s")
-        if self._fault:
-            self.close()
-            raise RunError(f"the ROS node does not start: {self._fault}")
+        why = "" if self._tried.wait(START_S) else f"not within {START_S:g} s"
+        if not (why := why or self._fault):
+            return
+        if patient:
+            self._on_report("", f"the ROS node does not start: {why}; trying again")
+            return
+        self.close()
+        raise RunError(f"the ROS node does not start: {why}")
 
     def publish(self, topic: str, text: str) -> None:
         """Publish a text as std_msgs/String, from any thread. While no node runs, latched texts wait; others are lost.
@@ -205,7 +210,8 @@ class NodeProcess:
             self._fail(why)
             if not self._tried.is_set():
                 self._tried.set()
-                return
+                if not self._patient:
+                    return
             self._closing.wait(pause_s(failed, *RETRY_S))
 
     def _fail(self, why: str) -> None:

@@ -23,7 +23,7 @@ from msgspec import UNSET
 from runner.configuration import agreement
 from runner.configuration.config import configuration
 from runner.core.model import Progress, Vehicle
-from runner.drive.log import Log
+from runner.drive.log import Log, check_free
 from runner.errors import RunError
 from runner.graph import rtsp_url
 from runner.metrics.side import metrics_of
@@ -41,7 +41,7 @@ from runner.mqtt.messages import (
     run_of,
     topic,
 )
-from runner.plans import compile_plans, render_missing
+from runner.plans import as_offered, compile_plans, render_missing
 from runner.records import (
     ClockAnswer,
     Outcome,
@@ -362,13 +362,18 @@ def live_vehicle(
     from runner import apply
 
     log = Path(log) if log else None
-    config = configuration(overrides, conf, check=apply.check_vehicle)
-    (pqos, track), vehicle, document = config.pqos(), config.vehicle(), config.document
+    config = configuration(overrides, conf, files=False, check=apply.check_vehicle)
+    if config.document.get("strict"):
+        config = config.drivable(apply.check_vehicle)
+    (pqos, track), document, rates = config.pqos(), config.document, list[str]()
+    vehicle = as_offered(config.vehicle(), rates.append)
     keyring = vehicle_keyring(vehicle)
     _check_ros(vehicle)
     render_missing(vehicle, progress)
     plans = compile_plans(vehicle)
-    apply.check_machine(plans)
+    lost = apply.check_machine(plans, strict=vehicle.strict)
+    if log and vehicle.strict:
+        check_free(log, "vehicle")
     console = _Console(say)
     with ExitStack() as ending:  # in reverse order, also of a vehicle that cannot start
         ending.callback(console.close)
@@ -380,8 +385,12 @@ def live_vehicle(
             console.say(what)
             drive.note(what)
 
+        for rate in rates:
+            report(rate)
         video = apply.VideoFiles(log, drive.video, drive.video_shift) if log and vehicle.log_video else None
-        side = apply.VehicleSide(plans, vehicle.media, lambda camera, what: report(f"{camera}: {what}"), video, keyring)
+        side = apply.VehicleSide(
+            plans, vehicle.media, lambda camera, what: report(f"{camera}: {what}"), video, keyring, lost
+        )
         ending.callback(side.stop)
         control = _VehicleControl(vehicle, document, report, keyring)
         ending.callback(control.close)
@@ -399,7 +408,7 @@ def live_vehicle(
             ending.callback(ros.close)
         ending.callback(live.stop)
         if ros:
-            ros.start()
+            ros.start(patient=not vehicle.strict)
         metrics.serve(live.problem, control.link)
         control.connect(live)
         for plan in plans:

@@ -22,6 +22,7 @@ from runner.core.events import (
     OperatorConnected,
     OperatorDisconnected,
     PositionReported,
+    SourceReported,
     SteeringReported,
     describe,
     parse,
@@ -80,6 +81,7 @@ class Applier(Protocol):
     def sent(self) -> Mapping[str, tuple[int, int]]: ...
     def faults(self) -> list[str]: ...
     def sources(self) -> Mapping[str, str]: ...
+    def lost(self) -> Mapping[str, str]: ...
     def untimed(self) -> Collection[str]: ...
     def slow(self) -> Mapping[str, int]: ...
     def stages(self) -> Mapping[str, tuple[float, float]]: ...
@@ -215,6 +217,7 @@ class ControlLoop:
         self.log.begin()
         self._warned = 0
         self._run = start(self.vehicle)
+        self._guarded("sources", lambda: self._check_sources(0.0))
         self._guarded("start", lambda: self._take(ClockAdvanced(t=0.0)))
         next_tick, late = TICK_S, LateCheck(2 * TICK_S)
         late.is_excused(0)
@@ -260,6 +263,7 @@ class ControlLoop:
             position_at = self.track.at
             self._guarded("position_reported", lambda: self._take(replace(position_at(t), t=t)))
         self._guarded("clock_advanced", lambda: self._take(ClockAdvanced(t=t)))
+        self._guarded("sources", lambda: self._check_sources(t))
         self._guarded("copies_counted", lambda: self._count_copies(t))
         self._guarded("faults", self._report_faults)
         if self._ticks % TELEMETRY_TICKS == 0:
@@ -271,6 +275,17 @@ class ControlLoop:
         copies = {name: count for name, count in self.applier.copies().items() if count > 1}
         if copies != self._run.state.copies:
             self._take(CopiesCounted(t=t, copies=copies))
+
+    def _check_sources(self, t: float) -> None:
+        """Let the rules know which cameras cannot be opened."""
+        now, known = self.applier.lost(), self._run.state.lost
+        for name in known.keys() - now.keys():
+            self._take(SourceReported(t=t, camera=name, works=True))
+            self.on_report(f"{name}: found again")
+        for name, why in now.items():
+            if known.get(name) != why:
+                self._take(SourceReported(t=t, camera=name, works=False, reason=why))
+                self.on_report(f"{name}: lost: {why}; trying again")
 
     def _report_faults(self) -> None:
         for fault in self.applier.faults():
@@ -523,7 +538,9 @@ class ControlLoop:
 
     def _state(self, applied: Mapping[str, KnobValues]) -> VehicleState:
         decision, weights = self._run.decision, self._run.state.weights
-        faults, untimed, slow = self.applier.sources(), self.applier.untimed(), self.applier.slow()
+        # A source that is awaited says for what; the rules know only that it does not open.
+        faults, untimed = {**self._run.state.lost, **self.applier.sources()}, self.applier.untimed()
+        slow = self.applier.slow()
         cameras = {
             name: CameraState.at(
                 setting,

@@ -106,7 +106,7 @@ def _cells(row: CameraRow) -> dict[str, str | Text]:
         "allocated": str(state.kbps) if state else "-",
         "demand": f"{state.demand_kbps:.0f}" if state else "-",
         "size": Text(size, style=_size_style(row)),
-        "factor": str(state.scaling or "off") if state else "-",
+        "factor": str(state.scaling or ("LOST" if state.on else "off")) if state else "-",
         "latency ms": f"{received.latency_ms:.1f}" if received.latency_ms is not None else "-",
         "lost": str(received.lost),
         WHY: state.reason if state else "",

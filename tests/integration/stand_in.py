@@ -66,6 +66,9 @@ class RecordingVehicle:
     def sources(self) -> dict[str, str]:
         return {}
 
+    def lost(self) -> dict[str, str]:
+        return {}
+
     def untimed(self) -> frozenset[str]:
         return frozenset()
 

@@ -229,8 +229,10 @@ def test_problems_with_credentials_are_reported(credentials, text, mode, why):
             assert not any("same7" in line for line in reported)
 
 
-def test_a_vehicle_whose_credentials_are_missing_does_not_start(tmp_path):
-    words = rear("rtsp://127.0.0.1:1/x", f'source.credentials="{tmp_path}/none"', f"media.port={free_port()}")
+def test_a_strict_vehicle_whose_credentials_are_missing_does_not_start(tmp_path):
+    words = rear(
+        "rtsp://127.0.0.1:1/x", f'source.credentials="{tmp_path}/none"', "strict=true", f"media.port={free_port()}"
+    )
     with process("vehicle", *words, cwd=CHECKOUT) as vehicle:
         output, _ = vehicle.communicate(timeout=60)
     assert vehicle.returncode == 1

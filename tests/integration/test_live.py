@@ -330,7 +330,8 @@ def test_the_demo_runs_a_real_clip_along_a_real_map(tmp_path):
 
 def test_missing_requirements_are_reported_in_one_line_with_status_1(broker, tmp_path):
     port = f"control.port={broker.port}"
-    absent = run("vehicle", "source=v4l2", "cameras.front_left.device=/dev/video99", port, f"media.port={free_port()}")
+    device = "cameras.front_left.device=/dev/video99"
+    absent = run("vehicle", "source=v4l2", device, "strict=true", port, f"media.port={free_port()}")
     assert absent.returncode == 1
     assert "camera front_left: Cannot identify device '/dev/video99'." in absent.stderr
     assert "Traceback" not in absent.stderr

@@ -19,6 +19,7 @@ const CASES = [
   ["off", { on: false }],
   ["off", { on: false, sending: false, arrived: NOW - 5000 }], // the silence was requested
   ["paused", { sending: false }],
+  ["lost", { sending: false, unopened: true }],
   ["lost", { connected: false }],
   ["lost", { online: false }],
   ["lost", { connected: false, on: false }], // the state of an unreachable camera is unknown

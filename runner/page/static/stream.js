@@ -124,9 +124,9 @@ export class Stream {
 
   /** The vehicle's decision about this camera; undefined: the vehicle does not have it. */
   onDecision(decision) {
-    const { on = null, sending = null, fault, slow_fps = null } = decision ?? {};
+    const { on = null, sending = null, scaling, fault, slow_fps = null } = decision ?? {};
     const begins = on && sending && (this.on === false || this.sending === false);
-    Object.assign(this, { on, sending, slow_fps });
+    Object.assign(this, { on, sending, slow_fps, unopened: on === true && scaling === null });
     this.failed_at = fault ? (this.failed_at ?? now()) : null;
     if (begins) this.resetTimes();
     if (decision) this.updateRegion(decision);
@@ -506,12 +506,12 @@ export class Stream {
 
   times() {
     const { connected, online } = this.station;
-    const { on, sending, refused, stood_since, waits_since, damaged, arrived, decoded, late_until } = this;
+    const { on, sending, unopened, refused, stood_since, waits_since, damaged, arrived, decoded, late_until } = this;
     const [faulty, isAbove] = [this.failed_at !== null, this.isOnlyInBirdseye];
     const drawn = this.drawn && (!isAbove || this.composed_at > -Infinity);
     const fps = Math.min(this.slow_fps ?? this.camera.fps, this.straight?.warp.fps ?? Infinity, isAbove ? this.composed_fps : Infinity);
     const { wave_s } = this.camera;
-    return { connected, online, on, sending, refused, drawn, stood_since, waits_since, wave_s, damaged, faulty, arrived, decoded, late_until, fps };
+    return { connected, online, on, sending, unopened, refused, drawn, stood_since, waits_since, wave_s, damaged, faulty, arrived, decoded, late_until, fps };
   }
 
   /** Whether too few pictures are drawn; to be called a few times a second. */

@@ -1,0 +1,121 @@
+"""Cameras whose sources cannot be opened: why, and when each is tried again."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from runner.graph import Plan
+from runner.system.backoff import pause_s
+
+BACKOFF_S = (1.0, 10.0)  # between two attempts: doubled from the first value up to the second
+POLL_S = 0.25
+
+
+@dataclass(slots=True)
+class _Loss:
+    """due: time.monotonic of the next attempt; is_tested: the source alone does not open, so no viewer need try it"""
+
+    reason: str
+    due: float
+    attempts: int = 1
+    is_tested: bool = False
+    must_test: bool = True
+
+
+class LostCameras:
+    """May be used from any thread. Sources are tested in a thread of its own, since that may take seconds.
+
+    A source that does not open by itself, such as a missing device, is tested again until it does. One that opens and
+    delivers nothing, such as an address where no camera answers, is tried again by its viewers, when that is due.
+
+    lost      by camera that does not open at the start, why
+    problem   returns why a source does not open; None: it opens
+    on_found  called with a camera whose source opens again
+    """
+
+    def __init__(
+        self,
+        plans: Sequence[Plan],
+        lost: Mapping[str, str],
+        problem: Callable[[Plan], str | None],
+        on_found: Callable[[str], None],
+    ) -> None:
+        self._plans, self._problem, self._on_found = {plan.camera.name: plan for plan in plans}, problem, on_found
+        self._changed = threading.Condition()
+        due = time.monotonic() + BACKOFF_S[0]
+        self._losses = {name: _Loss(why, due, is_tested=True) for name, why in lost.items()}
+        self._stopped = False
+        threading.Thread(target=self._run, name="lost", daemon=True).start()
+
+    def reasons(self) -> dict[str, str]:
+        """By camera that is lost, why."""
+        with self._changed:
+            return {name: loss.reason for name, loss in self._losses.items()}
+
+    def may_open(self, name: str) -> bool:
+        """Whether a viewer may make the camera open now."""
+        with self._changed:
+            loss = self._losses.get(name)
+            return loss is None or (not loss.must_test and time.monotonic() >= loss.due)
+
+    def fail(self, name: str, why: str) -> None:
+        """An attempt to open a camera has failed, or delivers nothing."""
+        with self._changed:
+            loss = self._losses.setdefault(name, _Loss(why, 0.0, attempts=0))
+            self._put_off(loss, why)
+            self._changed.notify_all()
+
+    def delay(self, name: str, why: str) -> None:
+        """An attempt to open a camera takes long."""
+        with self._changed:
+            self._losses.setdefault(name, _Loss(why, 0.0, attempts=0, must_test=False))
+
+    def open(self, name: str) -> None:
+        """A camera delivers pictures."""
+        with self._changed:
+            self._losses.pop(name, None)
+
+    def stop(self) -> None:
+        with self._changed:
+            self._stopped = True
+            self._changed.notify_all()
+
+    def _put_off(self, loss: _Loss, why: str) -> None:
+        loss.reason, loss.due = why, time.monotonic() + pause_s(loss.attempts, *BACKOFF_S)
+        loss.attempts += 1
+        loss.must_test = True
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._losses or self._stopped)
+                self._changed.wait_for(lambda: self._stopped, POLL_S)
+                if self._stopped:
+                    return
+                now = time.monotonic()
+                due = [name for name, loss in self._losses.items() if loss.must_test and now >= loss.due]
+            for name in due:
+                self._test(name)
+
+    def _test(self, name: str) -> None:
+        try:
+            why = self._problem(self._plans[name])
+        except Exception as error:  # the thread must go on: nothing else tries again
+            why = f"{type(error).__name__}: {error}"
+        with self._changed:
+            loss = self._losses.get(name)
+            if loss is None:
+                return
+            is_found = why is None and loss.is_tested
+            if why is not None:
+                loss.is_tested = True
+                self._put_off(loss, why)
+            elif is_found:
+                del self._losses[name]
+            else:
+                loss.must_test = False
+        if is_found and not self._stopped:
+            self._on_found(name)
