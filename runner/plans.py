@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+
 from runner.clips import View, cache_directory, rendered, view
-from runner.core.model import Progress, Vehicle
+from runner.core.model import Camera, Progress, Vehicle
 from runner.errors import RunError
 from runner.graph import Plan, compile_graph
+from runner.system.v4l2 import Device, offered_rate
 
 
 def compile_plans(vehicle: Vehicle) -> list[Plan]:
@@ -14,6 +21,29 @@ def compile_plans(vehicle: Vehicle) -> list[Plan]:
         compile_graph(camera, vehicle.media, index, clip=rendered(camera), recording=vehicle.recording)
         for index, camera in enumerate(vehicle.cameras.values())
     ]
+
+
+def as_offered(vehicle: Vehicle, report: Callable[[str], None]) -> Vehicle:
+    """The vehicle with the rates that its V4L2 devices state: 29.97 Hz stands for 30000/1001. Reports each change."""
+    cameras = dict(vehicle.cameras)
+    for name, camera in vehicle.cameras.items():
+        if (rate := nearest_rate(camera)) and camera.capture.fps:
+            report(f"{name}: {camera.device} captures at {rate} Hz, the nearest to {float(camera.capture.fps):g}")
+            cameras[name] = replace(camera, capture=replace(camera.capture, fps=rate))
+    return vehicle if cameras == vehicle.cameras else replace(vehicle, cameras=cameras)
+
+
+def nearest_rate(camera: Camera) -> Fraction | None:
+    """The rate that a camera's device offers in place of the configured one; None: that one, none close, or unknown."""
+    if camera.device is None or camera.capture.fps is None:
+        return None
+    try:
+        device = Device(Path(camera.device))
+    except OSError:
+        return None
+    with closing(device):
+        rate = offered_rate(device.formats(), camera.capture) if device.capability.captures else None
+    return rate if rate != camera.capture.fps else None
 
 
 def render_missing(vehicle: Vehicle, progress: Progress) -> None:

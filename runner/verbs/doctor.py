@@ -24,14 +24,16 @@ from typing import Any, NamedTuple
 from runner.configuration.config import configuration
 from runner.core.model import Camera, Endpoint, RosSettings, Vehicle, suggest
 from runner.errors import ArgumentError, MissingBindings, RunError, UserError, reason
+from runner.inputs import input_problem
 from runner.mqtt.broker import find_mosquitto
-from runner.plans import compile_plans
+from runner.plans import compile_plans, nearest_rate
 from runner.security.keyring import HOLDER, Keyring
 from runner.security.validity import date, expiring, invalid
 from runner.system.extras import EXTRAS, how_to_install
 from runner.system.ports import check_port_free
 from runner.system.rtsp import OK, UNAUTHORIZED, describe
 from runner.system.usb import UsbCamera, buses
+from runner.system.v4l2 import device_problem
 from runner.verbs import VERBS, Arguments, study_word
 
 IMPORT_S = 30  # rclpy or rospy loads within a second
@@ -222,14 +224,17 @@ def _certificates(keys: Path) -> Iterator[Diagnosis]:
 
 
 def _devices(vehicle: Vehicle) -> Iterator[Diagnosis]:
-    """V4L2 cameras, and the bandwidth of the USB buses that they share."""
+    """Clips, bags and V4L2 cameras, and the bandwidth of the USB buses that they share."""
     cameras = []
     for camera in vehicle.cameras.values():
-        device = camera.mount.get("device", camera.source.settings.get("device"))
-        if "device" in camera.source.needs and device is not None:
-            path = Path(str(device))
-            found = path.is_char_device()
-            yield Diagnosis(found, f"camera {camera.name}: {path}{'' if found else ' is not a device file'}")
+        if absent := input_problem(camera):
+            yield Diagnosis(False, f"camera {camera.name}: {absent}")
+        if camera.device is not None:
+            path = Path(camera.device)
+            why = device_problem(path, camera.capture, camera.fps)
+            rate = nearest_rate(camera) if why is None else None
+            taken = f" captures at {rate} Hz, the nearest to {float(camera.capture.fps or 0):g}" if rate else ""
+            yield Diagnosis(why is None, f"camera {camera.name}: {path}{f' {why}' if why else taken}")
             cameras.append(UsbCamera(camera.name, path, camera.capture, camera.fps))
     for bus in buses(cameras):
         need = f"about {bus.mbps:.0f} of {bus.budget_mbps:.0f} Mbit/s"

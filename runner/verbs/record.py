@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Any
 from runner.configuration.config import configuration
 from runner.core.model import Camera, Vehicle, plain
 from runner.errors import ArgumentError, RunError
-from runner.plans import compile_plans, render_missing
+from runner.plans import as_offered, compile_plans, render_missing
 from runner.rate_quality import recordings
 from runner.system.signals import Stop, stopping
 from runner.verbs import Arguments
@@ -48,7 +48,7 @@ def run(arguments: Arguments) -> int:
     duration, directory = _duration(arguments), _directory(arguments)
     apply = streaming()
     config = configuration(arguments.overrides, arguments.conf, check=apply.check_plan)
-    vehicle = config.vehicle()
+    vehicle = as_offered(config.vehicle(), say)
     _check_sources(vehicle)
     recordings.make_directory(directory)
     with progress_bar() as progress:
