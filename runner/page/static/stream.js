@@ -86,6 +86,7 @@ export class Stream {
     this.resync_interval = RESYNC_MIN_MS;
     this.transit = null; // usual time from the station to this page
     this.on = this.sending = null;
+    this.unopened = false; // whether the vehicle cannot open the source
     /** @type {number|null} */
     this.slow_fps = null; // what the camera delivers, if well below its rate
     /** @type {number|null} */
