@@ -12,7 +12,6 @@ from runner.clips import View, cache_directory, rendered, view
 from runner.core.model import Camera, Progress, Vehicle
 from runner.errors import RunError
 from runner.graph import Plan, compile_graph
-from runner.system.v4l2 import Device, offered_rate
 
 
 def compile_plans(vehicle: Vehicle) -> list[Plan]:
@@ -37,6 +36,8 @@ def nearest_rate(camera: Camera) -> Fraction | None:
     """The rate that a camera's device offers in place of the configured one; None: that one, none close, or unknown."""
     if camera.device is None or camera.capture.fps is None:
         return None
+    from runner.system.v4l2 import Device, offered_rate
+
     try:
         device = Device(Path(camera.device))
     except OSError:

@@ -50,7 +50,6 @@ from runner.core.model import (
 from runner.core.rules import RuleCall
 from runner.errors import ConfigError, Problem
 from runner.graph import Plan, assignments, check_video, compile_graph
-from runner.inputs import bag_problem, clip_problem
 from runner.redact import has_password, redacted
 
 if TYPE_CHECKING:
@@ -149,10 +148,8 @@ class Builder:
                 self.attempt(("cameras", camera.name), lambda c=camera: view(c))  # type: ignore[misc]
             if self.runnable:
                 self._check_inputs(camera)
-            if self.files:
-                self._check_file(camera, clip_problem(camera))
-            if self.bags:
-                self._check_file(camera, bag_problem(camera))
+            if camera.source.plays_bags or "clip" in camera.source.needs:
+                self._check_files(camera)
         if self.problems or recording is None:
             return None
         return Vehicle(
@@ -344,8 +341,11 @@ class Builder:
             elif key == "topic" and not TOPIC.fullmatch(str(given)):
                 self._report(where, ModelError(key, repr(given), TOPIC_RULE))
 
-    def _check_file(self, camera: Camera, error: ModelError | None) -> None:
-        """Report a clip or bag that cannot be read."""
+    def _check_files(self, camera: Camera) -> None:
+        """Check that the clip or bag that a camera's source plays can be read."""
+        from runner.inputs import bag_problem, clip_problem
+
+        error = (clip_problem(camera) if self.files else None) or (bag_problem(camera) if self.bags else None)
         if error:
             where = ("cameras", camera.name) if error.key in camera.mount else self._of(camera.name, "source")
             self._report(where, error)

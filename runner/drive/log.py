@@ -41,7 +41,6 @@ from runner.records import (
 from runner.redact import redacted
 from runner.system.clocks import STEP_S
 from runner.system.kernel_clock import NANO, ahead_of
-from runner.system.service import is_managed
 
 FORMAT = 1
 WITHOUT_LOG = "the drive continues without its log"
@@ -214,6 +213,8 @@ class _File:
         try:
             self._open()
         except _MISNAMED as error:
+            from runner.system.service import is_managed
+
             if not is_managed():
                 raise _refused(self.path.parent, reason(error)) from None
         except OSError:
