@@ -12,12 +12,14 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from fractions import Fraction
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from runner.core.commands import Command, KnobValue
 from runner.core.decision import NOTHING
-from runner.core.model import Media, suggest
+from runner.core.model import Camera, Media, suggest
 from runner.errors import RunError
 from runner.graph import Plan, launch, may_lack_parameter_sets
 from runner.gst import TYPELIBS, GLib, Gst, load_types
@@ -50,9 +52,6 @@ from runner.inputs import input_problem
 from runner.records import Arrivals, SentFrame
 
 if TYPE_CHECKING:
-    from fractions import Fraction
-    from pathlib import Path
-
     from runner.gst.lanes import Encoded, OnDecoded, OnFrame
     from runner.gst.pictures import LumaPlane
     from runner.gst.secure import StreamLogin
@@ -123,10 +122,22 @@ def check_recorders(plans: Sequence[Plan]) -> None:
         raise RunError("\n".join(missing))
 
 
+def _device_problem(camera: Camera) -> str | None:
+    """Why a device cannot be the camera's; None if it can, or GStreamer says what is wrong."""
+    if camera.device is None or not (path := Path(camera.device)).is_char_device():
+        return None
+    from runner.system.v4l2 import device_problem
+
+    why = device_problem(path, camera.capture, Fraction(0))  # a slow camera is sent at its rate
+    return f"{path} {why}" if why else None
+
+
 def _source_problem(plan: Plan) -> str | None:
     """Why a source does not open; None if it opens. GStreamer opens devices on the way to READY, and clips later."""
     if absent := input_problem(plan.camera):
         return str(absent)
+    if unfit := _device_problem(plan.camera):
+        return unfit
     pipeline = Gst.parse_launch(f"{launch(plan.source)} ! fakesink")
     try:
         if problem := log_in(pipeline, plan):

@@ -120,7 +120,7 @@ def test_a_v4l2_device_is_streamed_with_the_times_of_its_driver():
             streaming("source=v4l2", *words, cameras=(CAMERA,)) as (side, _, (plan,), reported),
             watching(plan) as client,
         ):
-            assert check_machine([plan]) is None
+            assert check_machine([plan]) == {}
             turn(side, sending=True, size=(480, 260), bitrate=500)
             until(lambda: len(client.sizes) > 10)
             pad = side._pipeline(CAMERA)._pipeline.get_by_name("raw").get_static_pad("src")

@@ -77,6 +77,7 @@ def test_a_strict_vehicle_does_not_start_without_a_clip(tmp_path):
 NOWHERE = 'address="rtsp://127.0.0.1:1/x"'
 ABSENT = {
     "device": ("v4l2", ("device=/dev/video99",), "Cannot identify device"),
+    "no camera": ("v4l2", ("device=/dev/null",), "/dev/null is no camera"),
     "credentials": ("rtsp", (NOWHERE, "credentials=/none"), "credentials /none: no such file"),
     "address": ("rtsp", (NOWHERE,), "Could not"),
     "bag": ("bag", ("bag=/none.mcap", "topic=/camera"), "/none.mcap: no such file"),
