@@ -30,7 +30,7 @@ def test_the_usage_names_every_verb(tod: Command, words: list[str]) -> None:
     status, out, err = tod(*words)
     assert (status, err) == (0 if words else 2, "")
     for name, verb in VERBS.items():
-        assert f"  {name:10}{verb.summary}" in out.splitlines()
+        assert f"  {name:11}{verb.summary}" in out.splitlines()
 
 
 @pytest.mark.parametrize("verb", VERBS)
