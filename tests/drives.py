@@ -244,6 +244,17 @@ class _Made:
         return line_to_json(LinkSample(t, kbps, round(queue, 2), self.passed, self.packets, self.dropped))
 
 
+def measured(side: str, lines: Lines) -> Lines:
+    """As if the vehicle had measured the link, and that had limited the total."""
+    for line in lines:
+        if line.get("log") == "state":
+            line["asked_kbps"] = 2 * line["total_kbps"]
+    if side != "vehicle":
+        return lines
+    events = ({"event": "link_measured", "kbps": 1000, "queue_ms": 60, "state": "filling"} for _ in lines)
+    return [each for line in lines for each in (line, {"t": line["t"], **next(events)})]
+
+
 def write_model(path: Path, name: str, factors: Sequence[float], full_kbps: float) -> Path:
     """A rate-quality model whose curves cross as measured ones do: quality saturates earlier for smaller factors."""
     points = []

@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("rosbags")
 
 from bags import fix, typestore, write_bag
-from drives import EPOCH, write_drive
+from drives import EPOCH, measured, write_drive
 
 from runner.core.model import ModelError
 from runner.drive.positions import reader
@@ -32,9 +32,8 @@ def gps(path, *topics, first_s=-2.0, count=60, status=0):
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory):
     directory = tmp_path_factory.mktemp("logged")
-    return write_drive(
-        directory / "drive", seconds=20, congested=2.0, overrides=("vehicle=delivery_robot", "fps_max=5")
-    )
+    words = ("vehicle=delivery_robot", "fps_max=5")
+    return write_drive(directory / "drive", seconds=20, congested=2.0, overrides=words, change=measured)
 
 
 def test_a_bag_is_a_track(tmp_path):

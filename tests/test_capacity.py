@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from drives import Lines, write_drive
+from drives import Lines, measured, write_drive
 from helpers import Command
 
 from runner.drive.capacity import CapacitySample, cells, limited_samples
@@ -37,17 +37,6 @@ def test_squares_are_square_at_every_latitude_and_across_the_180th_meridian() ->
             CapacitySample(lat, float(np.remainder(179.9995 + 180 + n * east / 10, 360) - 180), 1.0) for n in range(31)
         ]
         assert 3 <= len(cells(row, 50, 100)) <= 4
-
-
-def measured(side: str, lines: Lines) -> Lines:
-    """As if the vehicle had measured the link, and that had limited the total."""
-    for line in lines:
-        if line.get("log") == "state":
-            line["asked_kbps"] = 2 * line["total_kbps"]
-    if side != "vehicle":
-        return lines
-    events = ({"event": "link_measured", "kbps": 1000, "queue_ms": 60, "state": "filling"} for _ in lines)
-    return [each for line in lines for each in (line, {"t": line["t"], **next(events)})]
 
 
 def reported(t: float, late_s: float) -> dict[str, Any]:

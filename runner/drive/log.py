@@ -39,8 +39,6 @@ from runner.records import (
     line_to_json,
 )
 from runner.redact import redacted
-from runner.system.clocks import STEP_S
-from runner.system.kernel_clock import NANO, ahead_of
 
 FORMAT = 1
 WITHOUT_LOG = "the drive continues without its log"
@@ -102,7 +100,7 @@ class Log:
         first = Began(0.0, self._side, FORMAT, self.time, versions, redacted(self._config), redacted(replayed))
         with self._lock:
             self._began, self._past = time.monotonic(), None if at is None else 0.0
-            self._ahead_s = _wall_ahead_s()
+            self._ahead_s = _wall_ahead_s() if at is None else 0.0
             if self._file and at is None:
                 self._writer = _Writer(self._file, self._dropped, self._on_report)
             for line in (line_to_json(first), *self._before_begin):
@@ -143,6 +141,8 @@ class Log:
 
     def _look_at_clock(self) -> None:
         """Write by how much the wall clock has been set since the line before."""
+        from runner.system.clocks import STEP_S
+
         by_s = _wall_ahead_s() - self._ahead_s
         if abs(by_s) > STEP_S and abs(by_s := _wall_ahead_s() - self._ahead_s) > STEP_S:  # the first reading may be off
             self._ahead_s += by_s
@@ -188,6 +188,8 @@ class Log:
 
 def _wall_ahead_s() -> float:
     """How far the wall clock is ahead of one that is never set, and also runs while the machine is suspended, s."""
+    from runner.system.kernel_clock import NANO, ahead_of
+
     return NANO * ahead_of(lambda: time.clock_gettime_ns(time.CLOCK_BOOTTIME))
 
 

@@ -15,7 +15,6 @@ from runner.gst.arriving import CAPTURE_ID
 from runner.gst.knobs import KnobPanel
 from runner.gst.picture_rate import PictureRate
 from runner.gst.probes import BufferProbe, PassingBuffer, TypeProbe
-from runner.gst.pushed import PushedPictures
 from runner.gst.rate_limit import RateLimits
 from runner.gst.repeats import RepeatDetector
 from runner.gst.requests import RequestLimit
@@ -25,6 +24,7 @@ from runner.gst.source import loop_clip
 from runner.gst.watched import WatchedSource
 
 if TYPE_CHECKING:
+    from runner.gst.pushed import PushedPictures
     from runner.ros.cameras import SharedPicture
 
 Build = Callable[[Gst.Bin, Plan], "CameraPipeline"]
@@ -80,7 +80,7 @@ class CameraPipeline:
         self._rate, self._on_report = PictureRate(float(plan.camera.fps)), on_report
         self._restarts_after_gaps = is_restarted_after_gaps(plan.camera.graph)
         self._is_gap = False
-        self._pushed = PushedPictures(plan.camera.source_size, plan.camera.fps)
+        self._pushed: PushedPictures | None = None  # those of a Python program
         self._elements = [pipeline.get_by_name(element.name) for element in plan.vehicle]
         self._encoder = EncoderWatch(self._elements)
         entry = self._elements[0].get_static_pad("sink")
@@ -147,7 +147,10 @@ class CameraPipeline:
 
         raises  ValueError
         """
+        from runner.gst.pushed import PushedPictures
+
         camera = self._plan.camera
+        self._pushed = self._pushed or PushedPictures(camera.source_size, camera.fps)
         source = self._pipeline.get_by_name(self._plan.source[0].name)
         try:
             return self._pushed.push(source, frame, form, captured)
