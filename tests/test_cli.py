@@ -176,7 +176,7 @@ def test_doctor_and_validate_report_which_part_of_gstreamer_does_not_load(
         (["operator", "page.serve=false"], ["paho", "rich"]),
         (
             ["model", "metric=vmaf", "workers=dask"],
-            ["numba", "cv2", "scipy", "matplotlib", "rich", "imageio_ffmpeg", "distributed"],
+            ["numba", "cv2", "matplotlib", "rich", "imageio_ffmpeg", "distributed"],
         ),
         (["ros", "keys=/none"], ["paho", "rich", "cryptography"]),
         (["print"], []),

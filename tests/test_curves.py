@@ -12,8 +12,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-pytest.importorskip("scipy")
-
 from runner.rate_quality import plans
 from runner.rate_quality.choice import ChoiceCriteria, choose, pooled
 from runner.rate_quality.curves import (
@@ -24,6 +22,7 @@ from runner.rate_quality.curves import (
     cross,
     crossings,
     draw_curves,
+    interpolated,
     mean_score,
     quality_drops,
 )
@@ -61,6 +60,17 @@ def true_crossing(lower, upper):
         middle = (low * high) ** 0.5
         low, high = (low, middle) if quality(upper, middle) > quality(lower, middle) else (middle, high)
     return low
+
+
+@given(st.lists(st.tuples(st.integers(1, 60), st.floats(0, 1)), min_size=1, max_size=8, unique_by=lambda p: p[0]))
+def test_curves_are_pchip(points):
+    kbps, y = (np.array(column, float) for column in zip(*sorted(points), strict=True))
+    at = np.geomspace(kbps[0] / 2, kbps[-1] * 2, 50)
+    found = interpolated(kbps, y, at)
+    assert found.min() >= y.min() - 1e-9 and found.max() <= y.max() + 1e-9
+    if len(y) > 1:
+        pchip = pytest.importorskip("scipy.interpolate").PchipInterpolator(np.log(kbps), y)
+        assert found == pytest.approx(pchip(np.log(np.clip(at, kbps[0], kbps[-1]))), abs=1e-9)
 
 
 def test_a_crossing_is_where_the_curves_meet():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -29,6 +30,7 @@ from runner.drive.statistics import (
 )
 from runner.drive.tables import camera_rows
 from runner.rate_quality.artefact import read_model
+from runner.rate_quality.curves import Point, draw_curves, mean_score
 
 pytestmark = pytest.mark.slow  # reads whole drives
 
@@ -200,6 +202,23 @@ def test_quality_between_measured_points(
 ) -> None:
     found = estimate(camera(kbps, scaling, share=share), MODEL)
     assert (found.mean, found.clamped) == (pytest.approx(quality), clamped)
+
+
+def test_quality_is_read_from_the_curve_that_model_draws() -> None:
+    """Of bent points; two of them, where the encoder cannot use more, are at the same bitrate."""
+    rates, scores = (100, 200, 400, 800), (0.6, 0.8, 0.85, 0.86)
+    points = [Point(Fraction(1, 2), r, r, 1.0, {"mssim": (s,)}) for r, s in zip(rates, scores, strict=True)]
+    curves = draw_curves(points, mean_score("mssim"))
+    document = {
+        "metric": "mssim",
+        "points": [
+            {"scaling": 0.5, "actual_kbps": float(r), "mssim": s}
+            for r, s in (*zip(rates[:3], scores[:3], strict=True), (800.0, 0.855), (800.0, 0.865))
+        ],
+    }
+    for index in (60, 200, 333):
+        found = estimate(camera(float(curves.kbps[index]), 0.5), rate_curves(document))
+        assert found.mean == pytest.approx(curves.quality[Fraction(1, 2)][index], abs=1e-9)
 
 
 def interrupted(begin: float, end: float, kbps: float = 400, seconds: float = 25) -> CameraSeries:

@@ -27,6 +27,7 @@ from runner.drive.series import (
     sending_spans,
     spans,
 )
+from runner.rate_quality.curves import interpolated
 from runner.records import SLOW, SLOW_S
 
 FREEZE_GAPS = 30  # gaps over which the mean is taken (W3C webrtc-stats, freezeCount)
@@ -431,7 +432,14 @@ def rate_curves(document: Mapping[str, Any]) -> Model:
     for point in document["points"]:
         if metric in point and point["actual_kbps"] > 0:
             groups.setdefault(round(point["scaling"], 6), []).append((point["actual_kbps"], point[metric]))
-    return Model(metric, {factor: RateCurve(*np.array(sorted(group)).T) for factor, group in groups.items()})
+    return Model(metric, {factor: _rate_curve(group) for factor, group in groups.items()})
+
+
+def _rate_curve(points: Sequence[tuple[float, float]]) -> RateCurve:
+    """Of bitrate and quality; of points at one bitrate, as of an encoder that cannot use more, the mean."""
+    kbps, quality = np.array(points).T
+    distinct, index = np.unique(kbps, return_inverse=True)
+    return RateCurve(distinct, np.bincount(index, quality) / np.bincount(index))
 
 
 def estimate(
@@ -440,7 +448,7 @@ def estimate(
     """Quality of a camera's pictures by its rate-quality model.
 
     At each sample: the curve of the factor in force, at the actual bitrate as the full image would have it at the same
-    bits per pixel (paper, left side of Eq. 4), linear between measured points in log bitrate.
+    bits per pixel (paper, left side of Eq. 4), between measured points as `model` draws it.
 
     frozen_spans     when the picture was frozen: it keeps the quality it had before, see `Estimate`
     allocated_until  end of a drive of which only decisions are known: allocated bitrates are taken
@@ -456,7 +464,7 @@ def estimate(
             unknown.append(float(factor))
             continue
         curve = model.curves[factor]
-        quality[at] = np.interp(np.log(full[at]), np.log(curve.kbps), curve.quality)
+        quality[at] = interpolated(curve.kbps, curve.quality, full[at])
         outside[at] = (full[at] < curve.kbps[0]) | (full[at] > curve.kbps[-1])
     moving = np.ones(t.shape, dtype=bool)
     for freeze in frozen_spans:

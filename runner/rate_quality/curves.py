@@ -106,7 +106,7 @@ def mean_score(metric: str, sign: int = 1) -> Score:
 
 
 def draw_curves(points: Iterable[Point], score: Score) -> Curves:
-    """Curves through the points: piecewise cubic in log bitrate, monotone where the points are (PCHIP).
+    """Curves through the points, see `interpolated`.
 
     raises  ValueError if no point meets its target
     """
@@ -118,20 +118,59 @@ def draw_curves(points: Iterable[Point], score: Score) -> Curves:
     if not targets:
         raise ValueError("no encoding meets its target bitrate")
     kbps = np.geomspace(min(targets), max(targets), GRID)
-    return Curves(kbps, {factor: _curve(group, score, np.log(kbps)) for factor, group in valid.items()})
+    return Curves(kbps, {factor: _curve(group, score, kbps) for factor, group in valid.items()})
 
 
-def _curve(points: Sequence[Point], score: Score, x: Values) -> Values:
-    from scipy.interpolate import PchipInterpolator
+def interpolated(kbps: Values, quality: Values, at_kbps: Values) -> Values:
+    """Quality between measured bitrates: piecewise cubic in log bitrate, monotone where the points are (PCHIP; F. N.
+    Fritsch, J. Butland, SIAM J. Sci. Stat. Comput. 5(2), 1984); beyond them that of the nearest.
 
-    at = np.log([point.target_kbps for point in points])
+    Where measured points are left out it is nearer to them than straight lines are, see docs/models.md.
+
+    kbps     increasing, above 0
+    quality  measured there
+    """
+    x, y = np.log(kbps), np.asarray(quality, float)
+    at = np.clip(np.log(at_kbps), x[0], x[-1])
+    if len(x) == 1:
+        return np.full(at.shape, y[0])
+    step, slope = np.diff(x), np.diff(y) / np.diff(x)
+    tangent = _tangents(step, slope)
+    i = np.clip(np.searchsorted(x, at, side="right") - 1, 0, len(step) - 1)
+    u, h = (at - x[i]) / step[i], step[i]
+    curved = (3 * slope[i] - 2 * tangent[i] - tangent[i + 1]) * h, (tangent[i] + tangent[i + 1] - 2 * slope[i]) * h
+    return np.asarray(y[i] + u * (tangent[i] * h + u * (curved[0] + u * curved[1])))
+
+
+def _tangents(step: Values, slope: Values) -> Values:
+    """At each point: inside, the weighted harmonic mean of the slopes beside it; 0 at an extremum."""
+    if len(slope) == 1:
+        return np.repeat(slope, 2)
+    before, after = 2 * step[1:] + step[:-1], step[1:] + 2 * step[:-1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inside = (before + after) / (before / slope[:-1] + after / slope[1:])
+    inside[slope[:-1] * slope[1:] <= 0] = 0.0
+    ends = (_end_tangent(*step[:2], *slope[:2]), _end_tangent(*step[:-3:-1], *slope[:-3:-1]))
+    return np.concatenate([ends[:1], inside, ends[1:]])
+
+
+def _end_tangent(step: float, next_step: float, slope: float, next_slope: float) -> float:
+    """Of a parabola through three points, limited so that the curve keeps their shape."""
+    tangent = ((2 * step + next_step) * slope - step * next_slope) / (step + next_step)
+    if tangent * slope <= 0:
+        return 0.0
+    return 3 * slope if slope * next_slope <= 0 and abs(tangent) > 3 * abs(slope) else tangent
+
+
+def _curve(points: Sequence[Point], score: Score, kbps: Values) -> Values:
+    at = np.array([point.target_kbps for point in points], float)
     quality = np.array([score(point) for point in points])
-    inside = (x >= at[0] - 1e-9) & (x <= at[-1] + 1e-9)
-    y = np.full(x.shape, -np.inf)
+    inside = (kbps >= at[0] * (1 - 1e-9)) & (kbps <= at[-1] * (1 + 1e-9))
+    y = np.full(kbps.shape, -np.inf)
     if len(points) > 1:
-        y[inside] = PchipInterpolator(at, quality)(np.clip(x[inside], at[0], at[-1]))
+        y[inside] = interpolated(at, quality, kbps[inside])
     if points[-1].saturated:
-        y[x > at[-1]] = quality[-1]
+        y[kbps > at[-1]] = quality[-1]
     return y
 
 

@@ -10,7 +10,7 @@ EXTRAS = {  # top-level modules by extra, as in pyproject.toml
     "live": ("paho", "rich"),
     "page": ("aiohttp", "plotly"),
     "synthetic": ("numba", "rich"),
-    "model": ("numba", "cv2", "scipy", "matplotlib", "rich"),
+    "model": ("numba", "cv2", "matplotlib", "rich"),
     "report": ("matplotlib", "plotly", "rich"),
     "vmaf": ("imageio_ffmpeg",),
     "cluster": ("distributed",),

@@ -27,7 +27,6 @@ from runner.rate_quality.metrics import find_metric
 
 pytestmark = pytest.mark.gst
 cv2 = pytest.importorskip("cv2")
-pytest.importorskip("scipy")
 
 WIDTH, HEIGHT, FPS, FRAMES = 320, 192, 25, 40
 CAMERA = ("camera=front_center",)

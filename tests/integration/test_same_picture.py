@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 pytest.importorskip("cv2")
-pytest.importorskip("scipy")
 pytest.importorskip("rosbags")
 
 import cv2
