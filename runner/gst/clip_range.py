@@ -14,6 +14,7 @@ from runner.gst.video_reader import PARSED
 
 DECODE = "decodebin force-sw-decoders=true"
 WAIT_NS = 5 * Gst.SECOND
+FULL, LIMITED = map(GstVideo.VideoColorRange, (1, 2))  # Python has no names for them, which begin with digits
 LARGEST_BT601 = 576  # lines; GStreamer's rule for pictures that state no matrix
 CONVERTED = ("image/jpeg",)  # always full range and BT.601, which videoconvert converts, here as for live cameras
 
@@ -29,12 +30,12 @@ def full_range(clip: str, caps: Gst.Caps) -> str:
     if kind.get_name() in CONVERTED:
         return ""
     stated = _merged(_of_pictures(clip, kind.get_name().removeprefix("video/x-")), _colorimetry(caps))
-    if stated.range != GstVideo.VideoColorRange(1):
+    if stated.range != FULL or stated.matrix == GstVideo.VideoColorMatrix.RGB:
         return ""
     if stated.matrix == GstVideo.VideoColorMatrix.UNKNOWN:
         small = kind.get_int("height")[1] <= LARGEST_BT601
         stated.matrix = GstVideo.VideoColorMatrix.BT601 if small else GstVideo.VideoColorMatrix.BT709
-    stated.range = GstVideo.VideoColorRange(2)
+    stated.range = LIMITED
     return str(stated.to_string())
 
 
