@@ -1,4 +1,4 @@
-"""The vehicle's RTSP server: one shared factory per camera, its settings rewritten whenever its pipeline is rebuilt.
+"""The vehicle's RTSP server: one shared factory (`camera_media`) per camera, whose pipeline is built when watched.
 
 The server library runs each client in its own thread, so that a waiting client does not delay the others. Its
 callbacks run in any of these threads, and one lock guards all shared state.
@@ -23,19 +23,19 @@ from gi.repository import GLib, GObject, Gst, GstRtsp, GstRtspServer
 from runner.core.model import Media
 from runner.errors import RunError
 from runner.graph import Plan, rtsp_url
+from runner.gst.camera_media import CameraFactory, address_pool, on_element
 from runner.gst.connections import RtspConnection
 from runner.gst.lost import LostCameras
 from runner.gst.memory import give_back
-from runner.gst.patient_media import PatientMedia
 from runner.gst.pipeline import Build, CameraPipeline
-from runner.gst.srtp import set_master_key
 from runner.gst.timers import every
 from runner.gst.video_files import concerns_file
 from runner.gst.viewers import admit, operator_of, over_uplink
-from runner.system.ports import check_port_free, ip_address_of
+from runner.system.ports import check_port_free
 from runner.system.reports import LimitedReports
 
 if TYPE_CHECKING:
+    from runner.gst.patient_media import PatientMedia
     from runner.gst.secure import ViewerCheck
     from runner.security.keyring import Keyring
 
@@ -56,7 +56,6 @@ FIRST_REQUEST_S, CROWD, CROWDED_S = 5.0, 8, 1.0
 # A connection and its thread take three descriptors, and some more until it has ended. Beyond this many connections the
 # oldest one that watches nothing is dropped, whatever it requests: a viewer watches within a second.
 DESCRIPTORS, RESERVED, LEAST, MOST = 5, 256, 16, 1000
-QUEUE_BYTES = 2_000_000  # more than a viewer may lag at any bitrate
 LAG_S = 1.0  # a TCP viewer that lags by more is disconnected
 WATCH_MS = 200
 BLOCKED_S = 0.4  # a camera that should send but does not for this long and three frame intervals is blocked
@@ -95,13 +94,6 @@ class _Stage(Enum):
     ENDING = auto()
 
 
-class _Factory(GstRtspServer.RTSPMediaFactory):  # type: ignore[misc]
-    """A camera's factory, with one media for all URLs of the camera: another port, a trailing slash or a query."""
-
-    def do_gen_key(self, _url: GstRtsp.RTSPUrl) -> str:
-        return "media"
-
-
 class _Opening:
     """An attempt to open a camera, in a separate thread.
 
@@ -118,7 +110,7 @@ class _Opening:
 class _Camera:
     """One mount point and its pipeline, if built."""
 
-    def __init__(self, plan: Plan, factory: _Factory, url: str) -> None:
+    def __init__(self, plan: Plan, factory: CameraFactory, url: str) -> None:
         self.plan, self.factory = plan, factory
         self.name = plan.camera.name
         self.url = GstRtsp.RTSPUrl.parse(url)[1]
@@ -186,7 +178,7 @@ class CameraServer:
         self._server.connect("client-connected", self._on_connected)
         self._server.set_session_pool(SessionPool())
         self._server.get_session_pool().connect("session-removed", _on_session_removed)
-        self._addresses = _address_pool(media)
+        self._addresses = address_pool(media)
         self._cameras = {plan.camera.name: self._camera(plan) for plan in plans}
         for name, camera in self._cameras.items():
             self._server.get_mount_points().add_factory(f"/{name}", camera.factory)
@@ -215,28 +207,10 @@ class CameraServer:
     # --- cameras ------------------------------------------------------------------------------------------------------
 
     def _camera(self, plan: Plan) -> _Camera:
-        camera = _Camera(plan, self._factory(plan), rtsp_url(self._media, plan.camera.name))
+        factory = CameraFactory(plan, self._addresses, self._viewers and self._viewers.permissions)
+        camera = _Camera(plan, factory, rtsp_url(self._media, plan.camera.name))
         camera.factory.connect("media-configure", self._on_configure, camera)
         return camera
-
-    def _factory(self, plan: Plan) -> _Factory:
-        settings = plan.camera.graph.settings
-        factory = _Factory()
-        factory.set_launch(plan.server)
-        factory.set_media_gtype(PatientMedia.__gtype__)
-        factory.set_shared(True)  # otherwise a second viewer takes the pipeline from the first
-        factory.set_latency(0)
-        factory.set_address_pool(self._addresses)
-        if int(settings.get("dscp", -1)) >= 0:
-            factory.set_dscp_qos(int(settings["dscp"]))
-        repairs = int(settings.get("retransmission_ms", 0))
-        if repairs:
-            factory.set_retransmission_time(repairs * Gst.MSECOND)
-            factory.set_do_retransmission(True)
-        if self._viewers:
-            factory.set_permissions(self._viewers.permissions)
-        factory.set_profiles(_profiles(repairs > 0, self._viewers is not None))
-        return factory
 
     def _on_configure(self, _factory: object, media: GstRtspServer.RTSPMedia, camera: _Camera) -> None:
         element = media.get_element()
@@ -245,7 +219,7 @@ class CameraServer:
         bus.enable_sync_message_emission()  # the library watches the bus itself and reports nothing
         bus.connect("sync-message::error", self._on_error, camera)
         built = self._build(element, camera.plan)
-        pipeline.connect("deep-element-added", _on_element, weakref.ref(built))
+        pipeline.connect("deep-element-added", on_element, weakref.ref(built))
         with self._changed:
             camera.media, camera.bus, camera.stage, camera.prepared = media, bus, _Stage.BUILT, False
             self.pipelines[camera.name] = built
@@ -761,25 +735,6 @@ def _on_session_removed(_pool: object, session: GstRtspServer.RTSPSession) -> No
         _end(session, media)
 
 
-def _profiles(repairs: bool, secure: bool) -> GstRtsp.RTSPProfile:
-    """With feedback for retransmission, and without for players that lack it (RFC 4585); as SRTP (RFC 5124)."""
-    plain, feedback = (
-        (GstRtsp.RTSPProfile.SAVP, GstRtsp.RTSPProfile.SAVPF)
-        if secure
-        else (GstRtsp.RTSPProfile.AVP, GstRtsp.RTSPProfile.AVPF)
-    )
-    return feedback | plain if repairs else plain
-
-
-def _address_pool(media: Media) -> GstRtspServer.RTSPAddressPool:
-    """Addresses for RTP and RTCP: the server's own, or all if it listens on all."""
-    address = ip_address_of(media.host)
-    first, last = media.rtp_ports
-    pool = GstRtspServer.RTSPAddressPool()
-    pool.add_range(address, address, first, last, 0)
-    return pool
-
-
 def _camera_name(context: GstRtspServer.RTSPContext) -> str:
     """First component of the path of a request's URL: the camera, if valid; in SETUP a stream follows it."""
     return _path(context).partition("/")[0]
@@ -814,28 +769,3 @@ def _user_agent(context: GstRtspServer.RTSPContext) -> str | None:
     except UnicodeDecodeError:
         return None
     return agent
-
-
-def _on_element(pipeline: Gst.Bin, parent: Gst.Bin, element: Gst.Element, built: weakref.ref[CameraPipeline]) -> None:
-    """Configure the elements that the server library adds around a pipeline."""
-    factory = element.get_factory().get_name() if element.get_factory() else ""
-    if parent is pipeline and factory == "queue":
-        # In front of its sinks, if it has several: a sink that accepts nothing must not block the others. Not limited
-        # by time: the first packet after a pause would seem as old as the pause, and be dropped for the second.
-        element.set_property("leaky", "downstream")
-        element.set_property("max-size-buffers", 0)
-        element.set_property("max-size-time", 0)
-        element.set_property("max-size-bytes", QUEUE_BYTES)
-    if factory == "srtpenc":
-        set_master_key(element)
-    camera = built()
-    if camera and factory == "rtprtxsend":
-        camera.requests.add_store(element)
-    if camera and factory == "rtpsession":
-        camera.requests.add_session(element)
-    if element.find_property("processing-deadline"):
-        # Sinks of a live pipeline hold packets until their time: pure latency, and retransmissions wait behind them.
-        element.set_property("sync", False)
-    if element.find_property("rtcp-sync-send-time"):
-        # Packets state when their frame was captured, not when they leave.
-        element.set_property("rtcp-sync-send-time", False)

@@ -224,17 +224,16 @@ def test_a_delay_is_added_to_the_wait(kind):
 
 
 def test_lost_packets_are_retransmitted_through_the_relay(monkeypatch):
-    from runner.gst.server import CameraServer, GstRtsp
+    from runner.gst.camera_media import CameraFactory, GstRtsp
 
-    factory = CameraServer._factory
+    class FeedbackOnly(CameraFactory):
+        """Offered both, a client that does not choose uses AVP, which has no retransmission."""
 
-    def with_feedback_only(self, plan):
-        # Offered both, a client that does not choose uses AVP, which has no retransmission.
-        made = factory(self, plan)
-        made.set_profiles(GstRtsp.RTSPProfile.AVPF)
-        return made
+        def __init__(self, *settings):
+            super().__init__(*settings)
+            self.set_profiles(GstRtsp.RTSPProfile.AVPF)
 
-    monkeypatch.setattr(CameraServer, "_factory", with_feedback_only)
+    monkeypatch.setattr("runner.gst.server.CameraFactory", FeedbackOnly)
     # A queue that fits most of a frame but not all of it: the rest arrives once it is retransmitted.
     limit = Limit(lambda t: 4000, queue_ms=25, delay_ms=0)
     overrides = (*NOISE, "vehicle=delivery_robot", "fps_max=15", "graph.retransmission_ms=200")
