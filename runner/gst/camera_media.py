@@ -81,7 +81,14 @@ def on_element(pipeline: Gst.Bin, parent: Gst.Bin, element: Gst.Element, built: 
         camera.requests.add_session(element)
     if element.find_property("processing-deadline"):
         # Sinks of a live pipeline hold packets until their time: pure latency, and retransmissions wait behind them.
-        element.set_property("sync", False)
+        # For viewers over TCP the library turns this on again with each PLAY.
+        element.connect("notify::sync", _never_wait)
+        _never_wait(element)
     if element.find_property("rtcp-sync-send-time"):
         # Packets state when their frame was captured, not when they leave.
         element.set_property("rtcp-sync-send-time", False)
+
+
+def _never_wait(sink: Gst.Element, _changed: object = None) -> None:
+    if sink.get_property("sync"):
+        sink.set_property("sync", False)
