@@ -33,6 +33,7 @@ class RtspConnection:
     opening      whether it waits for the camera of its DESCRIBE to open
     described    camera of its last DESCRIBE: the library keeps it open for the client
     interleaved  whether this connection also carries video
+    refused_udp  cameras that its client has tried in vain to set up over UDP
     last_request monotonic time of its last complete request, s; before the first, of its start; see `note_request`
     peer         its IP address and port
     closed       whether it was told to close
@@ -53,6 +54,7 @@ class RtspConnection:
         self.viewer = StreamViewer(connection.get_ip(), since=time.monotonic())
         self.cameras: dict[str, GstRtspServer.RTSPStreamTransport | None] = {}
         self.described = ""
+        self.refused_udp: set[str] = set()
         self.opening = self.interleaved = False
         self.last_request = self._began = self._writable = time.monotonic()
         self._buffer = self._received = 0

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
-from gi.repository import Gst, GstSdp
+from gi.repository import Gst, GstRtsp, GstSdp
 
 from runner.graph import Plan, video_codec
 from runner.gst.arriving import NTP_EPOCH_S
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 STALL_S = 2.0  # a camera that should send but neither sends nor answers for longer is rebuilt
 DIALLED_STALL_S = 1.0  # likewise where the vehicle dials: it calls again, but a listener keeps its first caller
+OVER_TCP = "over TCP, since UDP was refused: are the vehicle's media.rtp_ports in use?"
 GRACE_S = 0.75  # time for the first frame once a camera is expected to send
 
 
@@ -118,6 +119,7 @@ class Receiver:
         self._repairs = bool(settings.get("retransmission_ms"))
         self._buffers: list[RepairBuffer] = []
         self._over_udp = self._feedback = False  # transport and profile of the session
+        self._may_use_udp = False  # until it is known which the session uses
         self._on_unit, self._on_picture = on_unit, on_picture
         self._name = name = plan.camera.name
         self._codec = video_codec(plan.camera.graph)
@@ -151,6 +153,7 @@ class Receiver:
     def sample(self) -> Reception:
         """Reception so far; requests the latency of the next frame."""
         waits = [buffer.adapt() for buffer in self._buffers if self._is_repaired]
+        self._report_transport()
         received = self._count()
         waited = [ms for buffer in self._buffers if (ms := buffer.waited_ms()) is not None]
         received = replace(
@@ -178,6 +181,13 @@ class Receiver:
             return received
         self._next_picture.arm()
         return received
+
+    def _report_transport(self) -> None:
+        """Say it if UDP was wanted: over TCP a late packet holds back all that follow."""
+        if self._begun and self._may_use_udp:
+            self._may_use_udp = False
+            if not self._over_udp:
+                self._on_report(self._name, OVER_TCP)
 
     def _has_stalled(self, now: float) -> bool:
         return now - self._progress[1] > self._stall_s and now - self._last_unexpected > GRACE_S
@@ -246,7 +256,9 @@ class Receiver:
         pipeline.connect("deep-element-added", self._on_element)
         if self._login and (problem := self._login.prepare(pipeline, self._client)):
             self._on_report(self._name, problem)
+        self._may_use_udp = False
         if is_rtsp_client(self._client):
+            self._may_use_udp = bool(self._client.get_property("protocols") & GstRtsp.RTSPLowerTrans.UDP)
             prefer_feedback(self._client, self._on_profile)
             handle_stream_end(self._client, self._on_source_gone)
             limit_teardown(pipeline)

@@ -487,6 +487,8 @@ class CameraServer:
                 self._viewers.viewer(new_viewer.certificate) if self._viewers else operator_of(_user_agent(context))
             )
             new_viewer.identify(operator)
+            if _wants_udp(context):
+                new_viewer.refused_udp.add(camera.name)  # until it is set up
             if camera.name in new_viewer.cameras:
                 return OK
             current = [c for c in self._connections.values() if camera.name in c.cameras]
@@ -503,9 +505,14 @@ class CameraServer:
         connection = self._connection(client)
         if connection is None:
             return
-        connection.cameras[_camera_name(context)] = context.trans
+        name = _camera_name(context)
+        connection.cameras[name] = context.trans
         if context.trans.get_transport().lower_transport & GstRtsp.RTSPLowerTrans.TCP:
             connection.carry_video()
+            if name in connection.refused_udp:
+                first, last = self._media.rtp_ports
+                self._on_report(name, f"over TCP, UDP ports {first}-{last} are in use")
+        connection.refused_udp.discard(name)
 
     def _on_playing(self, client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext) -> None:
         self._wake({_camera_name(context)})
@@ -761,6 +768,15 @@ def _has_password(context: GstRtspServer.RTSPContext) -> bool:
         return bool(context.request.get_header(GstRtsp.RTSPHeaderField.AUTHORIZATION, 0)[0] == GstRtsp.RTSPResult.OK)
     except UnicodeDecodeError:
         return True
+
+
+def _wants_udp(context: GstRtspServer.RTSPContext) -> bool:
+    """Whether a SETUP requests packets over UDP, to this client alone."""
+    try:
+        wanted = context.request.get_header(GstRtsp.RTSPHeaderField.TRANSPORT, 0)[1] or ""
+    except UnicodeDecodeError:
+        return False
+    return "client_port" in wanted
 
 
 def _user_agent(context: GstRtspServer.RTSPContext) -> str | None:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from contextlib import contextmanager
+import socket
+from contextlib import ExitStack, contextmanager
 from statistics import median
 
 import pytest
 
 from rig import over_tcp, streaming, until
 from runner.core.commands import Command
+from runner.gst.receiver import OVER_TCP
 
 pytestmark = pytest.mark.gst
 CAMERA = "rear"
@@ -51,3 +53,15 @@ def test_a_picture_does_not_wait_for_the_next_one(tcp):
 
         until(enough, every_s=0.1)
         assert median(latencies) < 100
+
+
+def test_a_viewer_that_falls_back_to_tcp_is_named():
+    """Another program holds the ports for RTP."""
+    with ExitStack() as stack:
+        for port in range(28000, 28006):
+            stack.enter_context(socket.socket(type=socket.SOCK_DGRAM)).bind(("127.0.0.1", port))
+        _, operator, _, reported = stack.enter_context(driving("media.rtp_ports=[28000,28005]"))
+        until(lambda: received(operator).frames > 5, every_s=0.1)
+        until(
+            lambda: {"rear: over TCP, UDP ports 28000-28005 are in use", f"operator: rear: {OVER_TCP}"} <= set(reported)
+        )
