@@ -75,6 +75,8 @@ def on_element(pipeline: Gst.Bin, parent: Gst.Bin, element: Gst.Element, built: 
     if factory == "srtpenc":
         set_master_key(element)
     camera = built()
+    if factory == "rtprtxsend":
+        element.set_property("max-size-packets", 0)  # packets are kept by time alone; by default, the last 100 at most
     if camera and factory == "rtprtxsend":
         camera.requests.add_store(element)
     if camera and factory == "rtpsession":

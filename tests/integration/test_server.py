@@ -15,7 +15,7 @@ from contextlib import ExitStack, contextmanager, suppress
 
 import pytest
 
-from rig import SMALL_FRONT, answers, streaming, until
+from rig import NOISE, SMALL_FRONT, answers, streaming, until
 from rtsp_client import RtspClient
 from runner.core.commands import Command
 from runner.gst import GLib, Gst
@@ -672,6 +672,31 @@ def test_a_viewer_that_requests_everything_again_gets_half_of_it():
         assert 0 < repeated <= AT_ONCE + REPEATED * (viewer.sources[own] + 10)
         limited = "viewers request too many packets again; some requests are ignored"
         assert vehicle.reported == [f"{CAMERA}: pipeline built", f"{CAMERA}: {limited}"]
+
+
+def test_a_packet_is_sent_again_as_long_as_the_graph_says():
+    """However many packets there are: here about as many a second as 8 Mbit/s have at the usual size."""
+    with serving(*NOISE, "graph.mtu_bytes=200") as vehicle, RtspClient(vehicle.url(CAMERA)) as viewer:
+        vehicle.turn(bitrate=1300)
+        assert viewer.open(udp=True, feedback=True) == [200, 200, 200]
+        viewer.read()
+
+        def repeated():
+            own = next(iter(viewer.sources))
+            return viewer.sources.total() - viewer.sources[own]
+
+        def is_repeated(age_s):
+            before, sent = repeated(), time.monotonic() - age_s
+            number = next(number for at, number, _ in reversed(viewer.packets) if at < sent)
+            viewer.send_feedback(205, 1, next(iter(viewer.sources)), struct.pack(">HH", number, 0))
+            time.sleep(0.3)
+            return repeated() > before
+
+        until(lambda: viewer.packets and viewer.packets[-1][0] - viewer.packets[0][0] > 1)
+        began = time.monotonic()
+        assert [is_repeated(age_s) for age_s in (0.1, 0.3, 0.8)] == [True, True, False]
+        passed = sum(at > began for at, _, _ in viewer.packets)
+        assert passed / (time.monotonic() - began) > 100 / 0.3
 
 
 def test_requests_for_key_frames_reach_the_encoder_once_a_second():
