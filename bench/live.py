@@ -1,4 +1,4 @@
-"""Cost of a change while playing: figures for commands, resolution changes and bitrate steps over real RTSP.
+"""Cost of a change while playing, and latency by transport: commands, sizes and bitrate steps over real RTSP.
 
   python bench/live.py                       everything, about two minutes
   python bench/live.py --clip CLIP.mp4       steps on your own clip; by default on the synthetic drive
@@ -27,10 +27,11 @@ from runner.core.commands import Command
 from runner.core.model import Vehicle
 from runner.gst import Gst, knobs
 from runner.gst.caps import structure
+from runner.gst.receiver import capture_time
 from runner.plans import compile_plans, render_missing
 
 PORT = 18554
-Sample = tuple[float, int, int, int]  # time, width, height, bytes
+Sample = tuple[float, int, int, int, float | None]  # time, width, height, bytes, capture time
 
 
 def main() -> None:
@@ -44,7 +45,8 @@ def main() -> None:
 
 def rows(source: Sequence[str] = ("source=synthetic",), rounds: int = 60) -> list[Row]:
     steps = (row for fps in (15, 40) for row in bitrate_step(source, fps))
-    return [*command_latency(source, rounds), *size_change(source, rounds), *steps]
+    latencies = (row for fps in (15, 40) for row in latency(source, fps))
+    return [*command_latency(source, rounds), *size_change(source, rounds), *steps, *latencies]
 
 
 def command_latency(source: Sequence[str], rounds: int) -> Iterator[Row]:
@@ -109,6 +111,19 @@ def bitrate_step(source: Sequence[str], fps: int) -> Iterator[Row]:
         yield Row(f"4000 -> 1000 at {fps} Hz, {what}: first 0.5 s", early / 1000, "of 1000", note=note)
 
 
+def latency(source: Sequence[str], fps: int) -> Iterator[Row]:
+    """From the capture of a picture to its decoded frame, by the transport of its packets."""
+    vehicle = _one_camera(source, fps)
+    for transport in ("udp", "tcp"):
+        with _streaming(vehicle) as side, _client(vehicle, transport) as (samples, _):
+            side.turn([Command("front_left", "size", (960, 520)), Command("front_left", "bitrate", 2000)])
+            _until(lambda samples=samples: len(samples) > fps)
+            start = len(samples)
+            time.sleep(5)
+        waits = [1000 * (s[0] - s[4]) for s in samples[start:] if s[4] is not None]
+        yield spread(f"capture to decoded picture at {fps} Hz over {transport.upper()}", waits, "ms")
+
+
 # --- parts ------------------------------------------------------------------------------------------------------------
 
 
@@ -150,10 +165,11 @@ def _operator(overrides: Sequence[str]) -> Iterator[None]:
 
 
 @contextmanager
-def _client(vehicle: Vehicle) -> Iterator[tuple[list[Sample], list[str]]]:
+def _client(vehicle: Vehicle, transport: str = "udp+tcp") -> Iterator[tuple[list[Sample], list[str]]]:
     """Decodes the one camera and records each frame; bytes are those of the access unit before it."""
     (plan,) = compile_plans(vehicle)
     pipeline = Gst.parse_launch(plan.receiver)
+    Gst.util_set_object_arg(pipeline.get_by_name(plan.operator[0].name), "protocols", transport)
     samples: list[Sample] = []
     errors: list[str] = []
     sizes: list[int] = []
@@ -162,10 +178,10 @@ def _client(vehicle: Vehicle) -> Iterator[tuple[list[Sample], list[str]]]:
         sizes.append(info.get_buffer().get_size())
         return Gst.PadProbeReturn.OK
 
-    def on_frame(pad: Any, _info: Any) -> Any:
+    def on_frame(pad: Any, info: Any) -> Any:
         picture = structure(pad.get_current_caps())
         width, height = picture.get_int("width")[1], picture.get_int("height")[1]
-        samples.append((time.time(), width, height, sizes[-1]))
+        samples.append((time.time(), width, height, sizes[-1], capture_time(info.get_buffer())))
         return Gst.PadProbeReturn.OK
 
     def on_message(_bus: Any, message: Any) -> Any:
