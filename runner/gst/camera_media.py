@@ -32,8 +32,8 @@ class CameraFactory(GstRtspServer.RTSPMediaFactory):  # type: ignore[misc]  # Py
         self.set_shared(True)  # otherwise a second viewer takes the pipeline from the first
         self.set_latency(0)
         self.set_address_pool(addresses)
-        if int(settings.get("dscp", -1)) >= 0:
-            self.set_dscp_qos(int(settings["dscp"]))
+        if dscp_of(plan) >= 0:
+            self.set_dscp_qos(dscp_of(plan))
         if permissions:
             self.set_permissions(permissions)
         plain, feedback = _profiles(permissions is not None)
@@ -45,6 +45,11 @@ class CameraFactory(GstRtspServer.RTSPMediaFactory):  # type: ignore[misc]  # Py
 
     def do_gen_key(self, _url: GstRtsp.RTSPUrl) -> str:
         return "media"
+
+
+def dscp_of(plan: Plan) -> int:
+    """DiffServ code point of a camera's packets; -1 leaves it to the system."""
+    return int(plan.camera.graph.settings.get("dscp", -1))
 
 
 def _profiles(secure: bool) -> tuple[GstRtsp.RTSPProfile, GstRtsp.RTSPProfile]:

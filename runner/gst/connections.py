@@ -90,10 +90,18 @@ class RtspConnection:
     def identify(self, operator: str | None) -> None:
         self.viewer = self.viewer._replace(operator=operator or "")
 
-    def carry_video(self) -> None:
-        """Prepare for interleaved video: the kernel closes the connection when data is no longer acknowledged."""
+    def carry_video(self, dscp: int) -> None:
+        """Prepare for interleaved video: the kernel closes the connection when data is no longer acknowledged.
+
+        dscp  DiffServ code point of its packets; -1 leaves it to the system
+        """
         self.interleaved = True
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, USER_TIMEOUT_MS)
+        if dscp < 0:
+            return
+        if self._socket.family == socket.AF_INET6:
+            self._socket.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_TCLASS, dscp << 2)
+        self._socket.setsockopt(socket.IPPROTO_IP, socket.IP_TOS, dscp << 2)  # of IPv4 over an IPv6 socket, too
 
     def lag(self, kbps: int, shared: bool) -> float:
         """Age of the oldest byte that the peer has not acknowledged, s; to be called a few times a second.

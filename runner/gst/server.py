@@ -23,7 +23,7 @@ from gi.repository import GLib, GObject, Gst, GstRtsp, GstRtspServer
 from runner.core.model import Media
 from runner.errors import RunError
 from runner.graph import Plan, rtsp_url
-from runner.gst.camera_media import CameraFactory, address_pool, on_element
+from runner.gst.camera_media import CameraFactory, address_pool, dscp_of, on_element
 from runner.gst.connections import RtspConnection
 from runner.gst.lost import LostCameras
 from runner.gst.memory import give_back
@@ -31,7 +31,7 @@ from runner.gst.pipeline import Build, CameraPipeline
 from runner.gst.timers import every
 from runner.gst.video_files import concerns_file
 from runner.gst.viewers import admit, operator_of, over_uplink
-from runner.system.ports import check_port_free
+from runner.system.ports import check_port_free, ip_address_of
 from runner.system.reports import LimitedReports
 
 if TYPE_CHECKING:
@@ -508,10 +508,12 @@ class CameraServer:
         name = _camera_name(context)
         connection.cameras[name] = context.trans
         if context.trans.get_transport().lower_transport & GstRtsp.RTSPLowerTrans.TCP:
-            connection.carry_video()
+            connection.carry_video(dscp_of(self._cameras[name].plan))
             if name in connection.refused_udp:
                 first, last = self._media.rtp_ports
-                self._on_report(name, f"over TCP, UDP ports {first}-{last} are in use")
+                is_ipv4_at_ipv6 = "." in connection.viewer.address and ":" in ip_address_of(self._media.host)
+                fault = "IPv6 only" if is_ipv4_at_ipv6 else "in use"
+                self._on_report(name, f"over TCP, UDP ports {first}-{last} are {fault}")
         connection.refused_udp.discard(name)
 
     def _on_playing(self, client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext) -> None:

@@ -15,6 +15,7 @@ from hashlib import md5
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 from runner.security.keyring import Keyring, rtsp_password
 
@@ -83,16 +84,18 @@ class RtspClient:
         keys: Path | None = None,
         vehicle: str = "delivery_robot",
     ) -> None:
-        host, port = re.match(r"rtsps?://([^:/]+):(\d+)", url).groups()  # type: ignore[union-attr]
+        host, port = urlsplit(url).hostname, urlsplit(url).port
+        assert host and port
         self.url, self._agent = url, agent
         self._login = Digest(keys, vehicle) if keys else None
-        self.tcp = socket.socket()
+        self._family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        self.tcp = socket.socket(self._family)
         self.tcp.settimeout(10)
         self.tcp.bind((source, 0))
         if small:
             self.tcp.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
             self.tcp.setsockopt(socket.IPPROTO_TCP, socket.TCP_MAXSEG, 1400)
-        self.tcp.connect(at or (host, int(port)))
+        self.tcp.connect(at or (host, port))
         self._tls = tls(keys).wrap_socket(self.tcp) if keys else None
         self.tcp = self._tls or self.tcp
         self._lock = threading.Lock()  # OpenSSL's connections serve one thread at a time
@@ -135,7 +138,8 @@ class RtspClient:
         codes = [self.ask("DESCRIBE", Accept="application/sdp")]
         base = re.search(r"Content-Base: (\S+?)/*\r", self.head)
         if codes == [200]:
-            codes.append(self.ask("SETUP", f"{base[1]}/stream=0", Transport=self._transport(udp, feedback)))  # type: ignore[index]
+            profile = ("RTP/SAVP" if self._login else "RTP/AVP") + ("F" if feedback else "")
+            codes.append(self.ask("SETUP", f"{base[1]}/stream=0", Transport=self.transport(profile, udp=udp)))  # type: ignore[index]
         if codes == [200, 200]:
             codes.append(self.ask("PLAY", **play))
         return codes
@@ -197,16 +201,16 @@ class RtspClient:
     def __exit__(self, *_: Any) -> None:
         self.close()
 
-    def _transport(self, udp: bool, feedback: bool) -> str:
-        profile = ("RTP/SAVP" if self._login else "RTP/AVP") + ("F" if feedback else "")
+    def transport(self, profile: str, *, udp: bool, channel: int = 0) -> str:
+        """The header of a SETUP, with the first of two channels over TCP, or with new sockets."""
         if not udp:
-            return f"{profile}/TCP;unicast;interleaved=0-1"
+            return f"{profile}/TCP;unicast;interleaved={channel}-{channel + 1}"
         for _ in range(2):
-            self._rtp.append(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+            self._rtp.append(socket.socket(self._family, socket.SOCK_DGRAM))
             # A reader that a busy machine delays must not lose packets.
             self._rtp[-1].setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4_000_000)
             self._rtp[-1].bind((self.tcp.getsockname()[0], 0))
-        ports = [sock.getsockname()[1] for sock in self._rtp]
+        ports = [sock.getsockname()[1] for sock in self._rtp[-2:]]
         return f"{profile};unicast;client_port={ports[0]}-{ports[1]}"
 
     def _answer(self) -> int:

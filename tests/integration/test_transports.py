@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import socket
+import struct
 from contextlib import ExitStack, contextmanager
 from statistics import median
 
 import pytest
 
-from rig import over_tcp, streaming, until
+from rig import needs_root, over_tcp, streaming, until
+from rtsp_client import RtspClient
 from runner.core.commands import Command
 from runner.gst.receiver import OVER_TCP
 
@@ -65,3 +67,48 @@ def test_a_viewer_that_falls_back_to_tcp_is_named():
         until(
             lambda: {"rear: over TCP, UDP ports 28000-28005 are in use", f"operator: rear: {OVER_TCP}"} <= set(reported)
         )
+
+
+@needs_root  # to see packets as they are sent
+@pytest.mark.parametrize(
+    ("host", "udp"),
+    [
+        ("::", False),  # an IPv6 socket for both
+        *(
+            pytest.param(host, udp, marks=[pytest.mark.soak, pytest.mark.players])
+            for host in ("127.0.0.1", "::1")
+            for udp in (False, True)
+        ),
+    ],
+)
+def test_packets_carry_the_dscp_of_the_graph(host, udp):
+    with (
+        socket.socket(socket.AF_PACKET, socket.SOCK_DGRAM, socket.htons(0x0003)) as seen,
+        streaming(*SMALL, f'media.host="{host}"', "graph.dscp=46", cameras=(CAMERA,)) as (side, vehicle, _, _),
+    ):
+        seen.bind(("lo", 0))
+        side.turn([Command(CAMERA, "sending", True), Command(CAMERA, "bitrate", 300)])
+        addresses = {"::": ("::1", "127.0.0.1")}.get(host, (host,))
+        for address in addresses:
+            named = f"[{address}]" if ":" in address else address
+            with RtspClient(f"rtsp://{named}:{vehicle.media.port}/{CAMERA}") as viewer:
+                assert viewer.open(udp=udp) == [200, 200, 200]
+                port = viewer.server_port if udp else vehicle.media.port
+                viewer.read()
+                until(lambda v=viewer: v.frames > 5)
+            assert 46 in codes(seen, port, 6 if ":" in address else 4), address
+
+
+def codes(seen, port, version):
+    """DiffServ code points of the packets of some size that a port has sent over a version of IP."""
+    found = set()
+    seen.setblocking(False)
+    while True:
+        try:
+            packet = seen.recv(65_536)
+        except BlockingIOError:
+            return found
+        head = 40 if version == 6 else 4 * (packet[0] & 15)
+        if packet[0] >> 4 == version and len(packet) > 300 and packet[head : head + 2] == struct.pack(">H", port):
+            word = int.from_bytes(packet[:2], "big") >> 4 if version == 6 else packet[1]
+            found.add((word & 0xFF) >> 2)
