@@ -82,6 +82,7 @@ _FILE_SINK = Element(
 )
 _COUNTERS = {"vehicle": "sent", "operator": "received"}  # by side, the identity that the tee follows
 CODECS = ("h264", "h265")  # supported in video files and on the operator's page
+FEEDBACK = "feedback"  # second part of a camera's path on the RTSP server: the same stream, with feedback
 _FROZEN_INTERVALS = 10  # frame intervals, so that a low frame rate does not count as frozen
 
 
@@ -306,8 +307,10 @@ def shell(elements: Iterable[Element]) -> str:
     return " ! ".join(" ".join(map(shlex.quote, _tokens(element, str))) for element in elements)
 
 
-def rtsp_url(media: Media, camera: str) -> str:
-    return f"{'rtsps' if media.secure else 'rtsp'}://{media}/{camera}"
+def rtsp_url(media: Media, camera: str, *, feedback: bool = False) -> str:
+    """Where a vehicle serves a camera; with feedback, to clients that request lost packets again (RFC 4585)."""
+    path = f"{camera}/{FEEDBACK}" if feedback else camera
+    return f"{'rtsps' if media.secure else 'rtsp'}://{media}/{path}"
 
 
 def video_codec(graph: Graph) -> str:
@@ -402,7 +405,7 @@ def _values(camera: Camera, media: Media, index: int, clip: str | None) -> dict[
         "capture_caps": _capture_caps(camera.capture),
         "controls": _controls(camera.capture),
         "host": media.host,
-        "url": rtsp_url(media, camera.name),
+        "url": rtsp_url(media, camera.name, feedback=bool(camera.graph.settings.get("retransmission_ms"))),
         "port": port,
         "endpoint": str(Endpoint(media.host, port)),
     }

@@ -53,8 +53,8 @@ def test_the_server_of_front_left() -> None:
 
 def test_the_receiver_of_front_left() -> None:
     assert plan().receiver == (
-        "rtspsrc name=client location=rtsp://127.0.0.1:8554/front_left latency=40 tcp-timeout=1000000 timeout=0 "
-        f"do-retransmission=true add-reference-timestamp-meta=true ! {DECODE}"
+        "rtspsrc name=client location=rtsp://127.0.0.1:8554/front_left/feedback latency=40 tcp-timeout=1000000 "
+        f"timeout=0 do-retransmission=true add-reference-timestamp-meta=true ! {DECODE}"
     )
 
 
@@ -259,6 +259,7 @@ def test_values_as_gstreamer_reads_them(value: Any, expected: str) -> None:
 
 def test_the_url_of_a_camera() -> None:
     assert rtsp_url(MEDIA, "front_left") == "rtsp://127.0.0.1:8554/front_left"
+    assert rtsp_url(MEDIA, "front_left", feedback=True) == "rtsp://127.0.0.1:8554/front_left/feedback"
     assert rtsp_url(replace(MEDIA, host="fd00::2"), "front_left") == "rtsp://[fd00::2]:8554/front_left"
 
 

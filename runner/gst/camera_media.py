@@ -1,13 +1,14 @@
-"""What the RTSP server's library is told about a camera: its factory, its addresses, and the elements around it."""
+"""What the RTSP server's library is told about a camera: its factory, its description, and the elements around it."""
 
 from __future__ import annotations
 
+import threading
 import weakref
 
-from gi.repository import Gst, GstRtsp, GstRtspServer
+from gi.repository import Gst, GstRtsp, GstRtspServer, GstSdp
 
 from runner.core.model import Media
-from runner.graph import Plan
+from runner.graph import FEEDBACK, Plan
 from runner.gst.patient_media import PatientMedia
 from runner.gst.pipeline import CameraPipeline
 from runner.gst.srtp import set_master_key
@@ -16,8 +17,42 @@ from runner.system.ports import ip_address_of
 QUEUE_BYTES = 2_000_000  # more than a viewer may lag at any bitrate
 
 
-class CameraFactory(GstRtspServer.RTSPMediaFactory):  # type: ignore[misc]  # PyGObject has no types
-    """A camera's factory, with one media for all URLs of the camera: another port, a trailing slash or a query.
+_SECURE = GstRtsp.RTSPProfile.SAVP | GstRtsp.RTSPProfile.SAVPF
+# By thread, whether the client whose DESCRIBE it is answering wants feedback. The library tells a media neither the
+# client nor the path, but answers each request in one thread.
+_feedback: dict[int, bool] = {}
+
+
+def describe_for(path: str) -> None:
+    """Note the path of a DESCRIBE, without slashes at its ends, for the description that follows in this thread."""
+    _feedback[threading.get_ident()] = wants_feedback(path)
+
+
+def wants_feedback(path: str) -> bool:
+    """Whether a path, without slashes at its ends, is that of clients which give feedback."""
+    return path.endswith(f"/{FEEDBACK}")
+
+
+class CameraMedia(PatientMedia):
+    """A camera's media, described to each client with the one profile that it wants.
+
+    The library would list the stream once for each of its profiles. Clients that set up whatever is listed then wait
+    for a second stream, which stays empty: ffmpeg for 5 s before its first picture.
+    """
+
+    def do_setup_sdp(self, sdp: GstSdp.SDPMessage, info: GstRtspServer.SDPInfo) -> bool:
+        stream, is_wanted = self.get_stream(0), _feedback.pop(threading.get_ident(), False)
+        caps, offered = stream.get_caps(), stream.get_profiles()
+        if caps is None:
+            return False
+        plain, feedback = _profiles(bool(offered & _SECURE))
+        sdp.add_attribute("range", self.get_range_string(False, GstRtsp.RTSPRangeUnit.NPT))
+        wanted = feedback if is_wanted and offered & feedback else plain
+        return bool(GstRtspServer.rtsp_sdp_make_media(sdp, info, stream, caps, wanted))
+
+
+class CameraFactory(GstRtspServer.RTSPMediaFactory):  # type: ignore[misc]
+    """A camera's factory, with one media for all URLs of the camera: another port, a trailing slash, or with feedback.
 
     permissions  of viewers; None: anyone may watch, and nothing is encrypted
     """
@@ -27,8 +62,8 @@ class CameraFactory(GstRtspServer.RTSPMediaFactory):  # type: ignore[misc]  # Py
     ) -> None:
         super().__init__()
         settings = plan.camera.graph.settings
+        self.set_media_gtype(CameraMedia.__gtype__)
         self.set_launch(plan.server)
-        self.set_media_gtype(PatientMedia.__gtype__)
         self.set_shared(True)  # otherwise a second viewer takes the pipeline from the first
         self.set_latency(0)
         self.set_address_pool(addresses)

@@ -235,8 +235,8 @@ class Receiver:
     def _is_repaired(self) -> bool:
         return self._repairs and self._over_udp and self._feedback
 
-    def _on_profile(self, profile: str) -> None:
-        self._feedback = profile.endswith("AVPF")
+    def _on_description(self, _client: Gst.Element, sdp: GstSdp.SDPMessage) -> None:
+        self._feedback = sdp.medias_len() > 0 and sdp.get_media(0).get_proto().endswith("AVPF")
 
     def _on_built(self, pipeline: Gst.Pipeline) -> Gst.Pad:
         self._before = self._count() if self._built else Reception()
@@ -259,7 +259,7 @@ class Receiver:
         self._may_use_udp = False
         if is_rtsp_client(self._client):
             self._may_use_udp = bool(self._client.get_property("protocols") & GstRtsp.RTSPLowerTrans.UDP)
-            prefer_feedback(self._client, self._on_profile)
+            self._client.connect("on-sdp", self._on_description)
             handle_stream_end(self._client, self._on_source_gone)
             limit_teardown(pipeline)
             opening = Opening()
@@ -391,24 +391,6 @@ class Receiver:
 def _captured(_pad: Gst.Pad, unit: PassingBuffer) -> float | None:
     reference_ns = unit.reference_ns
     return None if reference_ns is None else unix_s(reference_ns)
-
-
-def prefer_feedback(client: Gst.Element, on_profile: Callable[[str], None] = lambda profile: None) -> None:
-    """Make an RTSP client choose the profile with retransmission of lost packets (RFC 4585, 4588).
-
-    A server that offers both profiles lists the stream twice; by default the client uses the first, without feedback.
-
-    on_profile  called with the profile chosen
-    """
-    chosen = [0]
-
-    def on_sdp(_client: Gst.Element, sdp: GstSdp.SDPMessage) -> None:
-        profiles = [sdp.get_media(number).get_proto() for number in range(sdp.medias_len())]
-        chosen[0] = next((number for number, profile in enumerate(profiles) if profile.endswith("AVPF")), 0)
-        on_profile(profiles[chosen[0]] if profiles else "")
-
-    client.connect("on-sdp", on_sdp)
-    client.connect("select-stream", lambda _client, number, _caps: number == chosen[0])
 
 
 def capture_time(buffer: Gst.Buffer) -> float | None:

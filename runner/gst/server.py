@@ -22,8 +22,8 @@ from gi.repository import GLib, GObject, Gst, GstRtsp, GstRtspServer
 
 from runner.core.model import Media
 from runner.errors import RunError
-from runner.graph import Plan, rtsp_url
-from runner.gst.camera_media import CameraFactory, address_pool, dscp_of, on_element
+from runner.graph import FEEDBACK, Plan, rtsp_url
+from runner.gst.camera_media import CameraFactory, address_pool, describe_for, dscp_of, on_element
 from runner.gst.connections import RtspConnection
 from runner.gst.lost import LostCameras
 from runner.gst.memory import give_back
@@ -126,7 +126,7 @@ class _Camera:
 
 
 class CameraServer:
-    """RTSP server with one mount point per camera.
+    """RTSP server with one mount point per camera, and a second one with feedback, which our own receivers use.
 
     build      makes a `CameraPipeline` from each new pipeline
     lost       cameras that do not open: each is opened again when that is due
@@ -181,7 +181,8 @@ class CameraServer:
         self._addresses = address_pool(media)
         self._cameras = {plan.camera.name: self._camera(plan) for plan in plans}
         for name, camera in self._cameras.items():
-            self._server.get_mount_points().add_factory(f"/{name}", camera.factory)
+            for path in (name, f"{name}/{FEEDBACK}"):
+                self._server.get_mount_points().add_factory(f"/{path}", camera.factory)
         self._attached = self._server.attach(None)
         if not self._attached:
             raise RunError(f"the RTSP server cannot listen on {media}; choose another media.port")
@@ -423,7 +424,8 @@ class CameraServer:
     def _on_describe(
         self, client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext
     ) -> GstRtsp.RTSPStatusCode:
-        camera, connection = self._cameras.get(_path(context)), self._connection(client)
+        name, _, kind = _path(context).partition("/")
+        camera, connection = self._cameras.get(name) if kind in ("", FEEDBACK) else None, self._connection(client)
         if connection and self._viewers:
             connection.read_certificate(client)
         withdrawn = self._viewers.withdrawn(connection and connection.certificate) if self._viewers else None
@@ -448,6 +450,7 @@ class CameraServer:
             connection.described = camera.name
             if self._viewers:  # until the library has accepted its password
                 connection.refusal = WRONG_PASSWORD if _has_password(context) else NO_PASSWORD
+        describe_for(_path(context))
         return OK
 
     def _redirect(self, client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext) -> None:
@@ -693,8 +696,7 @@ def _end_other(client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPCont
     """End what a connection has set up of the requested camera in other sessions; False if it is being sent a copy.
 
     The library would not end that copy: it would go on after the viewer has left, and nobody would count it. A camera
-    that is not being sent may be set up again: ffmpeg does so for each profile in the description, and in a new session
-    when it pauses UDP to try TCP.
+    that is not being sent may be set up again: ffmpeg does so in a new session when it pauses UDP to try TCP.
     """
     held = [(session, media) for session, media in _set_up(client) if media.get_media() is context.media]
     sent = context.stream.transport_filter(None)
@@ -745,7 +747,7 @@ def _on_session_removed(_pool: object, session: GstRtspServer.RTSPSession) -> No
 
 
 def _camera_name(context: GstRtspServer.RTSPContext) -> str:
-    """First component of the path of a request's URL: the camera, if valid; in SETUP a stream follows it."""
+    """First component of the path of a request's URL: the camera, if valid; `FEEDBACK` and a stream may follow it."""
     return _path(context).partition("/")[0]
 
 

@@ -22,10 +22,11 @@ from typing import Any
 import pytest
 
 from runner.errors import RunError
-from runner.graph import Plan
+from runner.graph import FEEDBACK, Plan
 from runner.link.netns import _check_allowed
 from runner.operator.station import Listener
 from runner.records import Note, Sample, VehicleState, state_to_json, to_json
+from runner.security.keyring import Keyring
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 SHARED = Path(os.environ.get("TOD_SHARED_DATA", CHECKOUT.parent / "shared" / "data"))
@@ -300,7 +301,6 @@ class Operator:
         from runner.mqtt.link import ControlLink
         from runner.mqtt.login import Login
         from runner.mqtt.messages import OPERATOR_GONE, read_state, topic
-        from runner.security.keyring import Keyring
 
         login = Login(Keyring(keys), print) if keys else None
         self.name = login.user if login else name or f"op{free_port()}"
@@ -393,7 +393,9 @@ def process(
 
 
 @contextmanager
-def streaming(*overrides: str, cameras: Sequence[str] = ("front_left",)) -> Iterator[Any]:
+def streaming(
+    *overrides: str, cameras: Sequence[str] = ("front_left",), keyring: Keyring | None = None
+) -> Iterator[Any]:
     """Some cameras of a vehicle behind a real RTSP server. Yields (side, vehicle, plans, reports)."""
     from dataclasses import replace
 
@@ -406,7 +408,7 @@ def streaming(*overrides: str, cameras: Sequence[str] = ("front_left",)) -> Iter
     vehicle = replace(vehicle, cameras={name: vehicle.cameras[name] for name in cameras or vehicle.cameras})
     plans = compile_plans(vehicle)
     reported: list[str] = []
-    side = VehicleSide(plans, vehicle.media, lambda camera, what: reported.append(f"{camera}: {what}"))
+    side = VehicleSide(plans, vehicle.media, lambda camera, what: reported.append(f"{camera}: {what}"), keyring=keyring)
     try:
         yield side, vehicle, plans, reported
     finally:
@@ -422,10 +424,9 @@ class Client:
     def __init__(self, plan: Any, *, pictures: bool = False, feedback: bool = False) -> None:
         from runner.gst import Gst
         from runner.gst.caps import structure
-        from runner.gst.receiver import prefer_feedback
 
         self._gst, self._structure = Gst, structure
-        line = plan.receiver
+        line = plan.receiver if feedback else plan.receiver.replace(f"/{FEEDBACK} ", " ")
         if pictures:
             head, _, _ = line.rpartition(" ! ")
             sink = "appsink name=sink sync=false max-buffers=1 drop=true"
@@ -438,8 +439,6 @@ class Client:
             client = self.pipeline.get_by_name(element.name)
             if client and client.find_property("tcp-timeout"):  # as patient as the server: it does not reconnect
                 client.set_property("tcp-timeout", 20_000_000)
-            if client and feedback:
-                prefer_feedback(client)
         self._sink = self.pipeline.get_by_name("sink")
         self._sink.get_static_pad("sink").add_probe(Gst.PadProbeType.BUFFER, self._on_frame)
         self.pipeline.get_bus().set_sync_handler(self._on_message)
