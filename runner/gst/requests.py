@@ -59,7 +59,7 @@ class RequestLimit:
         self._key_unit: float | None = None  # when the last one was granted
         self._reported = False
         self._retransmissions = RequestProbe("GstRTPRetransmissionRequest", self._grant_retransmission)  # NACK
-        self._key_units = RequestProbe("GstForceKeyUnit", self._grant_key_unit)  # PLI, FIR
+        self._key_units = RequestProbe("GstForceKeyUnit", self.grant_key_unit)  # PLI, FIR
         self._key_units.add_to(packets)
 
     def add_store(self, element: Gst.Element) -> None:
@@ -94,7 +94,8 @@ class RequestLimit:
             self._by_viewer.popitem(last=False)
         return _Allowance(sent, first)
 
-    def _grant_key_unit(self) -> bool:
+    def grant_key_unit(self) -> bool:
+        """Whether a viewer may have a key frame now, which all others receive too."""
         now = time.monotonic()
         if self._key_unit is not None and now - self._key_unit < KEY_UNIT_S:
             return False

@@ -23,7 +23,7 @@ from gi.repository import GLib, GObject, Gst, GstRtsp, GstRtspServer
 from runner.core.model import Media
 from runner.errors import RunError
 from runner.graph import FEEDBACK, Plan, rtsp_url
-from runner.gst.camera_media import CameraFactory, address_pool, describe_for, dscp_of, on_element
+from runner.gst.camera_media import CameraFactory, address_pool, describe_for, dscp_of, on_element, wants_feedback
 from runner.gst.connections import RtspConnection
 from runner.gst.lost import LostCameras
 from runner.gst.memory import give_back
@@ -520,7 +520,12 @@ class CameraServer:
         connection.refused_udp.discard(name)
 
     def _on_playing(self, client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext) -> None:
-        self._wake({_camera_name(context)})
+        name = _camera_name(context)
+        self._wake({name})
+        # Players without feedback cannot request a key frame, and show nothing before they have seen a whole wave.
+        pipeline, joins = self.pipelines.get(name), len(self._watching(name)) > 1
+        if joins and pipeline and not wants_feedback(_path(context)) and pipeline.requests.grant_key_unit():
+            pipeline.send_key_frame()
 
     def _wake(self, cameras: Iterable[str]) -> None:
         """Make the library recheck which interleaved viewers are ready.
