@@ -99,11 +99,13 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         """Whether it is yet to start, or an IP camera still answers the first requests."""
         if not self._has_begun:
             return time.monotonic() - self._built < BEGIN_S
-        return bool(self._client and self._client.is_opening and not self._error)
+        client = self._client  # of a child that another thread may remove
+        return bool(client and client.is_opening and not self._error)
 
     def waiting(self, least_s: float) -> str | None:
         """For which answer of an IP camera it has waited so long; None if for none."""
-        asked = self._client and self._client.asked
+        client = self._client
+        asked = client and client.asked
         waited_s = time.monotonic() - asked[1] if asked else 0.0
         return f"waiting for the camera: {asked[0]}, {waited_s:.0f} s" if asked and waited_s >= least_s else None
 
@@ -134,8 +136,8 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
 
     def do_handle_message(self, message: Gst.Message) -> None:
         self._opening.handle(message)
-        if self._client:
-            self._client.follow(message)
+        if client := self._client:
+            client.follow(message)
         if message.type == Gst.MessageType.ERROR:
             self._on_error(message)
         if self._frames():
@@ -166,8 +168,8 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         error = message.parse_error()[0]
         if self._client and was_refused(error):
             self._login.refuse(message.src)
-        if self._decoders:
-            self._decoders.handle(error)
+        if decoders := self._decoders:
+            decoders.handle(error)
 
     def _set_error(self, what: str) -> None:
         self._error = self._error or (what, self._frames())  # the first one: others follow from it
@@ -202,12 +204,13 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
 
     def _note_waiting(self, now: float) -> None:
         """Report an answer that is late, once, and when it has come."""
-        asked = self._client.asked if self._client else None
+        client = self._client
+        asked = client.asked if client else None
         if asked and asked != self._late and (waiting := self.waiting(WAITING_S)):
             self._late = asked
             self._on_report(waiting)
-        elif self._late and self._client and asked != self._late:
-            if not self._client.has_failed:
+        elif self._late and client and asked != self._late:
+            if not client.has_failed:
                 self._on_report(f"the camera answered {self._late[0]} after {now - self._late[1]:.0f} s")
             self._late = None
 
@@ -216,7 +219,8 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         still_s = now - self._progress[1]
         if still_s <= self._frozen_s:
             return
-        if not self._error and self._decoders and self._decoders.suspects and still_s < self._frozen_s + DECODER_S:
+        decoders = self._decoders
+        if not self._error and decoders and decoders.suspects and still_s < self._frozen_s + DECODER_S:
             return  # the camera is not frozen: its decoder may soon be found to be at fault
         if self._is_idle():
             self.outage.report_failure(
