@@ -47,7 +47,6 @@ HABITS = {
     "no sender reports": Habits(ntp_shift=None),
     "key pictures 4 s apart, joined between two": Habits(encoder=ENCODER.replace("max=15", "max=60"), early=True),
     "no control of the session": Habits(description=(*SESSION, *VIDEO)),
-    "a base without scheme": Habits(content_base="127.0.0.1:554/stream/"),
     "a base without slash": Habits(content_base="{address}"),
     "no base": Habits(content_base=""),
     "absolute control": Habits(
