@@ -264,7 +264,8 @@ def test_video_is_encoded_again_with_key_frames(filmed, tmp_path):
     assert run("export", str(drive), f"output={plain}").returncode == 0
     done = run("export", str(drive), f"output={again}", "key_interval_s=0.5")
     assert done.returncode == 0, done.stderr
-    assert done.stderr.splitlines() == ["video is encoded again, with a key frame every 0.5 s: it is not what was sent"]
+    said = "video is encoded again, with a key frame every 0.5 s: it is not what was sent"
+    assert said in done.stderr.splitlines()
     for topic, (_, _, pictures) in messages(plain).items():
         if not topic.endswith("/video"):
             continue
@@ -454,7 +455,7 @@ def test_invalid_exports(tmp_path):
         ([f"{tmp_path}/empty"], f"{tmp_path}/empty: contains no drive log: neither drive.jsonl nor operator.jsonl"),
         (
             [str(drive), "mode=single"],
-            "command line: mode=single: unknown argument; expected one of output, format, conf",
+            "command line: mode=single: unknown argument; expected one of output, format, key_interval_s, conf",
         ),
         (
             [str(drive), f"output={tmp_path}/there.mcap"],
