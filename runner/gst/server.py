@@ -482,6 +482,10 @@ class CameraServer:
                 return FORBIDDEN
         if not _end_other(client, context):
             return NOT_NOW
+        # The library ends a media whose UDP it refuses, but its client then asks for TCP.
+        if camera and camera.is_open and _wants_udp(context) and context.media.prepare(None):
+            with self._changed:
+                self._holds.append((time.monotonic(), client, context.media))
         with self._changed:
             new_viewer = self._connections.get(client)
             if camera is None or new_viewer is None or not camera.is_open:
