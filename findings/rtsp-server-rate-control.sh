@@ -9,8 +9,10 @@
 # python3-gi 3.42.2-3+b1.
 # Output seen: "configured False, set up False, played True". Ends with another status than 0 if that changes.
 set -eu
+. "$(dirname "$0")/pinned"
+pinned libgstrtspserver-1.0-0=1.22.0-2 gir1.2-gst-rtsp-server-1.0=1.22.0-2 gstreamer1.0-plugins-good=1.22.0-5+deb12u4
 seen=$(timeout 60 /usr/bin/python3 - <<'PYTHON'
-import socket, threading
+import socket, threading, time
 import gi
 gi.require_version("Gst", "1.0")
 gi.require_version("GstRtspServer", "1.0")
@@ -47,7 +49,7 @@ answer = ask(2, "SETUP", f"{base}/stream=0", "Transport: RTP/AVP/TCP;unicast;int
 session = next(line for line in answer.splitlines() if line.startswith("Session: ")).partition(";")[0]
 ask(3, "PLAY", f"{base}/", session)
 while len(found) < 3:
-    pass
+    time.sleep(0.01)
 print(", ".join(found))
 PYTHON
 )

@@ -10,6 +10,8 @@
 # python3-gi 3.42.2-3+b1.
 # Output seen: "3 pipelines for one viewer". Ends with another status than 0 if that changes.
 set -eu
+. "$(dirname "$0")/pinned"
+pinned libgstrtspserver-1.0-0=1.22.0-2 gir1.2-gst-rtsp-server-1.0=1.22.0-2 gstreamer1.0-plugins-good=1.22.0-5+deb12u4
 seen=$(timeout 60 /usr/bin/python3 - <<'PYTHON'
 import socket, threading, time
 import gi

@@ -1,25 +1,21 @@
-#!/bin/sh
+#!/usr/bin/env bash
 # openh264enc's max-bitrate ("Maximum Bitrate (in bits per second)") limits nothing: noise goes out at 3.8 times that
 # rate in rate control mode `bitrate`, as without it. Only enable-frame-skip=true holds it, by leaving out pictures.
 # Seen with Debian 12: gstreamer1.0-plugins-bad 1.22.0-4+deb12u8, libopenh264-7 2.3.1+dfsg-3+deb12u2,
 # gstreamer1.0-tools 1.22.0-2+deb12u1: 15130 kbit/s at 4000 set, 15130 with max-bitrate, 4728 with frame skipping.
-# Install: apt-get install gstreamer1.0-tools gstreamer1.0-plugins-base gstreamer1.0-plugins-bad libopenh264-7
-# Exits with 1 if the behaviour differs, with 2 if something is not installed.
+# Exits with 1 if the behaviour differs, with 2 if these versions are not to be had.
 set -eu
-gst-inspect-1.0 openh264enc >/dev/null 2>&1 || { echo "needs openh264enc (gstreamer1.0-plugins-bad)"; exit 2; }
-work=$(mktemp -d)
-trap 'rm -rf "$work"' EXIT
+. "$(dirname "$0")/pinned"
+pinned gstreamer1.0-plugins-bad=1.22.0-4+deb12u8 libopenh264-7=2.3.1+dfsg-3+deb12u2 gstreamer1.0-tools=1.22.0-2+deb12u1
 
 kbps() {  # PROPERTY...: mean bitrate of 3 s of noise, 640x360 at 30 Hz, with 4 Mbit/s set
     gst-launch-1.0 -q videotestsrc num-buffers=90 pattern=snow \
         ! video/x-raw,format=I420,width=640,height=360,framerate=30/1 \
-        ! openh264enc rate-control=bitrate complexity=low bitrate=4000000 "$@" ! filesink location="$work/out.h264" \
+        ! openh264enc rate-control=bitrate complexity=low bitrate=4000000 "$@" ! filesink location="$place/out.h264" \
         >/dev/null 2>&1
-    echo $(($(stat -c %s "$work/out.h264") * 8 / 3000))
+    echo $(($(stat -c %s "$place/out.h264") * 8 / 3000))
 }
 
-gst-inspect-1.0 --version | head -1
-dpkg-query -W -f '${Package} ${Version}\n' gstreamer1.0-plugins-bad 'libopenh264-*' 2>/dev/null || true
 plain=$(kbps)
 limited=$(kbps max-bitrate=4000000)
 skipping=$(kbps max-bitrate=4000000 enable-frame-skip=true)

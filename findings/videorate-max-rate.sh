@@ -1,11 +1,12 @@
-#!/bin/sh
+#!/usr/bin/env bash
 # videorate's max-rate is documented as "Maximum framerate allowed to pass through (in frames per second, implies
 # drop-only)", but it does not imply drop-only: a gap of 4 s in the times of the pictures is filled with 39 copies of the
 # last one. With drop-only=true in addition there is none.
 # Seen with Debian 12: gstreamer1.0-plugins-base 1.22.0-3+deb12u7, python3-gi 3.42.2-3+b1.
-# Install: apt-get install python3-gi gir1.2-gstreamer-1.0 gstreamer1.0-plugins-base
-# Exits with 1 if the behaviour differs, with 2 if something is not installed.
+# Exits with 1 if the behaviour differs, with 2 if this version is not to be had. Needs python3-gi.
 set -eu
+. "$(dirname "$0")/pinned"
+pinned gstreamer1.0-plugins-base=1.22.0-3+deb12u7
 /usr/bin/python3 - <<'PYTHON'
 import sys
 
