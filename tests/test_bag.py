@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from fractions import Fraction
 
 import numpy as np
@@ -28,7 +29,7 @@ from bags import (
 from shared_data import shared
 
 from runner.bag import POSITIONS, Bag, PictureForm, is_bag
-from runner.bag.pictures import read_image
+from runner.bag.pictures import read_compressed, read_image
 from runner.core.model import ModelError
 
 ROAD = "video/forward_highway_day_540p25_A.mp4"
@@ -149,6 +150,29 @@ def test_a_picture_that_lacks_bytes_is_refused():
     message.data = message.data[:-1]
     with pytest.raises(ValueError, match=r"^a picture of 47 bytes, must have 48: 4 rows of 12$"):
         read_image(message)
+
+
+def test_compressed_bayer_patterns_are_known_by_their_format(frames):
+    """Image_transport of ROS 1 names no target and compresses the pattern; where a target follows, it converted."""
+    import cv2
+
+    grey = np.ascontiguousarray(frames[0][..., 0])
+    jpeg, png = (cv2.imencode(f".{kind}", grey)[1].tobytes() for kind in ("jpg", "png"))
+    for data, stated, form in (
+        (jpeg, "bayer_rggb8; jpeg compressed ", "jpeg-rggb"),
+        (png, "bayer_grbg8; png compressed ", "png-grbg"),
+        (jpeg, "bayer_rggb8; jpeg compressed mono8", "jpeg"),
+        (jpeg, "mono8; jpeg compressed ", "jpeg"),
+    ):
+        assert read_compressed(compressed(STORE, 1, data, stated)).format == form
+
+
+@pytest.mark.parametrize("form", ["16UC1; compressedDepth", "32FC1; compressedDepth png", "16UC1; png compressed "])
+def test_compressed_distances_are_refused(form):
+    """The upper eight bits of millimetres are black."""
+    rule = f"compressed distances, '{form}', are not supported; expected the topic of the raw ones"
+    with pytest.raises(ValueError, match=f"^{re.escape(rule)}$"):
+        read_compressed(compressed(STORE, 1, b"\x89PNG", form))
 
 
 def test_sizes_of_compressed_pictures(tmp_path, frames):

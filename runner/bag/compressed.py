@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import zlib
 from mmap import mmap
 
@@ -15,17 +16,23 @@ FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
 STANDALONE = {0x01, *range(0xD0, 0xD9)}
 SCAN, END = 0xDA, b"\xff\xd9"
 START_CODES = (b"\0\0\1", b"\0\0\0\1")  # of Annex B
+BAYER = ("rggb", "bggr", "gbrg", "grbg")
+# image_transport of ROS 1 compresses a Bayer pattern as if it were grey, and names no target.
+MOSAIC = re.compile(rf"bayer_({'|'.join(BAYER)})8; (?:jpeg|png) compressed ?")
+DISTANCES = ("16UC1", "32FC1")  # encodings: in mm and in m
 CODECS = {"264": "h264", "avc": "h264", "265": "h265", "hevc": "h265"}  # by parts of the names that writers give
 
 
 def compressed_form(data: bytes | mmap, stated: str) -> tuple[str, int, int]:
-    """jpeg or png, and width and height in px, of a whole compressed picture.
+    """jpeg or png, and width and height in px, of a whole compressed picture; with a Bayer pattern like jpeg-rggb.
 
     stated  its format by the message
     raises  ValueError with the rule that it breaks
     """
     if not len(data):
         raise ValueError("an empty picture")
+    if stated.partition(";")[0] in DISTANCES:  # whose upper eight bits are black
+        raise ValueError(f"compressed distances, {stated!r}, are not supported; expected the topic of the raw ones")
     if data[: len(JPEG)] == JPEG:
         form, (width, height) = "jpeg", _jpeg_size(data)
     elif data[: len(PNG)] == PNG:
@@ -36,7 +43,8 @@ def compressed_form(data: bytes | mmap, stated: str) -> tuple[str, int, int]:
         raise ValueError(f"a picture of {width}x{height}, must have at most {MOST_PIXELS} pixels")
     if not width * height or (form == "png" and not _is_whole_png(data)):
         raise ValueError(f"a {form.upper()} picture that is cut off or damaged")
-    return form, width, height
+    pattern = MOSAIC.fullmatch(stated)
+    return f"{form}-{pattern[1]}" if pattern else form, width, height
 
 
 def video_form(data: bytes, stated: str) -> tuple[str, tuple[int, int], bool] | None:

@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
-from runner.bag.compressed import compressed_form, video_form
+from runner.bag.compressed import BAYER, DISTANCES, compressed_form, video_form
 
 SECOND_NS = 1_000_000_000
-BAYER = ("rggb", "bggr", "gbrg", "grbg")
 # By encoding (sensor_msgs/image_encodings.hpp), GStreamer's name of the format and bytes of a pixel in the first plane.
 FORMATS = {
     "mono8": ("GRAY8", 1),
@@ -28,7 +27,7 @@ FORMATS = {
     "8UC4": ("BGRA", 4),
     **{f"bayer_{pattern}8": (pattern, 1) for pattern in BAYER},
 }
-DEPTHS = {"16UC1": ("mono8", 2), "32FC1": ("mono8", 4)}  # of distances in mm and in m; as in `WIDE`
+DEPTHS = dict(zip(DISTANCES, (("mono8", 2), ("mono8", 4)), strict=True))  # as in `WIDE`
 # Encodings that GStreamer lacks: the one of 8 bits that they are reduced to, and bytes of a pixel.
 WIDE = {
     **DEPTHS,
@@ -61,7 +60,7 @@ class Picture:
 
     ns             capture time, ns since 1970: the stamp of its header
     stamped        whether it had a stamp; otherwise `ns` is the time of recording
-    format         GStreamer's name of a raw format or of a Bayer pattern, or jpeg, png, h264 or h265
+    format         GStreamer's name of a raw format or of a Bayer pattern, or jpeg, png, h264, h265, or as jpeg-rggb
     width, height  px; of video 0 where the unit does not state them
     data           rows from the top, each padded to a multiple of four bytes; or the compressed file, or an access unit
     key            whether it can be decoded without the pictures before it
@@ -116,6 +115,12 @@ def read_compressed(message: Any, _depth_m: float = DEPTH_M) -> Picture:
         codec, size, key = video
         return Picture(stamp_ns(message), codec, *size, data, key=key)
     return Picture(stamp_ns(message), *compressed_form(data, stated), data)
+
+
+def bayer_pattern(form: str) -> str:
+    """The Bayer pattern of a format of `Picture`, such as rggb or jpeg-rggb; "" if it has none."""
+    pattern = form.rpartition("-")[2]
+    return pattern if pattern in BAYER else ""
 
 
 def image_format(form: RawForm, size: int) -> str:

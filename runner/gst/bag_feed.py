@@ -10,7 +10,7 @@ from pathlib import Path
 from gi.repository import GLib, Gst
 
 from runner.bag import PICTURES, Bag
-from runner.bag.pictures import BAYER, BadPicture, Picture
+from runner.bag.pictures import BadPicture, Picture, bayer_pattern
 from runner.core.model import BagTopic, ModelError
 from runner.graph import Plan
 from runner.gst.source import BEHIND_S
@@ -18,7 +18,11 @@ from runner.gst.source import BEHIND_S
 POLL_S = 0.5  # while waiting for the next picture, how often the thread checks that its pipeline still runs
 VIDEO = {codec: f"video/x-{codec},stream-format=byte-stream,alignment=au" for codec in ("h264", "h265")}
 ENCODED = {"jpeg": "image/jpeg", "png": "image/png", **VIDEO}
-BAYER_NAME = "bayer"  # of the element that converts Bayer patterns
+BAYER_NAME = "bayer"  # of what converts Bayer patterns
+# What decodes one as grey becomes a pattern again.
+MOSAIC = (
+    "{form}dec ! videoconvert ! video/x-raw,format=GRAY8 ! capssetter join=false caps=video/x-bayer,format={pattern}"
+)
 NO_BAYER = "pictures in Bayer patterns need bayer2rgb; on Debian: apt-get install gstreamer1.0-plugins-bad"
 BLOCKING = {"leaky-type": 0, "block": True}  # of an appsrc that drops nothing and blocks until a picture is consumed
 
@@ -112,8 +116,8 @@ class BagFeed:
             self._form, self.first = picture, picture.ns
             if picture.format in VIDEO:
                 _block(self._source)  # those that follow need each of them
-            if picture.format in BAYER:
-                accept_bayer(self._source)
+            if bayer_pattern(picture.format):
+                accept_bayer(self._source, picture.format)
             form = caps(picture.format, picture.width, picture.height, self._fps)
             self._source.set_property("caps", Gst.Caps.from_string(form))
             start = self._now() if self._on_report else 0
@@ -185,8 +189,10 @@ def _block(source: Gst.Element) -> None:
         source.set_property(key, value)
 
 
-def accept_bayer(source: Gst.Element) -> None:
+def accept_bayer(source: Gst.Element, form: str) -> None:
     """Let the pictures of an appsrc be Bayer patterns: decodebin itself plugs no element that converts them.
+
+    form  as in `Picture`
 
     To be called before the first picture is pushed; has no effect afterwards.
     """
@@ -194,11 +200,15 @@ def accept_bayer(source: Gst.Element) -> None:
     below = out.get_peer()
     if below.get_parent_element().get_name() == BAYER_NAME:
         return
-    convert = Gst.ElementFactory.make("bayer2rgb", BAYER_NAME)
-    if convert is None:
+    compressed, _, pattern = form.rpartition("-")
+    decode = MOSAIC.format(form=compressed, pattern=pattern) + " ! " if compressed else ""
+    try:
+        convert = Gst.parse_bin_from_description(f"{decode}bayer2rgb", True)
+    except GLib.Error:
         error = GLib.Error.new_literal(Gst.CoreError.quark(), NO_BAYER, Gst.CoreError.MISSING_PLUGIN)
         source.post_message(Gst.Message.new_error(source, error, ""))
         return
+    convert.set_name(BAYER_NAME)
     source.get_parent().add(convert)
     out.unlink(below)
     convert.get_static_pad("src").link(below)
@@ -209,8 +219,8 @@ def accept_bayer(source: Gst.Element) -> None:
 def caps(form: str, width: int, height: int, fps: Fraction) -> str:
     """Caps for a format named as in `Picture`."""
     rate = f"framerate={fps.numerator}/{fps.denominator}"
-    if form in ENCODED:
-        return f"{ENCODED[form]},{rate}"
-    if form in BAYER:
+    if (encoded := form.partition("-")[0]) in ENCODED:
+        return f"{ENCODED[encoded]},{rate}"
+    if bayer_pattern(form):
         return f"video/x-bayer,format={form},width={width},height={height},{rate}"
     return f"video/x-raw,format={form},width={width},height={height},pixel-aspect-ratio=1/1,{rate}"

@@ -8,7 +8,7 @@ from fractions import Fraction
 
 from gi.repository import Gst, GstAllocators, GstVideo
 
-from runner.bag.pictures import BAYER, SUBSAMPLED
+from runner.bag.pictures import SUBSAMPLED, bayer_pattern
 from runner.gst.bag_feed import accept_bayer, caps
 from runner.ros.cameras import SharedPicture
 from runner.system.kernel_clock import ahead_of
@@ -28,8 +28,8 @@ def push_shared(source: Gst.Element | None, picture: SharedPicture, fps: Fractio
         os.close(picture.memory)
         return False
     assert source is not None
-    if picture.type.format in BAYER:
-        accept_bayer(source)
+    if bayer_pattern(picture.type.format):
+        accept_bayer(source, picture.type.format)
     form = Gst.Caps.from_string(caps(*picture.type, fps))
     sample = Gst.Sample.new(_buffer(picture, pts), form, None, None)
     return bool(source.emit("push-sample", sample) == Gst.FlowReturn.OK)
@@ -42,7 +42,7 @@ def _buffer(picture: SharedPicture, pts: int) -> Gst.Buffer:
     buffer.append_memory(GstAllocators.FdAllocator.alloc(allocator, picture.memory, picture.size, flags))
     buffer.pts = pts
     raw, width, height = picture.type
-    if picture.step and raw not in BAYER:  # of which GstVideo knows nothing
+    if picture.step and not bayer_pattern(raw):  # of which GstVideo knows nothing
         form, none = GstVideo.VideoFormat.from_string(raw), GstVideo.VideoFrameFlags.NONE
         offsets, strides = [0, picture.step * height, 0, 0], [picture.step] * 2 + [0, 0]
         planes = 2 if raw in SUBSAMPLED else 1

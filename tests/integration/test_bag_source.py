@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from dataclasses import replace
+from fractions import Fraction
 from itertools import pairwise
 
 import numpy as np
@@ -18,6 +19,7 @@ from shared_data import shared
 
 from rig import free_port, process, run, streaming, until, watching
 from runner.bag import Bag
+from runner.bag.compressed import compressed_form
 from runner.bag.pictures import ENCODINGS
 from runner.core.commands import Command
 from runner.core.model import BagTopic
@@ -39,8 +41,6 @@ def road(count):
 
 def shown(bag, topic, form="RGB"):
     """The pictures that come out of GStreamer, and their times in ns."""
-    from fractions import Fraction
-
     from runner.gst import Gst
     from runner.gst.bag_feed import read_bag
 
@@ -93,8 +93,6 @@ def test_pixels_of_each_encoding(tmp_path, kind):
 @pytest.mark.parametrize("padding", [0, 6])
 def test_a_topic_of_ros_is_converted_as_in_a_bag(padding):
     """Without ROS: what its node passes on, pushed from shared memory."""
-    from fractions import Fraction
-
     from runner.configuration.config import configuration
     from runner.gst import Gst
     from runner.gst.shared import push_shared
@@ -129,6 +127,33 @@ def test_a_topic_of_ros_is_converted_as_in_a_bag(padding):
         found = rows[:, : 96 * 3].reshape(54, 96, 3)  # RGB passes with the padding of its rows
         pipeline.set_state(Gst.State.NULL)
         assert np.abs(found.astype(int) - wanted).max() <= TOLERANCES.get(encoding, 2), encoding
+
+
+def test_a_compressed_bayer_pattern_is_shown_in_colour_live_and_from_a_bag(tmp_path):
+    import cv2
+
+    from runner.gst import Gst
+    from runner.gst.shared import push_shared
+    from runner.ros.cameras import PictureType, SharedPicture
+
+    mosaic, wanted = encoded(road(1)[0], "bayer_grbg8")
+    data = cv2.imencode(".jpg", mosaic)[1].tobytes()
+    message = compressed(typestore("ros1"), BEGAN_NS, data, "bayer_grbg8; jpeg compressed ")
+    ((picture,), _) = shown(write_bag(tmp_path / "b", "ros1", {"/a": [(BEGAN_NS, message)]}), "/a")
+    assert np.abs(picture.astype(int) - wanted).mean() < 6
+
+    memory = os.memfd_create("picture")
+    os.write(memory, data)
+    sink = "videoconvert ! video/x-raw,format=RGB ! appsink name=out sync=false"
+    pipeline = Gst.parse_launch(f"appsrc name=in format=time is-live=true ! decodebin ! {sink}")
+    pipeline.set_state(Gst.State.PLAYING)
+    kind = PictureType(*compressed_form(data, message.format))
+    shared_picture = SharedPicture(memory, len(data), kind, 0, time.monotonic_ns(), False)
+    assert push_shared(pipeline.get_by_name("in"), shared_picture, Fraction(25))
+    buffer = pipeline.get_by_name("out").emit("try-pull-sample", 20 * Gst.SECOND).get_buffer()
+    rows = np.frombuffer(buffer.extract_dup(0, buffer.get_size()), np.uint8).reshape(54, -1)
+    pipeline.set_state(Gst.State.NULL)
+    assert np.abs(rows[:, : 96 * 3].reshape(54, 96, 3).astype(int) - wanted).mean() < 6
 
 
 def test_compressed_pictures_are_decoded(tmp_path):
@@ -276,8 +301,6 @@ def test_video_that_begins_without_a_key_picture_says_so(tmp_path):
 
 def played(bag, topic):
     """Capture times of the pictures that a live source releases, ns since the first one, and what it reports."""
-    from fractions import Fraction
-
     from runner.gst import Gst
     from runner.gst.bag_feed import BagFeed
 
@@ -296,8 +319,6 @@ def played(bag, topic):
 
 def failure(bag, topic):
     """Why a bag is not read, as `record` and `model` read it."""
-    from fractions import Fraction
-
     from runner.gst import Gst
     from runner.gst.bag_feed import read_bag
 
@@ -470,9 +491,9 @@ def test_a_bag_damaged_further_on_ends_only_its_camera(tmp_path):
     assert line.startswith(f"front: {bag}: /front/image: cannot be read, damaged or cut off: ")
 
 
-def test_a_vehicle_whose_bag_lacks_a_topic_does_not_start(tmp_path):
+def test_a_strict_vehicle_whose_bag_lacks_a_topic_does_not_start(tmp_path):
     bag = camera_bag(tmp_path / "drive", "mcap", {"/front/image": map(numbered, range(3))}, RATE)
-    with process("vehicle", *robot(bag), f"media.port={free_port()}") as vehicle:
+    with process("vehicle", *robot(bag), "strict=true", f"media.port={free_port()}") as vehicle:
         output, _ = vehicle.communicate(timeout=60)
     assert vehicle.returncode == 2
     rule = "no such topic with pictures, did you mean /front/image?"
