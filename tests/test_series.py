@@ -190,6 +190,41 @@ def test_a_vehicle_that_began_in_1970_is_shown_when_it_drove(
     assert "earlier times are corrected" in "".join(drive.warnings)
 
 
+@pytest.mark.parametrize(
+    "by_s, set_at, begins, ends",
+    [
+        *((sign * by_s, 9.0, OPERATOR_LATER_S, 19.0) for by_s in (1.2, 5, 60) for sign in (1, -1)),
+        *((sign * by_s, 20.0, OPERATOR_LATER_S, 15.0) for by_s in (1.2, 5, 60) for sign in (1, -1)),
+        *((sign * 60, at, 100.0, 300.0) for at in (50.0, 200.0, 350.0) for sign in (1, -1)),
+        (-5, 13.0, 9.0, 19.0),  # the clock shows 9 to 13 s twice: only the later comparisons tell which of them it was
+        (-5, 7.0, 9.0, 19.0),
+    ],
+)
+def test_the_operators_log_keeps_its_place_when_the_vehicles_clock_is_set(
+    tmp_path: Path, by_s: float, set_at: float, begins: float, ends: float
+) -> None:
+    """Also by a step that is much shorter than the drive."""
+    stretch = 20 if ends > 20 else 1
+
+    def is_set(side: str, lines: Lines) -> Lines:
+        for entry in lines:
+            entry["t"] *= stretch
+        if side == "vehicle":
+            return sorted([*lines, {"t": set_at, "log": "clock_set", "by_s": by_s}], key=lambda entry: entry["t"])
+        logged = [entry for entry in lines if entry["log"] == "sample" and begins <= entry["t"] < ends]
+        for entry in logged:
+            entry |= {"clock_ahead_ms": 1000.0 * by_s * (entry["t"] >= set_at), "clock_bound_ms": 0.4}
+            entry["t"] -= begins
+        return logged
+
+    path = write_drive(tmp_path / "drive", ["vehicle", "operator"], seconds=20, change=is_set, ended=False)
+    log = path / "operator.jsonl"
+    log.write_text(log.read_text().replace(f'"time": {EPOCH + OPERATOR_LATER_S}', f'"time": {EPOCH + begins}', 1))
+    read = read_drive(path).sides
+    assert read["vehicle"].began_s == pytest.approx(EPOCH + by_s)
+    assert read["operator"].began_s - read["vehicle"].began_s == pytest.approx(begins)
+
+
 @pytest.mark.parametrize("set_s", [30, -30, 2])
 def test_setting_the_operators_clock_makes_no_freeze(tmp_path: Path, set_s: int) -> None:
     """Arrivals are logged by the wall clock, samples by the monotonic one."""

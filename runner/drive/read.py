@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+from bisect import bisect_right
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
-from itertools import accumulate
+from itertools import accumulate, chain
 from pathlib import Path
 from statistics import median
 from typing import Any, TextIO, TypeVar
@@ -42,6 +43,7 @@ OTHER_KINDS = ("decision", "telemetry", "note", "video", "video_shift", "clock_s
 OF_SEVERAL_THREADS = {"note", "state", "video", "video_shift", "clock_set", "dropped"}
 LATE_S = 1.0  # by how much such lines may be late
 SET_S = 1.0  # a measured difference of the clocks that changes by more: one was set
+MOST_COMPARED = 1000  # measured differences of the clocks from which a side's start is found
 LONGEST_GAP_S = 86_400.0  # between two lines of a drive: both sides log several times a second
 LONGEST_LINE = 1 << 24  # characters; the longest real line, the configuration, has a thousandth of that
 
@@ -185,16 +187,24 @@ def _by_last_clock(side: Side) -> Side:
 
 
 def _by_clock_of(vehicle: Side, operator: Side) -> Side:
-    """The operator's side with its start by the vehicle's clock in the end, which may have been set after its end."""
-    ahead_s = _ahead_s(operator)
-    if not ahead_s:
+    """The operator's side with its start by the vehicle's clock in the end, which may have been set after its end.
+
+    Each correction yields another start. In the right one, the difference of the clocks changes when the vehicle's log
+    says that its clock was set.
+    """
+    measured = list(chain.from_iterable(_measured(operator)))
+    if not measured:
         return replace(operator, corrections=vehicle.corrections)
+    compared = measured[:: 1 + len(measured) // MOST_COMPARED]
+    set_at = [vehicle.began_s + line.t for line in vehicle.of(ClockSet)][: len(vehicle.corrections) - 1]
 
-    def overlap_s(began_s: float) -> float:
-        end = min(began_s + operator.end, vehicle.began_s + vehicle.end)
-        return end - max(began_s, vehicle.began_s)
+    def off_s(began_s: float) -> float:
+        """By how much the measured differences contradict a start."""
+        corrected = (ahead_s + vehicle.corrections[bisect_right(set_at, began_s + t)] for t, ahead_s in compared)
+        return round(sum(abs(operator.began.time + by_s - began_s) for by_s in corrected), 3)
 
-    began_s = max((operator.began.time + ahead_s[0] + by_s for by_s in reversed(vehicle.corrections)), key=overlap_s)
+    first_s = operator.began.time + _ahead_s(operator)[0]
+    began_s = min((first_s + by_s for by_s in vehicle.corrections), key=off_s)
     return replace(operator, began_s=began_s, corrections=vehicle.corrections)
 
 
@@ -203,11 +213,17 @@ def _corrections(ahead_s: Sequence[float]) -> tuple[float, ...]:
 
 
 def _ahead_s(side: Side) -> list[float]:
-    """How far the vehicle's clock was ahead of this side's own if that had never been set, s, as measured.
+    """How far the vehicle's clock was ahead of this side's own if that had never been set, s.
 
     One value for each setting of the vehicle's clock; none if the difference was not measured.
     """
-    found: list[list[tuple[float, float]]] = []  # by setting, time and difference
+    # The clocks drift, and `t` does not follow one that is slewed.
+    return [median(ahead_s for t, ahead_s in each if t - each[0][0] <= KEPT_S) for each in _measured(side)]
+
+
+def _measured(side: Side) -> list[list[tuple[float, float]]]:
+    """By setting of the vehicle's clock, time and difference as measured, s; none is empty."""
+    found: list[list[tuple[float, float]]] = []
     own_s = 0.0
     for line in side.lines:
         if isinstance(line, ClockSet):
@@ -217,8 +233,7 @@ def _ahead_s(side: Side) -> list[float]:
             if not found or abs(found[-1][-1][1] - measured[1]) > SET_S:
                 found.append([])
             found[-1].append(measured)
-    # The clocks drift, and `t` does not follow one that is slewed.
-    return [median(ahead_s for t, ahead_s in each if t - each[0][0] <= KEPT_S) for each in found]
+    return found
 
 
 def check_began(line: Json | None, name: str) -> Began:
