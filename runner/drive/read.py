@@ -39,9 +39,9 @@ DRIVEN = {"vehicle", "operator"}  # sides without which a directory holds no dri
 REPORTS = KINDS[ReceptionReported]
 # Kinds of lines in a vehicle's log, except events, reception reports and the first line.
 OTHER_KINDS = ("decision", "telemetry", "note", "video", "video_shift", "clock_set")
-# Kinds that several threads write, perhaps in another order than they read the time; readers put them into order.
+# Kinds that several threads write, perhaps in another order than they read the time: by any amount, if the process was
+# stopped in between. Readers put them into order.
 OF_SEVERAL_THREADS = {"note", "state", "video", "video_shift", "clock_set", "dropped"}
-LATE_S = 1.0  # by how much such lines may be late
 SET_S = 1.0  # a measured difference of the clocks that changes by more: one was set
 MOST_COMPARED = 1000  # measured differences of the clocks from which a side's start is found
 LONGEST_GAP_S = 86_400.0  # between two lines of a drive: both sides log several times a second
@@ -303,8 +303,6 @@ class _Order:
             return "a second drive begins here; each needs a directory of its own"
         if before and before.get("log") == "ended":
             return "the drive ended with the line before; each drive needs a directory of its own"
-        if kind in OF_SEVERAL_THREADS and t < self._latest - LATE_S:
-            return f"t: {t}: must not decrease; the line before was at {self._latest}"
         if kind not in OF_SEVERAL_THREADS and t < self._last.get(kind, 0.0):
             return f"t: {t}: must not decrease; the {kind} before was at {self._last[kind]}"
         if self._last.get("began") is not None and t > self._latest + LONGEST_GAP_S:
