@@ -338,6 +338,35 @@ def test_dropped_lines_are_reported(tod: Command, drive: Path, tmp_path: Path) -
     assert result.err == f"{incomplete}: dropped lines: 3; decisions may differ from the drive's\n"
 
 
+@pytest.mark.parametrize("by_s", ["", ', "by_s": "60"', ', "by_s": null'])
+def test_a_wrong_setting_of_the_clock_does_not_move_the_start(
+    tod: Command, drive: Path, tmp_path: Path, by_s: str
+) -> None:
+    first, *rest = (drive / "drive.jsonl").read_text().splitlines()
+    settings = (f'{{"t": 0.5, "log": "clock_set"{each}}}' for each in (', "by_s": 3600', by_s))
+    (tmp_path / "drive.jsonl").write_text("\n".join([first, *settings, *rest, ""]))
+    result = tod("replay", f"input={tmp_path}", f"log={tmp_path / 'again'}")
+    assert (result.status, result.err) == (0, "")
+    again = (tmp_path / "again" / "drive.jsonl").read_text().splitlines()
+    assert json.loads(again[0])["time"] == json.loads(first)["time"] + 3600
+
+
+@pytest.mark.parametrize(
+    "line, expected",
+    [
+        ('"clock_set"', "'clock_set': must be a mapping with t and event"),
+        ('{"t": 0.5, "log": ["clock_set"]}', 'log: ["clock_set"]: unknown kind of line, did you mean clock_set?'),
+    ],
+)
+def test_a_line_that_only_looks_like_a_setting_of_the_clock_ends_the_run(
+    tod: Command, drive: Path, line: str, expected: str
+) -> None:
+    file = drive / "drive.jsonl"
+    file.write_text(file.read_text().replace("\n", f"\n{line}\n", 1))
+    result = tod("replay", f"input={drive}")
+    assert (result.status, result.err) == (2, f"{file}: line 2: {expected}\n")
+
+
 def test_a_drive_replayed_into_a_drive_is_identical(tod: Command, drive: Path, tmp_path: Path) -> None:
     assert tod("replay", f"input={drive}", f"log={tmp_path / 'again'}").status == 0
     assert (tmp_path / "again" / "drive.jsonl").read_text() == (drive / "drive.jsonl").read_text()

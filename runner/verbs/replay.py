@@ -187,9 +187,9 @@ def _corrected(began: Began, arguments: Arguments) -> Began:
         return began
     with _input(arguments) as (_, text):
         steps = (read_line(line)[0] for line in text if KINDS[ClockSet] in line)
-        return replace(
-            began, time=began.time + sum(step["by_s"] for step in steps if step.get("log") == KINDS[ClockSet])
-        )
+        # Wrong lines are skipped here as `events` skips them, which reads no line of this kind.
+        valid = (step for step in steps if is_log(step) and step["log"] == KINDS[ClockSet] and not log_problem(step))
+        return replace(began, time=began.time + sum(step["by_s"] for step in valid))
 
 
 def _base(name: str, began: Began | None) -> Base | None:
