@@ -10,6 +10,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+from runner.errors import reason
 from runner.rate_quality.curves import Point
 from runner.system.files import write_whole
 
@@ -31,7 +32,7 @@ class Cache:
     """JSON documents by digest, one small file each, written atomically, with a digest of its own: whatever has
     happened to a file, its content is used only if it is what was stored.
 
-    on_warning  called with a line about a file that cannot be used and will be replaced
+    on_warning  called with a line about a file that cannot be used and is measured again
     """
 
     def __init__(self, directory: Path, on_warning: Callable[[str], None]) -> None:
@@ -43,7 +44,10 @@ class Cache:
             stored = json.loads(path.read_text(encoding="utf-8"))
         except FileNotFoundError:
             return None
-        except (ValueError, RecursionError, OSError) as error:
+        except OSError as error:  # may pass, so the file is kept
+            self._on_warning(f"{path}: cannot be read ({reason(error)}), measured again")
+            return None
+        except (ValueError, RecursionError) as error:
             self._give_up(path, f"cannot be read ({error})")
             return None
         match stored:
@@ -58,7 +62,7 @@ class Cache:
         write_whole(self._path(key), json.dumps(content).encode())
 
     def _give_up(self, path: Path, why: str) -> None:
-        """Remove a file, so that it is reported once."""
+        """Remove a file that is of no use, so that it is reported once."""
         self._on_warning(f"{path}: {why}, measured again")
         with suppress(OSError):
             path.unlink()
