@@ -1,11 +1,16 @@
 """Which picture was displayed at a moment, and which picture of a clip it shows."""
 
+from pathlib import Path
+
 import numpy as np
+from drives import EPOCH, Lines, write_drive
+from helpers import vehicle
 from hypothesis import given
 from hypothesis import strategies as st
 
 from runner.drive.captures import SAME_NS, RecordedVideo, UnitTimes, arrivals, matched, unfiled
-from runner.drive.delivered import _nearest, _thumbnail, displayed_units
+from runner.drive.delivered import _nearest, _thumbnail, displayed_units, measure
+from runner.drive.read import read_drive
 from runner.h264.access_unit import coded_picture
 
 MS = 1_000_000
@@ -76,6 +81,21 @@ def test_pictures_that_arrived_and_are_in_no_file_are_found() -> None:
     absent = [UnitTimes(100 * n * MS, 100 * n * MS + 90 * MS) for n in (7, *range(20, 30))]
     assert unfiled(arrivals(filed, log), log) == absent
     assert unfiled(log, log) == unfiled([], []) == []
+
+
+def test_a_video_without_pictures_of_the_vehicle_is_reported(tmp_path: Path) -> None:
+    """Files that were cut off before their first complete picture, while pictures arrived."""
+
+    def recorded(side: str, lines: Lines) -> Lines:
+        video = {"t": 0.0, "log": "video", "camera": "front_left", "file": f"{side}.ts", "captured": EPOCH}
+        return [video, *lines]
+
+    drive = read_drive(write_drive(tmp_path, ["vehicle", "operator"], seconds=5, change=recorded))
+    warnings: list[str] = []
+    cameras = {"front_left": vehicle().cameras["front_left"]}
+    measure(drive, cameras, {}, lambda _: iter(()), lambda *_: iter(()), on_warning=warnings.append)
+    ends = "the vehicle's video ends at 0.0 s, what arrived at 5.0 s"
+    assert warnings == [f"front_left: {ends}: scored up to its end"]
 
 
 def test_times_of_a_file_are_those_of_its_last_shift() -> None:

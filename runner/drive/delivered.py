@@ -214,7 +214,7 @@ def _camera(
     scores = meter.close()
     began = round(vehicle.began_s * SECOND_NS)
     unknown = [(moment - began) / SECOND_NS for moment, unit in displayed if unit in absent]
-    ends = [(times[-1] - began) / SECOND_NS for times in (captured, [unit.captured for unit in units]) if times]
+    ends = [(max(times, default=began) - began) / SECOND_NS for times in (captured, [unit.captured for unit in units])]
     stale = [moment - displayed > SAME_NS for moment, displayed in pairs]
     found = DeliveredQuality(
         t=tuple((pairs[number][0] - began) / SECOND_NS for number in scores),
@@ -225,11 +225,11 @@ def _camera(
     return found, list(_lacking(len(displayed), unknown, *ends))
 
 
-def _lacking(moments: int, unknown: Sequence[float], sent_end: float = 0.0, received_end: float = 0.0) -> Iterator[str]:
+def _lacking(moments: int, unknown: Sequence[float], sent_end: float, received_end: float) -> Iterator[str]:
     """What the files lack, in lines.
 
     unknown                 moments at which a picture was displayed that is in no file, s
-    sent_end, received_end  the last pictures in the vehicle's files, and of those that arrived, s
+    sent_end, received_end  the last pictures in the vehicle's files, and of those that arrived, s; 0: there is none
     """
     if unknown:
         lacks = f"the operator's video lacks pictures that arrived, from {unknown[0]:.1f} to {unknown[-1]:.1f} s"
