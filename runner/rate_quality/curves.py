@@ -125,8 +125,6 @@ def interpolated(kbps: Values, quality: Values, at_kbps: Values) -> Values:
     """Quality between measured bitrates: piecewise cubic in log bitrate, monotone where the points are (PCHIP; F. N.
     Fritsch, J. Butland, SIAM J. Sci. Stat. Comput. 5(2), 1984); beyond them that of the nearest.
 
-    Where measured points are left out it is nearer to them than straight lines are, see docs/models.md.
-
     kbps     increasing, above 0
     quality  measured there
     """
