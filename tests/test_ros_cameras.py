@@ -10,7 +10,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from runner.bag.pictures import SECOND_NS
 from runner.configuration.config import configuration
 from runner.core.model import RosSettings
 from runner.errors import ConfigError, UserError
@@ -18,6 +17,7 @@ from runner.ros.cameras import CameraStream
 from runner.ros.inputs import check_names
 from runner.ros.node import pictures, ros1
 from runner.ros.process import NodeProcess, check_discovery
+from runner.system.clocks import SECOND_NS
 
 WORDS = ["vehicle=delivery_robot", "source=ros", "fps_max=10"]
 TOPICS = [f"cameras.{name}.topic=/{name}" for name in ("front", "rear", "mast")]

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from runner.gst.stream_times import HZ, PACKET, SECOND_NS, WRAP, RestoredTimes, stream_times
+from runner.gst.stream_times import HZ, PACKET, WRAP, RestoredTimes, stream_times
+from runner.system.clocks import SECOND_NS
 
 pytestmark = pytest.mark.gst
 

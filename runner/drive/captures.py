@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from runner.drive.read import Side
 from runner.records import Sample, VideoBegan, VideoShifted
+from runner.system.clocks import SECOND_NS
 
 if TYPE_CHECKING:
     from runner.apply import Unit
 
-SECOND_NS = 1_000_000_000
 # A frame of the file and one of the log are different if further apart; less than most cameras' frame interval.
 SAME_NS = 20_000_000
 ROUNDING_NS = 1_000_000  # of times in the file, which count in 1/90000 s

@@ -27,7 +27,6 @@ from numpy.typing import NDArray
 from runner.core.model import Camera
 from runner.drive.captures import (
     SAME_NS,
-    SECOND_NS,
     ReadVideo,
     RecordedVideo,
     UnitTimes,
@@ -44,6 +43,7 @@ from runner.h264.access_unit import coded_picture
 from runner.rate_quality.metrics.interface import Luma
 from runner.rate_quality.metrics.mssim import metric
 from runner.records import DecisionMade, Sample
+from runner.system.clocks import SECOND_NS
 
 if TYPE_CHECKING:
     from runner.apply import Unit

@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from runner.core.events import NAMES, Event, PositionReported
 from runner.core.events import to_json as event_to_json
-from runner.drive.captures import SECOND_NS, ReadVideo, RecordedVideo, files
+from runner.drive.captures import ReadVideo, RecordedVideo, files
 from runner.drive.read import Drive, Side
 from runner.errors import RunError
 from runner.records import KINDS, Json, Note, Position, Record, Sample, line_to_json
+from runner.system.clocks import SECOND_NS
 
 if TYPE_CHECKING:
     from runner.apply import Unit

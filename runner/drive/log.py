@@ -95,12 +95,14 @@ class Log:
         at        s since 1970, for a past drive whose lines carry their own times; None: now
         replayed  see `Began`
         """
+        from runner.system.kernel_clock import wall_ahead_s
+
         self.time = time.time() if at is None else at
         versions = {"tod-runner": version("tod-runner"), "Python": platform.python_version(), **self._versions}
         first = Began(0.0, self._side, FORMAT, self.time, versions, redacted(self._config), redacted(replayed))
         with self._lock:
             self._began, self._past = time.monotonic(), None if at is None else 0.0
-            self._ahead_s = _wall_ahead_s() if at is None else 0.0
+            self._ahead_s = wall_ahead_s(time.CLOCK_BOOTTIME) if at is None else 0.0
             if self._file and at is None:
                 self._writer = _Writer(self._file, self._dropped, self._on_report)
             for line in (line_to_json(first), *self._before_begin):
@@ -142,9 +144,13 @@ class Log:
     def _look_at_clock(self) -> None:
         """Write by how much the wall clock has been set since the line before."""
         from runner.system.clocks import STEP_S
+        from runner.system.kernel_clock import wall_ahead_s
 
-        by_s = _wall_ahead_s() - self._ahead_s
-        if abs(by_s) > STEP_S and abs(by_s := _wall_ahead_s() - self._ahead_s) > STEP_S:  # the first reading may be off
+        def moved_s() -> float:
+            return wall_ahead_s(time.CLOCK_BOOTTIME) - self._ahead_s
+
+        by_s = moved_s()
+        if abs(by_s) > STEP_S and abs(by_s := moved_s()) > STEP_S:  # the first reading may be off
             self._ahead_s += by_s
             self._put(line_to_json(ClockSet(self.now(), round(by_s, 6))))
 
@@ -184,13 +190,6 @@ class Log:
 
     def _dropped(self, lines: int) -> bytes:
         return _encoded(line_to_json(LinesDropped(self.now(), lines)))
-
-
-def _wall_ahead_s() -> float:
-    """How far the wall clock is ahead of one that is never set, and also runs while the machine is suspended, s."""
-    from runner.system.kernel_clock import NANO, ahead_of
-
-    return NANO * ahead_of(lambda: time.clock_gettime_ns(time.CLOCK_BOOTTIME))
 
 
 def _encoded(line: Mapping[str, Any]) -> bytes:

@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 from msgspec import UNSET
 
-from runner.drive.captures import SECOND_NS, ReadVideo
+from runner.drive.captures import ReadVideo
 from runner.drive.exported import NOTE_TOPIC, POSITION_TOPIC, cameras_of, write_all
 from runner.drive.read import Drive
 from runner.errors import RunError, reason
 from runner.records import Json, Note, Position, line_to_json
 from runner.schema import referred
+from runner.system.clocks import SECOND_NS
 
 if TYPE_CHECKING:
     from runner.apply import Unit

@@ -8,11 +8,11 @@ from heapq import merge
 from pathlib import Path
 
 from runner.bag import POSITIONS, Bag, Fix
-from runner.bag.pictures import SECOND_NS
 from runner.core.events import PositionReported
 from runner.core.model import ModelError
 from runner.drive.read import Drive, read_drive, time_span
 from runner.errors import ArgumentError, UserError
+from runner.system.clocks import SECOND_NS
 
 ARGUMENTS = ("positions", "topic")  # of the command line
 

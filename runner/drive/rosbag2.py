@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from runner.drive.captures import SECOND_NS, ReadVideo
+from runner.drive.captures import ReadVideo
 from runner.drive.exported import NOTE_TOPIC, POSITION_TOPIC, VIDEO_TOPICS, cameras_of, write_all
 from runner.drive.read import Drive
 from runner.errors import RunError, os_errors_as
 from runner.records import Json, Note, Position, line_to_json
+from runner.system.clocks import SECOND_NS
 
 if TYPE_CHECKING:
     from rosbags.rosbag2 import Writer

@@ -8,11 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
+from runner.system.clocks import SECOND_NS
+
 PACKET, SYNC = 188, 0x47  # bytes of a packet, and its first (ISO/IEC 13818-1, section 2.4.3)
 STARTS, ADAPTED = 0x40, 0x20  # a payload unit starts in it; an adaptation field comes first
 VIDEO, TIMED = 0xE0, 0x80  # stream number of video, in the upper four bits; a presentation time is given
 HZ, WRAP = 90_000, 1 << 33
-SECOND_NS, SAME_NS = 1_000_000_000, 1_000_000
+SAME_NS = 1_000_000
 
 
 def stream_times(path: Path) -> list[int]:

@@ -69,7 +69,7 @@ def track_of_bag(path: Path, topic: str | None, loop: bool) -> Track:
     raises  ModelError
     """
     from runner.bag import POSITIONS, Bag
-    from runner.bag.pictures import SECOND_NS
+    from runner.system.clocks import SECOND_NS
 
     try:
         with Bag(path) as bag:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from typing import NamedTuple
 
+SECOND_NS = 1_000_000_000
 MOST_DRIFT = 5e-4  # of two clocks: crystals drift by 100 ppm; adjtime(3) slews a clock by 500 ppm
 SET_S = 5e-4  # a clock that moved by more than this plus the drift between two exchanges was set or slewed faster
 STEP_S = 5e-3  # one that moved by this much was set, perhaps in the middle of an exchange

@@ -46,9 +46,12 @@ def ahead_of(read: Callable[[], int], own: Callable[[], int] = time.time_ns) -> 
     return min(readings)[1]
 
 
-def wall_ahead_s() -> float:
-    """By how much the wall clock is ahead of the monotonic clock, s: this changes when the wall clock is set."""
-    return NANO * ahead_of(time.monotonic_ns)
+def wall_ahead_s(clock: int = time.CLOCK_MONOTONIC) -> float:
+    """By how much the wall clock is ahead of one that is never set, s: this changes when the wall clock is set.
+
+    clock  CLOCK_BOOTTIME also runs while the machine is suspended
+    """
+    return NANO * ahead_of(lambda: time.clock_gettime_ns(clock))
 
 
 def clock_error_s() -> float | None:
