@@ -8,9 +8,10 @@ from itertools import pairwise
 from math import inf
 from typing import NamedTuple
 
-from runner.h264.keyframe import Bits, grey_idr
+from runner.h264.keyframe import grey_idr
+from runner.h264.sps import SPS, Bits
 
-SLICE, IDR, SEI, SPS = 1, 5, 6, 7  # NAL unit types (ITU-T H.264, table 7-1)
+SLICE, IDR, SEI = 1, 5, 6  # NAL unit types (ITU-T H.264, table 7-1)
 RECOVERY_POINT = 6  # SEI payload type (D.1.8)
 H265_VCL, H265_IRAP = range(32), range(16, 24)  # NAL unit types (ITU-T H.265, table 7-1)
 H265_SETS = range(32, 35)  # video, sequence and picture parameter sets
@@ -118,8 +119,11 @@ def nal_units(data: bytes) -> Iterator[tuple[int, int]]:
 
 
 def _recovery(message: bytes) -> int | None:
-    """recovery_frame_cnt of an SEI message that is a recovery point (D.1.8)."""
-    return Bits(message[2:]).ue() if len(message) > 2 and message[0] == RECOVERY_POINT else None
+    """recovery_frame_cnt of an SEI message that is a recovery point (D.1.8); None also if it is cut off."""
+    try:
+        return Bits(message[2:]).ue() if message[:1] == bytes([RECOVERY_POINT]) else None
+    except ValueError:
+        return None
 
 
 class RecentUnits:

@@ -41,6 +41,6 @@ class Damage:
         key, recovery = starts(head, self._codec)
         if self._left is not None:
             self._left -= 1
-        if recovery is not None and recovery >= 0 and (self._left is None or recovery < self._left):
+        if recovery is not None and (self._left is None or recovery < self._left):
             self._left = recovery
         return key or self._left == 0
