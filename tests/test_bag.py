@@ -335,6 +335,19 @@ def test_metadata_may_say_other_qos_and_list_files_in_any_order(tmp_path, qos, o
         Bag(tmp_path)
 
 
+def test_metadata_that_knows_less_or_more_than_the_files_is_reported(tmp_path):
+    """No file is left out without a word, and none is missing; one that ROS unpacked beside the packed one is known."""
+    for n in range(2):
+        write_mcap(tmp_path / f"b_{n}.mcap", recorded()[10 * n : 10 * n + 10], {"/a": definition(IMAGE)})
+    write_metadata(tmp_path, "/a", IMAGE, ["b_0.mcap"], 20)
+    with pytest.raises(ModelError, match=r"cannot be read: metadata.yaml does not name b_1.mcap: `ros2 bag reindex`"):
+        Bag(tmp_path)
+    (tmp_path / "b_1.mcap").rename(tmp_path / "b_0.mcap.zstd")
+    with pytest.raises(ModelError, match=r"/a: cannot be read: metadata.yaml states 20 messages of this topic.* 10$"):
+        numbers(tmp_path)
+    assert numbers(write_metadata(tmp_path, "/a", IMAGE, ["b_0.mcap"], 10)) == list(range(10))
+
+
 @pytest.mark.parametrize("kind", ["sqlite3", "mcap"])
 @pytest.mark.parametrize("mode", ["MESSAGE", "FILE"])
 def test_a_compressed_bag_is_read_by_its_directory_and_by_its_file(tmp_path, kind, mode):

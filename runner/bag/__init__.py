@@ -12,7 +12,7 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from runner.bag.files import METADATA, BagFiles
+from runner.bag.files import METADATA, SUFFIXES, BagFiles, is_named_like_a_bag
 from runner.bag.messages import Decoder, decoder
 from runner.bag.pictures import DEPTH_M, SECOND_NS, BadPicture, Picture, read_compressed, read_image, stamp_ns
 from runner.bag.storage import Channel, UnreadableError
@@ -22,7 +22,6 @@ from runner.errors import reason
 if TYPE_CHECKING:
     from typing import Self
 
-SUFFIXES = (".bag", ".mcap", ".db3")
 PICTURES: dict[str, Callable[[Any, float], Picture]] = {  # by type of message, also of ROS 1
     "sensor_msgs/msg/Image": read_image,
     "foxglove.RawImage": read_image,
@@ -68,7 +67,7 @@ class PictureForm:
 
 def is_bag(path: Path) -> bool:
     """Whether a path names a bag: its files' suffixes, or the directory of a ROS 2 bag."""
-    return _is_named_like_a_bag(path) if path.is_file() else (path / METADATA).is_file()
+    return is_named_like_a_bag(path) if path.is_file() else (path / METADATA).is_file()
 
 
 class Bag:
@@ -178,11 +177,13 @@ class Bag:
     def _messages(self, topic: str) -> Iterator[tuple[int, Any]]:
         """Messages of a topic, with the times at which they were recorded, ns since 1970; a ValueError: it is damaged.
 
-        raises  ModelError also if the file has fewer than it says
+        raises  ModelError also if there are fewer than the file, or the bag's metadata, says
         """
         kind, read = self.topics[topic], 0
         expected = sum(count for c, count in self._files.counts.items() if (c.topic, c.kind) == (topic, kind))
         with _readable("topic", self.names(topic)):
+            if expected < (stated := self._files.stated.get((topic, kind), 0)):
+                raise UnreadableError(f"{METADATA} states {stated} messages of this topic, and its files {expected}")
             for ns, channel, data in self._files.messages(topic):
                 if channel.kind == kind:
                     read += 1
@@ -218,18 +219,14 @@ def check_topic(path: Path, topic: str | None) -> None:
         raise ModelError("topic", bag.names(found), f"picture {bad.number}: {bad.why}")
 
 
-def _is_named_like_a_bag(path: Path) -> bool:
-    return path.with_suffix("").suffix in SUFFIXES if path.suffix == ".zstd" else path.suffix in SUFFIXES
-
-
 def _check_path(path: Path) -> None:
     if not path.exists():
         raise ModelError("bag", str(path), "no such file")
     if path.is_dir() and not (path / METADATA).is_file():
-        files = sorted(file.name for file in path.iterdir() if _is_named_like_a_bag(file))
+        files = sorted(file.name for file in path.iterdir() if is_named_like_a_bag(file))
         name = f"; a recorder that was killed writes none: name its file, {', '.join(files)}" if files else ""
         raise ModelError("bag", str(path), f"has no {METADATA}, which makes a directory a ROS 2 bag{name}")
-    if path.is_file() and not _is_named_like_a_bag(path):
+    if path.is_file() and not is_named_like_a_bag(path):
         kinds = f"a file *{', *'.join(SUFFIXES)}, or the directory of a ROS 2 bag"
         raise ModelError("bag", str(path), f"must be a bag: {kinds}")
 

@@ -11,8 +11,10 @@ from tempfile import TemporaryDirectory
 
 from runner.bag.ros1_file import Ros1File
 from runner.bag.sqlite_file import SqliteFile
-from runner.bag.storage import MCAP, ROS1, SQLITE, Message, Part, Storage, UnreadableError, merged, total
+from runner.bag.storage import MCAP, ROS1, SQLITE, Message, Part, Storage, UnreadableError, merged, normal, total
 
+SUFFIXES = (".bag", ".mcap", ".db3")
+ZSTD = ".zstd"  # follows the suffix of a compressed file
 METADATA = "metadata.yaml"  # makes a directory a ROS 2 bag
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
@@ -20,12 +22,14 @@ ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 class BagFiles:
     """All files of a bag as one, see `Storage`.
 
+    stated  number of messages by topic and type, by the metadata of a directory
     raises  UnreadableError, or any exception of a library if a file is damaged
     """
 
     def __init__(self, path: Path) -> None:
+        files, self.stated = _listed(path) if path.is_dir() else ([path], {})
         with ExitStack() as opened:
-            self._files = [_opened(file, opened) for file in files_of(path)]
+            self._files = [_opened(file, opened) for file in files]
             self._opened = opened.pop_all()
         self.counts = total(counted for file in self._files for counted in file.counts.items())
         self.start = min((file.start for file in self._files if file.counts), default=0)
@@ -41,22 +45,40 @@ class BagFiles:
             yield message._replace(data=_unpacked(message.data)) if packed else message
 
 
-def files_of(path: Path) -> list[Path]:
-    """The files of a bag: those that the metadata of a directory lists, in any order, or the one that is named."""
-    if path.is_file():
-        return [path]
+def is_named_like_a_bag(path: Path) -> bool:
+    """Whether a path has the suffix of a bag's file."""
+    return _unpacked_name(path.name).endswith(SUFFIXES)
+
+
+def _listed(directory: Path) -> tuple[list[Path], dict[tuple[str, str], int]]:
+    """The files that the metadata of a bag lists, in any order, and its numbers of messages by topic and type.
+
+    raises  UnreadableError also if the directory holds others
+    """
     import yaml
 
     try:
         loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # a bag of many topics has long metadata
-        document = yaml.load((path / METADATA).read_text(encoding="utf-8"), loader)
-        names = document["rosbag2_bagfile_information"]["relative_file_paths"]
-        files = [path / PurePath(name).name for name in names]  # older ones name the directory, too
-    except (yaml.YAMLError, UnicodeDecodeError, LookupError, TypeError) as error:
+        document = yaml.load((directory / METADATA).read_text(encoding="utf-8"), loader)["rosbag2_bagfile_information"]
+        names = [PurePath(name).name for name in document["relative_file_paths"]]  # older ones name the directory, too
+        topics = document.get("topics_with_message_count", ())
+        counted = [(topic["topic_metadata"], int(topic["message_count"])) for topic in topics]
+        stated = {(topic["name"], normal(topic["type"])): count for topic, count in counted}
+    except (yaml.YAMLError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise UnreadableError(f"{METADATA} names no files: {type(error).__name__}: {error}") from None
-    if missing := [file.name for file in files if not file.is_file()]:
+    if missing := [name for name in names if not (directory / name).is_file()]:
         raise UnreadableError(f"{METADATA} names {', '.join(missing)}, which must be in the same directory")
-    return files
+    # ROS unpacks a compressed file beside it.
+    known = {_unpacked_name(name) for name in names}
+    found = sorted(file.name for file in directory.iterdir() if is_named_like_a_bag(file))
+    if others := [name for name in found if _unpacked_name(name) not in known]:
+        remedy = "`ros2 bag reindex` lists all files; a file may also be named alone"
+        raise UnreadableError(f"{METADATA} does not name {', '.join(others)}: {remedy}")
+    return [directory / name for name in names], stated
+
+
+def _unpacked_name(name: str) -> str:
+    return name.removesuffix(ZSTD)
 
 
 def _opened(path: Path, opened: ExitStack) -> Storage:
