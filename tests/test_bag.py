@@ -260,6 +260,25 @@ def test_an_mcap_of_any_writer_is_read_whole_and_in_order(tmp_path, name):
     assert numbers(path) == list(range(COUNT))
 
 
+def test_messages_outside_chunks_are_read_beside_those_within(tmp_path):
+    from mcap.writer import Writer
+
+    path = tmp_path / "b.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2", "another program")
+        channel = writer.register_channel("/a", "cdr", writer.register_schema(*definition(IMAGE)))
+        for number, (_, ns, data) in enumerate(recorded()):
+            if number == 12:
+                writer._Writer__finalize_chunk()
+                writer._Writer__chunk_builder, chunks = None, writer._Writer__chunk_builder
+            if number == 13:
+                writer._Writer__chunk_builder = chunks
+            writer.add_message(channel, ns, data, ns)
+        writer.finish()
+    assert numbers(path) == list(range(COUNT))
+
+
 @pytest.mark.parametrize("form", ["ros1msg", "ros2idl", "none"])
 def test_definitions_of_each_kind_are_read(tmp_path, form):
     """Of ROS 1 in MCAP, of ROS 2 in IDL, and without one."""

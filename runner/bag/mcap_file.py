@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import BinaryIO
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
 from mcap.records import Channel as ChannelRecord
-from mcap.records import Chunk, McapRecord, Schema
+from mcap.records import Chunk, ChunkIndex, McapRecord, Schema
 from mcap.records import Message as MessageRecord
 from mcap.stream_reader import breakup_chunk
 
@@ -108,13 +109,22 @@ def _summarised(file: BinaryIO) -> _Index | None:
     counts = Counter({number: count for number, count in said.channel_message_counts.items() if count})
     described = {number for number, c in summary.channels.items() if not c.schema_id or c.schema_id in summary.schemas}
     is_whole = chunks and said.chunk_count == len(chunks) and said.message_count == counts.total()
-    if not is_whole or counts.keys() - described:
+    if not is_whole or counts.keys() - described or _has_loose(file, chunks):
         return None
     placed = [
         _PlacedChunk(c.chunk_start_offset + HEADER_BYTES, c.message_start_time, c.message_index_offsets.keys() or None)
         for c in chunks
     ]
     return _Index(summary.schemas, summary.channels, counts, placed)
+
+
+def _has_loose(file: BinaryIO, chunks: Iterable[ChunkIndex]) -> bool:
+    """Whether messages lie outside the chunks, where the summary does not say; also if what lies there is not clear."""
+    ends = {c.chunk_start_offset: c.chunk_start_offset + c.chunk_length + c.message_index_length for c in chunks}
+    try:
+        return any(kind == Opcode.MESSAGE for kind, *_ in _records(file, ends))
+    except ValueError:
+        return True
 
 
 def _scanned(file: BinaryIO) -> _Index:
@@ -144,13 +154,16 @@ def _scan_chunk(index: _Index, file: BinaryIO, at: int) -> None:
         index.chunks.append(_PlacedChunk(at, start, {record.channel_id for record in messages}))
 
 
-def _records(file: BinaryIO) -> Iterator[tuple[int, int, int]]:
-    """Kind of each record, and offset and length of its content.
+def _records(file: BinaryIO, skipped: Mapping[int, int] = MappingProxyType({})) -> Iterator[tuple[int, int, int]]:
+    """Kind of each record of the data, and offset and length of its content.
 
+    skipped  ends, by beginnings, of parts that are left out
     raises  ValueError if the file ends before its footer
     """
     at = len(MCAP)
     while True:
+        while (end := skipped.get(at, at)) > at:
+            at = end
         file.seek(at)
         head = file.read(HEADER_BYTES)
         if len(head) < HEADER_BYTES:
