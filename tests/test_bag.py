@@ -409,6 +409,22 @@ def test_a_database_whose_recorder_was_killed_is_read_whole(tmp_path):
         Bag(tmp_path / "killed")
 
 
+def test_a_database_whose_recorder_was_killed_within_a_transaction_says_what_to_do(tmp_path):
+    import shutil
+    import sqlite3
+
+    recorder = sqlite3.connect(tmp_path / "b.db3", isolation_level=None)
+    recorder.executescript("PRAGMA cache_size=1; CREATE TABLE messages(data BLOB); BEGIN;")
+    recorder.executemany("INSERT INTO messages VALUES(?)", [(bytes(4000),)] * 100)
+    (tmp_path / "killed").mkdir()
+    for file in tmp_path.glob("b.db3*"):
+        shutil.copy(file, tmp_path / "killed")
+    recorder.close()
+    rule = "cannot be read: its recorder was killed while it wrote, and b.db3-journal holds .*: `sqlite3 b.db3 .tables`"
+    with pytest.raises(ModelError, match=rule):
+        Bag(tmp_path / "killed" / "b.db3")
+
+
 def test_only_damaged_files_are_called_damaged(tmp_path):
     whole = write_mcap(tmp_path / "b.mcap", recorded(), {"/a": definition(IMAGE)})
     cut = tmp_path / "cut.mcap"

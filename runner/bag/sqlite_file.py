@@ -9,7 +9,8 @@ from urllib.parse import quote
 
 from runner.bag.storage import Channel, Message, UnreadableError, normal, total
 
-BESIDE = ("-wal", "-journal")  # suffixes of files that a killed recorder leaves; without them messages are missing
+JOURNAL = "-journal"
+BESIDE = ("-wal", JOURNAL)  # suffixes of files that a killed recorder leaves; without them messages are missing
 
 
 class SqliteFile:
@@ -59,6 +60,9 @@ class SqliteFile:
         if not self._unfinished:
             return f"it is no bag of rosbag2: {error}"
         left = ", ".join(path.name for path in self._unfinished)
+        if any(path.name.endswith(JOURNAL) for path in self._unfinished):
+            remedy = f"`sqlite3 {self._path.name} .tables` takes it back, in a directory that can be written"
+            return f"its recorder was killed while it wrote, and {left} holds what must be taken back: {remedy}"
         return f"its recorder was killed, and {left} can be read only in a directory that can be written: {error}"
 
 
