@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from fractions import Fraction
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -29,7 +30,9 @@ from bags import (
 from shared_data import shared
 
 from runner.bag import POSITIONS, Bag, PictureForm, is_bag
-from runner.bag.pictures import read_compressed, read_image
+from runner.bag.messages import decoder
+from runner.bag.pictures import image_format, read_compressed, read_image
+from runner.bag.storage import Channel
 from runner.core.model import ModelError
 
 ROAD = "video/forward_highway_day_540p25_A.mp4"
@@ -495,6 +498,32 @@ def test_a_damaged_message_is_a_picture_that_cannot_be_shown(tmp_path):
         found = list(opened.all_pictures("/a"))
     assert [number for number, each in enumerate(found) if not hasattr(each, "data")] == [4]
     assert found[4].why.startswith("a damaged message of 30 bytes: ")
+
+
+@pytest.mark.parametrize(
+    ("encoding", "data"),
+    [
+        ("protobuf", b"\x08\x05"),  # a number as the time, as text and as bytes; bytes as seconds
+        ("protobuf", b"\x22\x04rgb8\x20\x05"),
+        ("protobuf", b"\x30\x05"),
+        ("protobuf", b"\x0a\x03\x0a\x01x"),
+        ("json", b'{"width": 1e400}'),
+        ("json", b'{"timestamp": {"sec": 1e400}}'),
+        ("json", b"[" * 2000),
+    ],
+    ids=["time", "text", "bytes", "seconds", "size", "infinite", "deep"],
+)
+def test_a_message_with_values_of_other_types_is_damaged(encoding, data):
+    decode = decoder(Channel("/a", "foxglove.RawImage", encoding, ("", "")))
+    with pytest.raises(ValueError, match=f"^a damaged message of {len(data)} bytes: "):
+        decode(data)
+
+
+@pytest.mark.parametrize("size", [(-2, 2), (2, -2), (-2, -2), (0, 2)])
+def test_a_picture_has_a_size(size):
+    form = SimpleNamespace(encoding="mono8", width=size[0], height=size[1], step=2)
+    with pytest.raises(ValueError, match=f"^a picture of {size[0]}x{size[1]} with rows of 2 bytes, must be at least "):
+        image_format(form, 100)
 
 
 # --- the command line -------------------------------------------------------------------------------------------------

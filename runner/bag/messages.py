@@ -100,7 +100,7 @@ def _from_json(data: bytes, likes: Mapping[str, Any]) -> Any:
             if name != "timestamp":
                 value = given.get(name, like)
                 setattr(message, name, base64.b64decode(value) if isinstance(like, bytes) else type(like)(value))
-    except (ValueError, TypeError, AttributeError) as error:
+    except (ValueError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
         raise ValueError(f"a damaged message of {len(data)} bytes: {error}") from None
     return message
 
@@ -109,19 +109,24 @@ def _from_protobuf(data: bytes, fields: Mapping[int, tuple[str, Any]]) -> Any:
     try:
         found = _protobuf_fields(data)
         message = SimpleNamespace(**{name: _typed(found.get(n, like), like) for n, (name, like) in fields.items()})
-        seconds = _protobuf_fields(message.timestamp)
+        at = _protobuf_fields(message.timestamp)
+        message.timestamp = SimpleNamespace(**{part: _typed(at.get(n, 0), 0) for n, part in ((1, "sec"), (2, "nsec"))})
     except (IndexError, ValueError, struct.error) as error:
         raise ValueError(f"a damaged message of {len(data)} bytes: {error}") from None
-    message.timestamp = SimpleNamespace(sec=seconds.get(1, 0), nsec=seconds.get(2, 0))
     return message
 
 
 def _typed(value: Any, like: Any) -> Any:
-    """A value of the wire as the type of the field."""
+    """A value of the wire as the type of the field.
+
+    raises  ValueError or struct.error if it is of another type
+    """
     if isinstance(value, bytes) and not isinstance(like, bytes):
         if isinstance(like, str):
             return value.decode()
         return struct.unpack("<d" if isinstance(like, float) else "<I", value)[0]
+    if type(value) is not type(like):
+        raise ValueError(f"{value!r} in a field of type {type(like).__name__}")
     return value
 
 

@@ -98,7 +98,7 @@ def read_image(message: Any, depth_m: float = DEPTH_M) -> Picture:
     raises   ValueError with the rule that it breaks
     """
     form = image_format(message, len(message.data))
-    data = bytes(packed_rows(message, message.data, depth_m).tobytes())
+    data: bytes = packed_rows(message, message.data, depth_m).tobytes()
     return Picture(stamp_ns(message), form, int(message.width), int(message.height), data)
 
 
@@ -134,7 +134,7 @@ def image_format(form: RawForm, size: int) -> str:
         raise ValueError(f"encoding {form.encoding!r} is not supported; expected one of {', '.join(ENCODINGS)}")
     name, pixel = FORMATS[wide[0] if wide else form.encoding]
     row = form.width * (wide[1] if wide else pixel)
-    if not form.width or not form.height or form.step < row:
+    if form.width <= 0 or form.height <= 0 or form.step < row:
         found = f"a picture of {form.width}x{form.height} with rows of {form.step} bytes"
         raise ValueError(f"{found}, must be at least {max(1, row)}")
     rows = _row_count(form)
