@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import weakref
 from fractions import Fraction
 from types import SimpleNamespace
 
@@ -29,7 +30,7 @@ from bags import (
 )
 from shared_data import shared
 
-from runner.bag import POSITIONS, Bag, PictureForm, is_bag
+from runner.bag import POSITIONS, Bag, PictureForm, is_bag, mcap_file
 from runner.bag.messages import decoder
 from runner.bag.pictures import image_format, read_compressed, read_image
 from runner.bag.storage import Channel
@@ -524,6 +525,26 @@ def test_a_picture_has_a_size(size):
     form = SimpleNamespace(encoding="mono8", width=size[0], height=size[1], step=2)
     with pytest.raises(ValueError, match=f"^a picture of {size[0]}x{size[1]} with rows of 2 bytes, must be at least "):
         image_format(form, 100)
+
+
+def test_chunks_are_held_only_while_they_are_read(tmp_path, monkeypatch):
+    """Although another topic makes all of them begin at once."""
+    held, most = [], 0
+    read = mcap_file.McapFile._of_chunk
+
+    def counted(file, placed, wanted):
+        nonlocal most
+        messages = read(file, placed, wanted)
+        held.append(weakref.ref(messages))
+        most = max(most, sum(each() is not None for each in held))
+        return messages
+
+    monkeypatch.setattr(mcap_file.McapFile, "_of_chunk", counted)
+    messages = [each for one in recorded(60) for each in (one, ("/other", 0, bytes(400)))]
+    schemas = {"/a": definition(IMAGE), "/other": ("o", "jsonschema", b"{}")}
+    path = write_mcap(tmp_path / "b.mcap", messages, schemas, encodings={"/other": "json"}, chunk_size=500)
+    assert numbers(path) == list(range(60))
+    assert most <= 3
 
 
 # --- the command line -------------------------------------------------------------------------------------------------

@@ -59,7 +59,7 @@ class Part(NamedTuple):
     """Messages in order of time.
 
     start  no message is earlier
-    read   opens it
+    read   opens it; may be called again
     """
 
     start: int
@@ -67,16 +67,26 @@ class Part(NamedTuple):
 
 
 def merged(parts: Iterable[Part]) -> Iterator[Message]:
-    """The messages of all parts in order of time. A part is opened only when its start has been reached."""
-    waiting = sorted(parts, key=lambda part: part.start, reverse=True)
+    """The messages of all parts in order of time. A part stays open only from its first message on.
+
+    Its start may be that of other messages; then it is opened again at its own first one.
+    """
+    ranked = enumerate(sorted(parts, key=lambda part: part.start))
+    waiting = [(part.start, rank, part.read) for rank, part in ranked]  # a heap
     heads: list[tuple[int, int, Message, Iterator[Message]]] = []
     while waiting or heads:
-        if waiting and (not heads or waiting[-1].start <= heads[0][0]):
-            rank, rest = -len(waiting), waiting.pop().read()
+        if waiting and (not heads or waiting[0][0] <= heads[0][0]):
+            start, rank, read = heappop(waiting)
+            rest = read()
+            following = next(rest, None)
+            if following and waiting and following.ns > max(start, waiting[0][0]):
+                heappush(waiting, (following.ns, rank, read))
+                continue
         else:
             _, rank, message, rest = heappop(heads)
             yield message
-        if following := next(rest, None):
+            following = next(rest, None)
+        if following:
             heappush(heads, (following.ns, rank, following, rest))
 
 
