@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
+import random
+from bisect import bisect_right
+from itertools import accumulate, pairwise
 
 import pytest
 
@@ -69,3 +71,29 @@ def test_a_rate_of_three_quarters_is_not_told():
 def test_nothing_is_known_of_a_silent_camera():
     seen = looked((10, 6), (0, 3))
     assert (seen[-1][1], seen[-1][2]) == (1.0, None)
+
+
+def test_a_low_rate_that_varies_a_little_is_told_once():
+    """Each other number would be published with the whole state of the vehicle."""
+    chance, rate, told = random.Random(1), PictureRate(40.0), []
+    arrivals = list(accumulate(chance.uniform(0.9, 1.1) / 11.5 for _ in range(11 * 30)))
+    for look in range(int(arrivals[-1] / LOOK_S)):
+        rate.look(look * LOOK_S, bisect_right(arrivals, look * LOOK_S))
+        told.append(rate.slow_fps)
+    assert len(set(told)) <= 3  # None, then the rate
+    assert told[-1] == pytest.approx(11.5, abs=1)
+
+
+def test_a_camera_that_falls_silent_is_not_back_at_its_rate():
+    rate = PictureRate(40.0)
+    for look in range(400):
+        rate.look(look * LOOK_S, min(look, 300) // 5)
+        assert not (look > 100 and rate.is_steady)
+    assert rate.slow_fps is None
+
+
+def test_pictures_that_the_network_holds_up_are_not_the_camera_s():
+    rate = PictureRate(40.0)
+    for look in range(500):
+        rate.look(look * LOOK_S, look // 5, is_held_up=look % 5 == 4)
+        assert (rate.pace, rate.slow_fps) == (1.0, None)

@@ -11,6 +11,7 @@ WINDOW_S = 2.0  # over which the rate is measured
 SPAN_S = 0.4  # the fastest part of that, as long as this, counts for the encoder: a stall is no lower rate
 MARGIN = 1.1  # by which it must differ from what the encoder was told, or from the camera's rate
 PACES = (0.25, 8.0)  # limits of the pace
+ANOTHER, ANOTHER_HZ = 0.15, 1.0  # change of a low rate that is told: as a share of it, and at least so much
 SILENT_S, SILENT_INTERVALS = 1.0, 3  # without a picture, after which nothing is known about the rate
 STEADY = 0.8  # share of the camera's rate from which it is not slow any more
 
@@ -18,7 +19,8 @@ STEADY = 0.8  # share of the camera's rate from which it is not slow any more
 class PictureRate:
     """The rate of a camera's pictures, for encoders that count frames in place of time, and for the driver.
 
-    fps  the camera's rate in force, Hz
+    fps        the camera's rate in force, Hz
+    is_steady  whether it was last measured to be about that; False while nothing is known
 
     `pace` is the camera's rate as a multiple of the one that arrives: an encoder that counts frames holds its bitrate
     if it is told that many times as much. It rises once the lower rate has lasted for a while, and falls at once:
@@ -27,12 +29,13 @@ class PictureRate:
 
     def __init__(self, fps: float) -> None:
         self._fps = fps
-        self._counted, self._last = 0, 0.0
+        self._counted, self._last, self._held = 0, 0.0, -WINDOW_S
         self._allowance = Allowance()
         self._forget()
 
     def _forget(self) -> None:
         self.pace = 1.0
+        self.is_steady = False
         self.slow_fps: float | None = None  # the rate that arrives, Hz, if it has been well below the camera's for long
         self._seen: deque[tuple[float, int]] = deque()  # when a number of pictures was first counted
         self._slow_since: float | None = None
@@ -42,12 +45,15 @@ class PictureRate:
         """Time since the last picture, s; 0 before the first."""
         return now - self._last if self._last else 0.0
 
-    def look(self, now: float, count: int) -> None:
+    def look(self, now: float, count: int, is_held_up: bool = False) -> None:
         """Many times a second, from one thread.
 
-        now    s by any steady clock
-        count  of the pictures so far
+        now         s by any steady clock
+        count       of the pictures so far
+        is_held_up  whether the network holds up the last one: how many the camera delivers cannot be seen then
         """
+        if is_held_up:
+            self._held, self._slow_since = now, None
         new, self._counted = count - self._counted, count
         limit_s = max(SILENT_S, SILENT_INTERVALS * self.pace / self._fps)
         if new < 0 or (self._seen and now - self._seen[-1][0] > limit_s):
@@ -59,7 +65,7 @@ class PictureRate:
             self._seen.append((now, count))
             while len(self._seen) > 2 and now - self._seen[1][0] > WINDOW_S:
                 self._seen.popleft()
-            if now - self._seen[0][0] >= WINDOW_S / 2:
+            if now - self._seen[0][0] >= WINDOW_S / 2 and now - self._held > WINDOW_S:
                 self._measure(now)
 
     def _measure(self, now: float) -> None:
@@ -84,12 +90,14 @@ class PictureRate:
         return max(rates, default=self._fps)
 
     def _judge(self, now: float, rate: float) -> None:
-        if rate >= self._fps * (STEADY if self.slow_fps else SLOW):
+        self.is_steady = rate >= self._fps * (STEADY if self.slow_fps else SLOW)
+        if self.is_steady:
             self._slow_since = self.slow_fps = None
             return
         if self._slow_since is None:
             self._slow_since = now
-        if now - self._slow_since >= SLOW_S:
+        is_told = self.slow_fps and abs(rate - self.slow_fps) <= max(ANOTHER_HZ, ANOTHER * self.slow_fps)
+        if now - self._slow_since >= SLOW_S and not is_told:
             self.slow_fps = rate
 
 

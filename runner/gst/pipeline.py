@@ -12,6 +12,7 @@ from runner.core.commands import KnobValue
 from runner.errors import RunError
 from runner.graph import Plan, is_restarted_after_gaps
 from runner.gst.arriving import CAPTURE_ID
+from runner.gst.held_up import HeldUp
 from runner.gst.knobs import KnobPanel
 from runner.gst.picture_rate import PictureRate
 from runner.gst.probes import BufferProbe, PassingBuffer, TypeProbe
@@ -83,6 +84,7 @@ class CameraPipeline:
         self._pushed: PushedPictures | None = None  # those of a Python program
         self._elements = [pipeline.get_by_name(element.name) for element in plan.vehicle]
         self._encoder = EncoderWatch(self._elements)
+        self._entered = _count_before(self._encoder.encoder) if self._encoder.encoder else None
         entry = self._elements[0].get_static_pad("sink")
         self._repeats = RepeatDetector(entry, plan.camera.source.repeated_s, on_report)
         last = next(pad for element in reversed(self._elements) if (pad := element.get_static_pad("src")))
@@ -91,6 +93,7 @@ class CameraPipeline:
         if payloader:
             _add_capture_time(payloader)
         self.knobs.set_now(self._allowed(self._first))
+        self._held_up = HeldUp(last)
         self.requests = RequestLimit(last, on_report)
         self._first_packet = BufferProbe(last, self._on_first_packet, in_lists=True)
         self._first_packet.arm()
@@ -165,25 +168,36 @@ class CameraPipeline:
         return push_shared(self._pipeline.get_by_name(self._plan.source[0].name), picture, self._plan.camera.fps)
 
     def look(self) -> None:
-        """Look what has passed; many times a second, from one thread."""
-        now = time.monotonic()
+        """Look what has passed; many times a second, from one thread. After an exception the encoder's pace is 1."""
+        try:
+            self._look(time.monotonic())
+        except Exception:
+            if self.knobs.pace != 1:
+                self.knobs.pace = 1.0  # nothing would lower it once the camera is faster
+            raise
+
+    def _look(self, now: float) -> None:
         self._limits.look(now)
-        if self._sent:
-            self._look_at_rate(now)
+        if self._entered:
+            self._look_at_rate(now, passed_counts(self._entered)[0])
         if self.sent_frames:
             self.sent_frames.look()
 
-    def _look_at_rate(self, now: float) -> None:
-        was_slow = self.slow_fps is not None
-        self._rate.look(now, self.counters()[0])
+    def _look_at_rate(self, now: float, entered: int) -> None:
+        """entered: pictures before the encoder. Behind it, those that it leaves out would count as the camera's."""
+        was_slow, silent_s = self.slow_fps, self._rate.silent_s(now)
+        is_held_up = self._held_up.look(silent_s > self.frame_s)
+        self._rate.look(now, entered, is_held_up)
         if self._rate.pace != self.knobs.pace:
             self.knobs.pace = self._rate.pace
-        was_gap, self._is_gap = self._is_gap, self._rate.silent_s(now) > max(GAP_S, GAP_INTERVALS * self.frame_s)
+        was_gap, self._is_gap = self._is_gap, not is_held_up and silent_s > max(GAP_S, GAP_INTERVALS * self.frame_s)
         if self._is_gap and not was_gap and self._restarts_after_gaps:
             self.knobs.restart_encoder("size")
-        if (self.slow_fps is not None) != was_slow:
-            rate = f"{float(self._plan.camera.fps):g} Hz"
-            self._on_report(f"{rate} again" if was_slow else f"{self.slow_fps} of {rate}")
+        rate = f"{float(self._plan.camera.fps):g} Hz"
+        if self.slow_fps and not was_slow:
+            self._on_report(f"{self.slow_fps} of {rate}")
+        elif was_slow and self._rate.is_steady:
+            self._on_report(f"{rate} again")
 
     @property
     def slow_fps(self) -> int | None:
@@ -242,6 +256,17 @@ def _add_capture_time(payloader: Gst.Element) -> None:
     extension = GstRtp.RTPHeaderExtension.create_from_uri(CAPTURE_TIME)
     extension.set_id(CAPTURE_ID)
     payloader.emit("add-extension", extension)
+
+
+def _count_before(encoder: Gst.Element) -> Gst.Element:
+    """Put an identity in front of the encoder of a pipeline that does not play yet, which counts its pictures."""
+    counter, entry = Gst.ElementFactory.make("identity"), encoder.get_static_pad("sink")
+    above = entry.get_peer()
+    encoder.get_parent().add(counter)
+    above.unlink(entry)
+    above.link(counter.get_static_pad("sink"))
+    counter.get_static_pad("src").link(entry)
+    return counter
 
 
 def passed_counts(identity: Gst.Element) -> tuple[int, int]:

@@ -27,10 +27,11 @@ class EncoderWatch:
     """Measures sampled pictures as they enter and leave the encoder; no Python runs for the others.
 
     elements  of the pipeline from gate to payloader; nothing is measured unless one is an encoder
+    encoder   None if none is
     """
 
     def __init__(self, elements: Iterable[Gst.Element]) -> None:
-        encoder = next((element for element in elements if _is_encoder(element)), None)
+        self.encoder = encoder = next((element for element in elements if _is_encoder(element)), None)
         self._into = BufferProbe(encoder.get_static_pad("sink"), self._on_raw) if encoder else None
         self._out = BufferProbe(encoder.get_static_pad("src"), self._on_coded) if encoder else None
         self._remaining = 0

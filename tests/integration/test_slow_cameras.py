@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from rig import SMALL_ROBOT, streaming, until, watching
+from rtsp_client import RtspClient
 from runner.core.commands import Command
 
 WIDTH, HEIGHT, KBPS = 424, 240, 1000
@@ -23,15 +24,18 @@ class Feed:
     """
 
     def __init__(self, side, hz, noise=255):
+        self.set_noise(noise)
+        self._side, self.hz = side, hz
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def set_noise(self, noise):
         chance = np.random.default_rng(1)
         bands = (np.arange(2 * WIDTH) // 9 * 29 % 190).astype(np.uint8)
         self._noise = bands % (256 - noise) + chance.integers(
             0, noise + 1, (HEIGHT * 3 // 2, 2 * WIDTH), dtype=np.uint8
         )
-        self._side, self.hz = side, hz
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
 
     def _run(self):
         number, due = 0, time.monotonic()
@@ -51,17 +55,22 @@ class Feed:
 
 
 @contextmanager
-def fed(hz, *words, noise=255):
+def feeding(hz, *words, noise=255):
     with streaming(*WORDS, *words, cameras=("rear",)) as (side, _, (plan,), reported):
         knobs = {"sending": True, "size": (WIDTH, HEIGHT), "bitrate": KBPS}
         side.turn([Command("rear", knob, value) for knob, value in knobs.items()])
         feed = Feed(side, hz, noise)
         try:
-            with watching(plan) as client:
-                until(lambda: client.frames_with_retry() > 3)
-                yield side, feed, client, reported
+            yield side, feed, plan, reported
         finally:
             feed.end()
+
+
+@contextmanager
+def fed(hz, *words, noise=255):
+    with feeding(hz, *words, noise=noise) as (side, feed, plan, reported), watching(plan) as client:
+        until(lambda: client.frames_with_retry() > 3)
+        yield side, feed, client, reported
 
 
 def kbps(side, seconds):
@@ -82,6 +91,37 @@ def test_after_a_pause_the_encoder_makes_up_for_nothing(graph):
         time.sleep(3)
         feed.hz = 25
         assert kbps(side, 1) <= 1.15 * KBPS
+
+
+def test_openh264_is_not_restarted_by_the_pictures_that_it_leaves_out_itself():
+    """Each restart would be a key picture as large as a second of the bitrate; and the camera is not slow."""
+    with fed(25, "graph=openh264_rtsp", "cameras.rear.fps=25", noise=12) as (side, feed, _, reported):
+        side.turn([Command("rear", "bitrate", 300)])
+        time.sleep(1)
+        feed.set_noise(120)
+        time.sleep(1)  # the first picture after the cut is larger
+        assert kbps(side, 4) <= 1.3 * 300
+    assert not [line for line in reported if "Hz" in line]
+
+
+@pytest.mark.soak
+@pytest.mark.players
+def test_a_jammed_viewer_over_tcp_makes_no_camera_slow():
+    """Neither is the driver told so, nor does the encoder give each picture more bits, which would jam it more."""
+    with feeding(40, noise=60) as (side, _, plan, reported):
+        url = str(plan.operator[0].properties["location"]).replace("/feedback", "")
+        with RtspClient(url, small=True) as client:
+            assert client.open() == [200, 200, 200]
+            client.delay_s = 0.06
+            client.read()
+            time.sleep(3)
+            first, paces = side.sent()["rear"][0], []
+            for _ in range(400):
+                paces.append(side._pipeline("rear").knobs.pace)
+                time.sleep(0.02)
+            assert side.sent()["rear"][0] - first < 8 * 28  # it is jammed
+    assert set(paces) == {1.0}
+    assert not [line for line in reported if "Hz" in line]
 
 
 def test_a_camera_at_a_quarter_of_its_rate_gets_its_bitrate_and_is_named():
