@@ -45,7 +45,7 @@ from runner.gst.registry import (
 from runner.gst.rtspsrc import limit_teardown
 from runner.gst.server import CameraServer, OnReport
 from runner.gst.supervised import CameraCaller
-from runner.gst.timers import every
+from runner.gst.timers import Guarded, every
 from runner.gst.video_files import VideoFile, VideoFiles
 from runner.gst.watched import WatchedSource
 from runner.inputs import input_problem
@@ -284,6 +284,7 @@ class VehicleSide:
             for p in plans
             if not p.serves
         }
+        self._looks = [self._guarded_look(plan.camera.name) for plan in plans]
         served = [plan for plan in plans if plan.serves]
         self._lost = LostCameras(plans, lost, _source_problem, self._on_found)
 
@@ -452,9 +453,17 @@ class VehicleSide:
 
     def _look(self) -> None:
         """Look which pictures of each camera have passed since it looked last."""
-        for name in self._wanted:
+        for look in self._looks:
+            look()
+
+    def _guarded_look(self, name: str) -> Guarded:
+        """That of one camera, whose fault concerns no other."""
+
+        def look() -> None:
             if pipeline := self._pipeline(name):
                 pipeline.look()
+
+        return Guarded(look, lambda what: self._on_report(name, f"its pictures are not counted: {what}"))
 
     def _on_knobs_turned(self) -> None:
         self.on_turned()  # looked up now: it may have been set after the pipeline was built

@@ -24,6 +24,25 @@ class Delayed:
         self.work = None
 
 
+class Guarded:
+    """Calls a function again and again, whatever it raises.
+
+    on_fault  called with an exception in words; again only if it changes, or returns after the work has succeeded
+    """
+
+    def __init__(self, work: Callable[[], None], on_fault: Callable[[str], None]) -> None:
+        self._work, self._on_fault, self._fault = work, on_fault, ""
+
+    def __call__(self) -> None:
+        before, self._fault = self._fault, ""
+        try:
+            self._work()
+        except Exception as error:
+            self._fault = f"{type(error).__name__}: {error}"
+            if self._fault != before:
+                self._on_fault(self._fault)
+
+
 class _Delays:
     """Calls that are due later. They share one timer, since each would leak memory: runner/gst/probes.py."""
 
@@ -69,20 +88,13 @@ def later(delay_s: float, work: Callable[[], None]) -> Delayed:
 def every(interval_ms: int, work: Callable[[], None], on_fault: Callable[[str], None]) -> int:
     """Call a function at intervals, in GLib's thread, whatever it raises: PyGObject would end the timer.
 
-    on_fault  called with an exception in words; again only if it changes, or returns after the work has succeeded
+    on_fault  as of `Guarded`
     returns   the timer, for `GLib.source_remove`
     """
-    fault = ""
+    guarded = Guarded(work, on_fault)
 
     def call() -> bool:
-        nonlocal fault
-        before, fault = fault, ""
-        try:
-            work()
-        except Exception as error:
-            fault = f"{type(error).__name__}: {error}"
-            if fault != before:
-                on_fault(fault)
+        guarded()
         return True
 
     return int(GLib.timeout_add(interval_ms, call))

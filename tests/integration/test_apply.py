@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 import time
+from contextlib import ExitStack
 from fractions import Fraction
 
 import numpy as np
@@ -17,6 +18,7 @@ from runner.core.commands import Command
 from runner.core.model import Roi
 from runner.errors import RunError
 from runner.gst.knobs import KnobPanel
+from runner.gst.pipeline import CameraPipeline
 from runner.gst.pushed import PushedPictures
 
 CAMERA = "front_left"
@@ -56,6 +58,29 @@ def test_a_knob_turned_while_a_pipeline_is_built_is_set(monkeypatch):
         with watching(plan) as client:
             until(lambda: client.sizes[-1:] == [(240, 130)])
             assert side.applied()[CAMERA]["bitrate"] == 777
+
+
+def test_a_fault_while_looking_at_one_camera_is_named_and_leaves_the_others_alone(monkeypatch):
+    look = CameraPipeline._look
+
+    def failing(self, now):
+        if self._plan.camera.name == CAMERA:
+            raise ValueError("no such property")
+        look(self, now)
+
+    with streaming(cameras=(CAMERA, "front_right")) as (side, _, plans, reported), ExitStack() as stack:
+        for plan in plans:
+            stack.enter_context(watching(plan))
+        until(lambda: set(side.sent_frames()) == {CAMERA, "front_right"})
+        pipeline = side._pipeline(CAMERA)
+        turn(side, bitrate=500)
+        pipeline.knobs.pace = 4.0
+        monkeypatch.setattr(CameraPipeline, "_look", failing)
+        until(lambda: f"{CAMERA}: its pictures are not counted: ValueError: no such property" in reported)
+        until(lambda: pipeline.knobs.pace == 1)
+        side.sent_frames()
+        until(lambda: len(side.sent_frames()["front_right"]) > 1)
+    assert sum("not counted" in line for line in reported) == 1
 
 
 def sent_in_frames(side, count):
