@@ -238,6 +238,7 @@ class CameraServer:
                 camera.prepared = True
                 if camera.stage is _Stage.BUILT:  # it has not failed in the meantime
                     camera.stage = _Stage.OPEN
+                    self._lost.open(camera.name)
                 self._changed.notify_all()
 
     def _on_target_state(self, media: GstRtspServer.RTSPMedia, state: int, camera: _Camera) -> None:
@@ -309,9 +310,10 @@ class CameraServer:
 
     def _note_slow(self, camera: _Camera) -> None:
         """Let the other cameras have the share of one that takes long to open."""
-        opening = camera.opening
-        if opening and not opening.over and time.monotonic() - opening.since > SLOW_S:
-            self._lost.delay(camera.name, f"it has delivered nothing for {SLOW_S:g} s")
+        with self._changed:  # it may be opening just now
+            opening = None if camera.is_open else camera.opening
+            if opening and not opening.over and time.monotonic() - opening.since > SLOW_S:
+                self._lost.delay(camera.name, f"it has delivered nothing for {SLOW_S:g} s")
 
     def _is_settled(self, camera: _Camera, opening: _Opening | None) -> bool:
         """Whether waiting for a camera to open is over."""
@@ -337,8 +339,6 @@ class CameraServer:
             opening.failed = media is None or not self._prepare(media, thread, camera)
             if opening.failed:
                 self._lost.fail(camera.name, opening.problem or "it delivers nothing")
-            else:
-                self._lost.open(camera.name)
             if media is not None and not opening.failed:
                 if camera.is_open:
                     opening.held.wait(HELD_S)
@@ -494,15 +494,15 @@ class CameraServer:
                 self._viewers.viewer(new_viewer.certificate) if self._viewers else operator_of(_user_agent(context))
             )
             new_viewer.identify(operator)
-            if _wants_udp(context):
-                new_viewer.refused_udp.add(camera.name)  # until it is set up
-            if camera.name in new_viewer.cameras:
-                return OK
             current = [c for c in self._connections.values() if camera.name in c.cameras]
-            leaving = admit([c.viewer for c in current], new_viewer.viewer, self._media.max_viewers, self.controller)
+            viewers = [c.viewer for c in current]
+            is_admitted = new_viewer in current
+            leaving = [] if is_admitted else admit(viewers, new_viewer.viewer, self._media.max_viewers, self.controller)
             if leaving is None:
                 return REFUSED
-            new_viewer.cameras[camera.name] = None
+            new_viewer.cameras.setdefault(camera.name, None)
+            if _wants_udp(context):
+                new_viewer.refused_udp.add(camera.name)  # until it is set up
         for connection in current:
             if connection.viewer in leaving:
                 self._close(connection, f"the operator in control watches from {new_viewer.viewer.address}")
@@ -702,17 +702,20 @@ def _watches(client: GstRtspServer.RTSPClient, connection: RtspConnection) -> bo
 
 
 def _end_other(client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext) -> bool:
-    """End what a connection has set up of the requested camera in other sessions; False if it is being sent a copy.
+    """End what a connection has set up of the requested camera elsewhere; False if it is being sent a copy.
+
+    Elsewhere is in another session, or in the same one by the camera's other path.
 
     The library would not end that copy: it would go on after the viewer has left, and nobody would count it. A camera
     that is not being sent may be set up again: ffmpeg does so in a new session when it pauses UDP to try TCP.
     """
     held = [(session, media) for session, media in _set_up(client) if media.get_media() is context.media]
+    own = context.session and context.session.get_media(context.uri.abspath)[0]
     sent = context.stream.transport_filter(None)
     if any(transport in sent for _, media in held for transport in _transports(media)):
         return False
     for session, media in held:
-        if session is not context.session:
+        if session is not context.session or media is not own:
             _end(session, media)
     return True
 

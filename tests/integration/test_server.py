@@ -18,6 +18,7 @@ import pytest
 from rig import NOISE, SMALL_FRONT, answers, streaming, until
 from rtsp_client import RtspClient
 from runner.core.commands import Command
+from runner.graph import FEEDBACK
 from runner.gst import GLib, Gst
 from runner.gst.requests import AT_ONCE, KEY_UNIT_S, REPEATED
 from runner.gst.server import CameraServer
@@ -197,6 +198,38 @@ def test_a_camera_that_delivers_nothing_is_answered_503_and_opens_when_it_delive
         with RtspClient(vehicle.url()) as client:
             assert client.open() == [200, 200, 200]
         assert vehicle.pipelines() == 1  # the one requested by the first client
+
+
+def test_a_viewer_whose_time_is_up_does_not_count_a_camera_as_lost_that_has_just_opened(monkeypatch):
+    """It opens between the end of a viewer's wait and the note about it."""
+    monkeypatch.setattr("runner.gst.server.SLOW_S", 0.1)
+    with serving("source=appsrc") as vehicle:
+        with RtspClient(vehicle.url()) as client:
+            assert client.open() == [503]
+        assert CAMERA in vehicle.side.lost()
+        server = vehicle.side._server
+        camera = server._cameras[CAMERA]
+        until(lambda: vehicle.side.push(CAMERA, bytes(480 * 260 * 3 // 2)))
+        until(lambda: camera.is_open)
+        until(lambda: not vehicle.side.lost())
+        assert camera.opening  # until a viewer holds it
+        server._note_slow(camera)
+        assert vehicle.side.lost() == {}
+
+
+@pytest.mark.parametrize("udp", [True, False], ids=["udp", "tcp"])
+@pytest.mark.parametrize("paths", [(f"/{FEEDBACK}", ""), ("", f"/{FEEDBACK}")], ids=["feedback first", "plain first"])
+def test_a_session_gets_one_copy_of_a_camera_by_whichever_of_its_paths(paths, udp):
+    with serving(*SMALL, cameras=(SMALL_CAMERA,)) as vehicle, RtspClient(vehicle.url(SMALL_CAMERA)) as viewer:
+        urls = [f"{vehicle.url(SMALL_CAMERA)}{path}" for path in paths]
+        for number, url in enumerate(urls):
+            assert viewer.ask("DESCRIBE", url, Accept="application/sdp") == 200
+            transport = viewer.transport("RTP/AVP", udp=udp, channel=2 * number)
+            viewer.ask("SETUP", f"{url}/stream=0", Transport=transport)
+        played = [url for url in urls if viewer.ask("PLAY", url) == 200]
+        assert len(played) == 1
+        stream = vehicle.side._server._cameras[SMALL_CAMERA].media.get_stream(0)
+        assert len(stream.transport_filter(None)) == 1
 
 
 def test_a_camera_can_be_reopened_immediately():
