@@ -10,7 +10,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from fractions import Fraction
 from functools import partial
@@ -413,8 +412,7 @@ class VehicleSide:
     def _on_found(self, name: str) -> None:
         """From the thread that tries again. A viewer makes the server open its camera."""
         if name in self._callers:
-            with suppress(RunError):  # GStreamer hangs, or ends
-                self._glib.call(f"starting {name}", self._callers[name].start)
+            self._glib.call(f"starting {name}", self._callers[name].start)
 
     def _build(self, pipeline: Gst.Bin, plan: Plan) -> CameraPipeline:
         """Set up a newly built pipeline, with every knob at its wanted value."""

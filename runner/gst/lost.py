@@ -6,8 +6,11 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
+from runner.errors import RunError
 from runner.graph import Plan
+from runner.gst.aside import HUNG_STARTING, change_in_thread
 from runner.system.backoff import pause_s
 
 BACKOFF_S = (1.0, 10.0)  # between two attempts: doubled from the first value up to the second
@@ -26,14 +29,14 @@ class _Loss:
 
 
 class LostCameras:
-    """May be used from any thread. Sources are tested in a thread of its own, since that may take seconds.
+    """May be used from any thread. Each source is tested in a thread of its own: a device may block it for good.
 
     A source that does not open by itself, such as a missing device, is tested again until it does. One that opens and
     delivers nothing, such as an address where no camera answers, is tried again by its viewers, when that is due.
 
     lost      by camera that does not open at the start, why
     problem   returns why a source does not open; None: it opens
-    on_found  called with a camera whose source opens again
+    on_found  called with a camera whose source opens again; if it raises, the camera is still lost
     """
 
     def __init__(
@@ -47,6 +50,7 @@ class LostCameras:
         self._changed = threading.Condition()
         due = time.monotonic() + BACKOFF_S[0]
         self._losses = {name: _Loss(why, due, is_tested=True) for name, why in lost.items()}
+        self._testing: set[str] = set()
         self._stopped = False
         threading.Thread(target=self._run, name="lost", daemon=True).start()
 
@@ -96,26 +100,39 @@ class LostCameras:
                 if self._stopped:
                     return
                 now = time.monotonic()
-                due = [name for name, loss in self._losses.items() if loss.must_test and now >= loss.due]
+                idle = [(name, loss) for name, loss in self._losses.items() if name not in self._testing]
+                due = [name for name, loss in idle if loss.must_test and now >= loss.due]
+                self._testing.update(due)
             for name in due:
-                self._test(name)
+                change_in_thread(f"test {name}", partial(self._test, name), partial(self._note_hung, name))
+
+    def _note_hung(self, name: str) -> None:
+        with self._changed:
+            if (loss := self._losses.get(name)) and name in self._testing:
+                loss.reason = f"its source {HUNG_STARTING}"
 
     def _test(self, name: str) -> None:
         try:
             why = self._problem(self._plans[name])
-        except Exception as error:  # the thread must go on: nothing else tries again
+            with self._changed:
+                loss = self._losses.get(name)
+                is_found = loss is not None and why is None and loss.is_tested and not self._stopped
+            if is_found:
+                self._on_found(name)
+        except RunError as error:
+            why = str(error)
+        except Exception as error:  # it must be tried again: nothing else does
             why = f"{type(error).__name__}: {error}"
         with self._changed:
-            loss = self._losses.get(name)
-            if loss is None:
-                return
-            is_found = why is None and loss.is_tested
-            if why is not None:
-                loss.is_tested = True
-                self._put_off(loss, why)
-            elif is_found:
-                del self._losses[name]
-            else:
-                loss.must_test = False
-        if is_found and not self._stopped:
-            self._on_found(name)
+            self._testing.discard(name)
+            if loss := self._losses.get(name):
+                self._note_test(name, loss, why)
+
+    def _note_test(self, name: str, loss: _Loss, why: str | None) -> None:
+        if why is not None:
+            loss.is_tested = True
+            self._put_off(loss, why)
+        elif loss.is_tested:
+            del self._losses[name]
+        else:
+            loss.must_test = False

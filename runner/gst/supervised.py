@@ -181,6 +181,9 @@ class CameraCaller:
         self._supervised.must_wait = lambda: refusal(name) is not None
 
     def start(self) -> None:
+        """Start it; a second call has no effect."""
+        if self._watch is not None:
+            return
         self._supervised.start()
         self._watch = every(WATCH_MS, self._check, self._on_fault)
 
