@@ -438,12 +438,14 @@ class VehicleSide:
 
     def _prepare(self, pipeline: Gst.Bin, plan: Plan, report: Callable[[str], None]) -> None:
         """Set up a source that is not watched."""
-        if problem := log_in(pipeline, plan):
+        login, bus = self._logins[plan.camera.name], (pipeline.get_parent() or pipeline).get_bus()
+        if problem := login.log_in(pipeline):
             report(problem)
-        follow_cameras(pipeline, plan)
+        if follow_cameras(pipeline, plan, login.accept):
+            login.follow(bus)
         end = pipeline.get_by_name(plan.source[-1].name).get_static_pad("src")
         decoders = DecoderWatch(pipeline, end, self._left_out[plan.camera.name], report)
-        decoders.follow((pipeline.get_parent() or pipeline).get_bus())
+        decoders.follow(bus)
 
     def _refusal(self, camera: str) -> str | None:
         """Why a camera must not be asked now: it refuses the login, and would lock the vehicle out."""

@@ -11,6 +11,7 @@ from pathlib import Path
 from gi.repository import GLib, Gst
 
 from runner.graph import Plan
+from runner.gst.rtspsrc import is_rtsp_client
 from runner.system.backoff import pause_s
 from runner.system.files import exposure, read_file
 from runner.system.rtsp import describe
@@ -51,8 +52,17 @@ class Login:
             return None
         return self._reason
 
-    def refuse(self, client: Gst.Element) -> None:
-        """The camera has refused the login of an RTSP client."""
+    def follow(self, bus: Gst.Bus) -> None:
+        """Handle the errors of a bus."""
+        bus.enable_sync_message_emission()
+        bus.connect("sync-message::error", lambda _bus, message: self.handle(message))
+
+    def handle(self, message: Gst.Message) -> None:
+        """An error may say that the camera has refused the login of an RTSP client."""
+        if was_refused(message.parse_error()[0]) and is_rtsp_client(message.src):
+            self._refuse(message.src)
+
+    def _refuse(self, client: Gst.Element) -> None:
         pause = pause_s(self._refused, *REFUSED_S)
         self._refused, self._until = self._refused + 1, time.monotonic() + pause
         what = "asks for a user and a password: name their file as credentials"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from gi.repository import GLib, Gst, GstRtsp, GstSdp
 
@@ -16,10 +16,10 @@ SENDS = 2  # of one request: without a login, and with it. The client itself (1.
 MARGIN_S = 5.0  # by which the client may notice late that no answer came
 
 
-def follow_cameras(pipeline: Gst.Bin, plan: Plan) -> list[CameraClient]:
-    """Follow the RTSP clients of a newly built source."""
+def follow_cameras(pipeline: Gst.Bin, plan: Plan, on_stream: Callable[[], None] = lambda: None) -> list[CameraClient]:
+    """Follow the RTSP clients of a newly built source; `on_stream` is called when one has streamed."""
     elements = (pipeline.get_by_name(element.name) for element in plan.source)
-    return [CameraClient(each, plan.camera.source) for each in elements if each and is_rtsp_client(each)]
+    return [CameraClient(each, plan.camera.source, on_stream) for each in elements if each and is_rtsp_client(each)]
 
 
 class CameraClient:
@@ -33,8 +33,8 @@ class CameraClient:
     The client keeps this alive, not the other way round: its handlers would otherwise keep both for ever.
     """
 
-    def __init__(self, client: Gst.Element, source: Source) -> None:
-        self._medium = source.medium
+    def __init__(self, client: Gst.Element, source: Source, on_stream: Callable[[], None]) -> None:
+        self._on_first, self._medium = on_stream, source.medium
         self._usual_us = int(client.get_property("tcp-timeout"))
         self._reply_s = max(source.first_reply_s, self._usual_us / 1e6)
         self._chosen: int | None = None  # index in the description
@@ -77,6 +77,7 @@ class CameraClient:
         """The first packet has arrived."""
         self._has_streamed, self._asked, self._is_opening = True, None, False
         client.set_property("tcp-timeout", self._usual_us)
+        self._on_first()
 
     def _on_sdp(self, client: Gst.Element, sdp: GstSdp.SDPMessage) -> None:
         kinds = [sdp.get_media(number).get_media() for number in range(sdp.medias_len())]

@@ -10,7 +10,7 @@ from gi.repository import GLib, Gst
 
 from runner.graph import Plan, launch
 from runner.gst.aside import HUNG, HUNG_STARTING, change_in_thread, set_state_in_thread
-from runner.gst.credentials import Login, was_refused
+from runner.gst.credentials import Login
 from runner.gst.decoders import SILENT_S, DecoderWatch
 from runner.gst.ip_camera import CameraClient, follow_cameras
 from runner.gst.outage import Outage
@@ -165,11 +165,9 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
             self.post_message(Gst.Message.new_error(self, GLib.Error(STREAM_ENDED), ""))
 
     def _on_error(self, message: Gst.Message) -> None:
-        error = message.parse_error()[0]
-        if self._client and was_refused(error):
-            self._login.refuse(message.src)
+        self._login.handle(message)
         if decoders := self._decoders:
-            decoders.handle(error)
+            decoders.handle(message.parse_error()[0])
 
     def _set_error(self, what: str) -> None:
         self._error = self._error or (what, self._frames())  # the first one: others follow from it
@@ -193,11 +191,9 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         if not frames:
             return
         if not self._attempts:
-            self._login.accept()
             self._check_source(now)
         elif frames > self._last_attempt[0]:
             self._attempts = 0
-            self._login.accept()
             self.outage.report_recovery(now)
         else:
             self._check_attempt(now)
@@ -226,7 +222,8 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
             self.outage.report_failure(
                 f"source: {self._error[0] if self._error else f'no frame for {self._frozen_s:g} s'}", self._progress[1]
             )
-            self._replace(now)
+            if not self._login.refusal:
+                self._replace(now)
         else:
             self._progress = (self._progress[0], now)  # its next frame follows once this one has passed
 
@@ -275,7 +272,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
             play_bag(child, self._plan, self._plan.bag, self._on_report)
         for client in filter(is_rtsp_client, child.children):
             handle_stream_end(client, self._on_stream_gone)
-        self._client = next(iter(follow_cameras(child, self._plan)), None)
+        self._client = next(iter(follow_cameras(child, self._plan, self._login.accept)), None)
         limit_teardown(child)
         for element in fixed_rate(child):
             element.set_property("skip-to-first", True)  # otherwise the first frame is repeated for the time before it

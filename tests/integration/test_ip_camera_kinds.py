@@ -177,10 +177,12 @@ def credentials(tmp_path):
     return file
 
 
-@pytest.mark.parametrize("login", ["basic", soak_of_sources("md5")])
-def test_a_refused_login_is_tried_again_when_its_file_changes(credentials, login):
-    """A camera locks out who tries too often. Its viewers make no attempt."""
-    words = (f'source.credentials="{credentials}"',)
+@pytest.mark.parametrize(
+    ("login", "frozen_s"), [("basic", "1"), soak_of_sources("basic", None), soak_of_sources("md5", "1")]
+)
+def test_a_refused_login_is_tried_again_when_its_file_changes(credentials, login, frozen_s):
+    """A camera locks out who tries too often. Its viewers make no attempt, whether or not the source is watched."""
+    words = (f'source.credentials="{credentials}"', f"source.frozen_s={frozen_s}" if frozen_s else "~source.frozen_s")
     with mini_camera(login=login, password="right") as camera, robot(camera.address, *words) as (side, plan, reported):
         refused(plan)
         logins = len(camera.logins)
@@ -196,9 +198,31 @@ def test_a_refused_login_is_tried_again_when_its_file_changes(credentials, login
             shown(plan)
             assert side.sources() == {}
         else:
-            refused(plan)
-            assert logins < len(camera.logins) <= logins + MOST_LOGINS
+            until(lambda: refused(plan) and len(camera.logins) > logins)
+            assert len(camera.logins) <= logins + MOST_LOGINS
             assert any("next attempt after 120 s" in line for line in reported)
+
+
+def test_a_login_that_is_refused_while_the_camera_streams_counts_as_refused(credentials):
+    """As after a change of the password, when the client connects again by itself."""
+    from runner.gst import GLib, Gst
+
+    credentials.write_text("viewer:right\n")
+    words = (f'source.credentials="{credentials}"',)
+    with (
+        mini_camera(login="basic", password="right") as camera,
+        robot(camera.address, *words) as (side, plan, _),
+        watching(plan) as client,
+    ):
+        until(lambda: client.frames_with_retry() > 5)
+        source, logins = side._pipeline("rear")._pipeline.get_by_name("source"), len(camera.logins)
+        why = GLib.Error.new_literal(Gst.ResourceError.quark(), "Unauthorized", Gst.ResourceError.NOT_AUTHORIZED)
+        source.post_message(Gst.Message.new_error(source, why, ""))
+        source.set_locked_state(True)
+        source.set_state(Gst.State.PAUSED)
+        time.sleep(2)  # longer than a camera may be frozen
+        assert side._logins["rear"].refusal
+        assert len(camera.logins) == logins
 
 
 @pytest.mark.soak
