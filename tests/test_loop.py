@@ -130,6 +130,7 @@ def test_cameras_that_are_lost_are_logged_and_stated_and_found_again(monkeypatch
         assert camera("mast").fault is None
     said = ["mast: lost: no such device; trying again", "mast: lost: permission denied; trying again"]
     assert [line for line in watched.reports if line.startswith("mast: ")] == [*said, "mast: found again"]
+    assert not any(" -> mast: " in line for line in watched.reports)  # a second time
     assert watched.loop.errors == 0
 
 

@@ -512,9 +512,10 @@ class ControlLoop:
 
     def _report_decision(self, before: Run, event: Event) -> None:
         self._cause = describe(event)
+        reported = event.camera if isinstance(event, SourceReported) else None  # which says this itself
         for name, now in self._run.decision.settings.items():
             was = before.decision.settings[name]
-            if (was.scaling, was.sending) != (now.scaling, now.sending):
+            if name != reported and (was.scaling, was.sending) != (now.scaling, now.sending):
                 self.on_report(f"{self._cause} -> {name}: {now.reason}")
 
     def _publish_state(self) -> None:
