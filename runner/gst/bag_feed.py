@@ -97,8 +97,8 @@ class BagFeed:
                 self._skip(bag, f"picture {number}{why}")
                 continue
             assert isinstance(picture, Picture)
-            if not count:
-                self._begin(picture)
+            if not count and not self._begin(picture):
+                return False
             self._last = max(picture.ns + self._shift, self._last + 1)
             if not self._push(picture):
                 return False
@@ -110,20 +110,21 @@ class BagFeed:
         self._count_skipped(bag, number)
         return True
 
-    def _begin(self, picture: Picture) -> None:
-        """Start a round with this picture."""
+    def _begin(self, picture: Picture) -> bool:
+        """Start a round with this picture; returns False if nothing converts it."""
         if self._form is None:
             self._form, self.first = picture, picture.ns
             if picture.format in VIDEO:
                 _block(self._source)  # those that follow need each of them
-            if bayer_pattern(picture.format):
-                accept_bayer(self._source, picture.format)
+            if bayer_pattern(picture.format) and not accept_bayer(self._source, picture.format):
+                return False
             form = caps(picture.format, picture.width, picture.height, self._fps)
             self._source.set_property("caps", Gst.Caps.from_string(form))
             start = self._now() if self._on_report else 0
         else:
             start = self._last + self._interval
         self._shift = start - picture.ns
+        return True
 
     def _problem(self, picture: Picture | BadPicture, first: bool) -> str | None:
         """Why a picture cannot be shown after the previous ones, to follow its number; None: it can.
@@ -189,31 +190,36 @@ def _block(source: Gst.Element) -> None:
         source.set_property(key, value)
 
 
-def accept_bayer(source: Gst.Element, form: str) -> None:
+def accept_bayer(source: Gst.Element, form: str) -> bool:
     """Let the pictures of an appsrc be Bayer patterns: decodebin itself plugs no element that converts them.
 
     form  as in `Picture`
 
-    To be called before the first picture is pushed; has no effect afterwards.
+    To be called before the first picture is pushed; has no effect afterwards. Returns False if it cannot, which an
+    error of the appsrc says once, or if the appsrc is being removed.
     """
     out = source.get_static_pad("src")
     below = out.get_peer()
+    if below is None:
+        return False
     if below.get_parent_element().get_name() == BAYER_NAME:
-        return
+        return True
     compressed, _, pattern = form.rpartition("-")
     decode = MOSAIC.format(form=compressed, pattern=pattern) + " ! " if compressed else ""
     try:
         convert = Gst.parse_bin_from_description(f"{decode}bayer2rgb", True)
     except GLib.Error:
+        out.unlink(below)  # the next call finds it so
         error = GLib.Error.new_literal(Gst.CoreError.quark(), NO_BAYER, Gst.CoreError.MISSING_PLUGIN)
         source.post_message(Gst.Message.new_error(source, error, ""))
-        return
+        return False
     convert.set_name(BAYER_NAME)
     source.get_parent().add(convert)
     out.unlink(below)
     convert.get_static_pad("src").link(below)
     convert.sync_state_with_parent()
     out.link(convert.get_static_pad("sink"))
+    return True
 
 
 def caps(form: str, width: int, height: int, fps: Fraction) -> str:

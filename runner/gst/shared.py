@@ -24,14 +24,12 @@ def push_shared(source: Gst.Element | None, picture: SharedPicture, fps: Fractio
     clock = source.get_clock() if source else None
     # Capture times use CLOCK_MONOTONIC; a pipeline's clock may differ.
     pts = picture.captured - ahead_of(clock.get_time, time.monotonic_ns) - source.get_base_time() if clock else -1  # type: ignore[union-attr]
-    if pts < 0:
+    form = picture.type.format
+    if source is None or pts < 0 or (bayer_pattern(form) and not accept_bayer(source, form)):
         os.close(picture.memory)
         return False
-    assert source is not None
-    if bayer_pattern(picture.type.format):
-        accept_bayer(source, picture.type.format)
-    form = Gst.Caps.from_string(caps(*picture.type, fps))
-    sample = Gst.Sample.new(_buffer(picture, pts), form, None, None)
+    stated = Gst.Caps.from_string(caps(*picture.type, fps))
+    sample = Gst.Sample.new(_buffer(picture, pts), stated, None, None)
     return bool(source.emit("push-sample", sample) == Gst.FlowReturn.OK)
 
 

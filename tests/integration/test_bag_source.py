@@ -557,3 +557,22 @@ def test_a_model_is_measured_on_a_topic(tmp_path):
     (sequence,) = json.loads((tmp_path / "models" / "front.model.json").read_text())["sequences"].values()
     assert (sequence["topic"], sequence["frames"], sequence["fps"]) == ("/front/image", 30, 25)
     assert (sequence["width"], sequence["height"], sequence["lossless"]) == (320, 180, True)
+
+
+def test_a_missing_converter_of_bayer_patterns_is_reported_once():
+    from runner.gst import Gst
+    from runner.gst.bag_feed import accept_bayer
+
+    registry, converter = Gst.Registry.get(), Gst.ElementFactory.find("bayer2rgb")
+    if converter:
+        registry.remove_feature(converter)
+    pipeline = Gst.parse_launch("appsrc name=in ! decodebin")
+    try:
+        assert [accept_bayer(pipeline.get_by_name("in")) for _ in range(3)] == [False] * 3
+    finally:
+        if converter:
+            registry.add_feature(converter)
+    bus = pipeline.get_bus()
+    errors = [bus.pop_filtered(Gst.MessageType.ERROR) for _ in range(2)]
+    assert "bayer2rgb" in errors[0].parse_error()[0].message
+    assert errors[1] is None
