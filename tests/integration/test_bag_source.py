@@ -568,7 +568,7 @@ def test_a_missing_converter_of_bayer_patterns_is_reported_once():
         registry.remove_feature(converter)
     pipeline = Gst.parse_launch("appsrc name=in ! decodebin")
     try:
-        assert [accept_bayer(pipeline.get_by_name("in")) for _ in range(3)] == [False] * 3
+        assert [accept_bayer(pipeline.get_by_name("in"), "rggb") for _ in range(3)] == [False] * 3
     finally:
         if converter:
             registry.add_feature(converter)
