@@ -114,19 +114,11 @@ class Bag:
             raise ModelError("topic", self.names(topic), f"no such topic with {what}{suggest(topic, known)}")
         return topic or known[0]
 
-    def pictures(self, topic: str, depth_m: float = DEPTH_M) -> Iterator[Picture]:
-        """The pictures of a topic, in the order of recording.
+    def pictures(self, topic: str, depth_m: float = DEPTH_M) -> Iterator[Picture | BadPicture]:
+        """The pictures of a topic, in the order of recording; those that cannot be shown do not hide the others.
 
         depth_m  distance that is white in a picture of distances
-        raises   ModelError at the first one that cannot be shown
         """
-        for picture in self.all_pictures(topic, depth_m):
-            if isinstance(picture, BadPicture):
-                raise ModelError("topic", self.names(topic), f"picture {picture.number}: {picture.why}")
-            yield picture
-
-    def all_pictures(self, topic: str, depth_m: float = DEPTH_M) -> Iterator[Picture | BadPicture]:
-        """The same, with those that cannot be shown: the others can be, with their times."""
         read = PICTURES[self.topics[topic]]
         started = False  # whether a picture of video has come with which decoding can start
         for number, (ns, message) in enumerate(self._messages(topic), 1):
@@ -162,7 +154,7 @@ class Bag:
 
         raises  ModelError, also if there are fewer than two
         """
-        shown = (picture for picture in self.all_pictures(topic) if isinstance(picture, Picture))
+        shown = (picture for picture in self.pictures(topic) if isinstance(picture, Picture))
         first = next(shown, None)
         times = [first.ns, *(picture.ns for picture in islice(shown, SURVEYED - 1))] if first else []
         steps = [later - earlier for earlier, later in pairwise(times) if later > earlier]
@@ -211,7 +203,7 @@ def check_topic(path: Path, topic: str | None) -> None:
             raise ModelError("topic", str(path), f"must be given, a topic with pictures: {', '.join(known)}")
         found = bag.find(PICTURES, topic, "pictures")
         bad: BadPicture | None = None
-        for picture in islice(bag.all_pictures(found), SURVEYED):
+        for picture in islice(bag.pictures(found), SURVEYED):
             if isinstance(picture, Picture):
                 return
             bad = bad or picture

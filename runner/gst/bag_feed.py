@@ -92,7 +92,7 @@ class BagFeed:
     def _play_once(self, bag: Bag) -> bool:
         """Play the bag once; returns False if the pipeline is gone."""
         began, count, number = 0, 0, 0
-        for number, picture in enumerate(bag.all_pictures(self._bag.topic, self._bag.depth_m), 1):
+        for number, picture in enumerate(bag.pictures(self._bag.topic, self._bag.depth_m), 1):
             if why := self._problem(picture, first=not count):
                 self._skip(bag, f"picture {number}{why}")
                 continue
