@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 from runner.bag.compressed import BAYER, DISTANCES, compressed_form, video_form
+from runner.system.clocks import SECOND_NS
 
-SECOND_NS = 1_000_000_000
 # By encoding (sensor_msgs/image_encodings.hpp), GStreamer's name of the format and bytes of a pixel in the first plane.
 FORMATS = {
     "mono8": ("GRAY8", 1),
