@@ -510,6 +510,7 @@ class CameraServer:
 
     def _on_set_up(self, client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext) -> None:
         connection = self._connection(client)
+        self._release(lambda _, holder: holder is client)
         if connection is None:
             return
         name = _camera_name(context)
