@@ -112,14 +112,14 @@ def test_a_jammed_viewer_over_tcp_makes_no_camera_slow():
         url = str(plan.operator[0].properties["location"]).replace("/feedback", "")
         with RtspClient(url, small=True) as client:
             assert client.open() == [200, 200, 200]
-            client.delay_s = 0.02  # a third of the bitrate
+            client.delay_s = 0.014  # about half the bitrate
             client.read()
             time.sleep(3)
             first, paces = side.sent()["rear"][0], []
-            for _ in range(400):
+            for _ in range(300):
                 paces.append(side._pipeline("rear").knobs.pace)
                 time.sleep(0.02)
-            assert side.sent()["rear"][0] - first < 8 * 28  # it is jammed
+            assert side.sent()["rear"][0] - first < 6 * 28  # it is jammed
     assert set(paces) == {1.0}
     assert not [line for line in reported if "Hz" in line]
 
