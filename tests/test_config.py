@@ -88,7 +88,7 @@ def test_modes_safe_is_the_default_and_automatic_the_mode() -> None:
         ("29.97", "2997/100"),
         ("29.97002997002997", "30000/1001"),
         ("33.333333333", "100/3"),
-        ("0.001", "1/1000"),
+        ("0.2", "1/5"),
     ],
 )
 def test_rates_fit_into_caps(fps: str, rate: str) -> None:

@@ -17,13 +17,13 @@ from typing import Any
 
 import pytest
 from drives import write_drive
+from helpers import Command
 
 from runner.core.events import CameraSwitched
 from runner.drive.log import Log, new_drive
 from runner.drive.read import read_drive
 from runner.errors import RunError, UserError
 from runner.records import LinesDropped, Note
-from tests.helpers import Command
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 NOTES = """

@@ -42,7 +42,7 @@ def loaded(*words: str) -> tuple[int, set[str]]:
 RUNNING = {  # modules of the project and heavy packages; `validate` reads maps and queries GStreamer's registry
     "print": (44, COMPOSING),
     "replay": (47, COMPOSING),
-    "validate": (103, COMPOSING | {"numpy", "gi"}),
+    "validate": (105, COMPOSING | {"numpy", "gi"}),
 }
 HELP = {
     "vehicle": {"paho"},

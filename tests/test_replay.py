@@ -136,7 +136,8 @@ def test_standard_input_and_output() -> None:
     assert json.loads(result.out.splitlines()[1])["reason"].startswith(
         "unknown camera 'ü'; expected one of front_left,"
     )
-    assert process("replay", *PAPER, stdin="") == (0, "", "")
+    nothing = "standard input: has no events, so there is nothing to replay\n"
+    assert process("replay", *PAPER, stdin="") == (0, "", nothing)
 
 
 # --- where a run ends -------------------------------------------------------------------------------------------------

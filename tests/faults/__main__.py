@@ -110,7 +110,7 @@ FAULTS = [
         "if True:\n            self._holder, self._closed_at = ",
         "test_page_parts",
     ),
-    Fault("verbs/replay.py", 'if document["t"] < last:', "if False:", "test_replay"),
+    Fault("drive/read.py", "if kind not in OF_SEVERAL_THREADS and t < ", "if False and t < ", "test_replay"),
     Fault("verbs/validate.py", 'not name.startswith(".") and name.lower()', "name.lower()", "test_validate"),
     Fault("security/authority.py", "in keyring.PUBLIC else 0o600", "in keyring.PUBLIC else 0o640", "test_keys"),
     Fault("security/authority.py", "if role is Role.VEHICLE or role in VIEWERS:", "if role in VIEWERS:", "test_keys"),

@@ -42,7 +42,14 @@ LONGEST = (
 )
 
 # Files of drives among the tests marked `alone`, in two groups: the tests of a group run one after the other.
-DRIVES = {"test_link": "1", "test_feedback": "1", "test_live": "2", "test_page_sides": "2"}
+DRIVES = {
+    "test_link": "1",
+    "test_feedback": "1",
+    "test_live": "2",
+    "test_page_sides": "2",
+    "test_players": "1",
+    "test_transports": "2",
+}
 
 
 @pytest.fixture(scope="session", autouse=True)
