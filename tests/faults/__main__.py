@@ -116,7 +116,7 @@ FAULTS = [
     Fault("security/authority.py", "if role is Role.VEHICLE or role in VIEWERS:", "if role in VIEWERS:", "test_keys"),
     Fault("system/clocks.py", "if exchange.answered < exchange.received:", "if False:", "test_clocks"),
     Fault("system/reports.py", "if most or text in self._passed_on:", "if text in self._passed_on:", "test_reports"),
-    Fault("bag/pictures.py", "if size < step * height:", "if size < step * height - step:", "test_bag"),
+    Fault("bag/pictures.py", "if size < form.step * rows:", "if size < form.step * rows - form.step:", "test_bag"),
     Fault("bag/__init__.py", "abs(measured - whole) <= ROUND * whole", "measured == whole", "test_bag"),
     Fault("ros/inputs.py", "if other != camera:", "if False:", "test_ros_cameras"),
     Fault("metrics/prometheus.py", "if not is_own:", "if False:", "test_prometheus"),

@@ -45,6 +45,13 @@ LONGEST = (
 DRIVES = {
     "test_link": "1",
     "test_feedback": "1",
+    "test_players": "1",
+    "test_live": "2",
+    "test_page_sides": "2",
+    "test_transports": "2",
+}
+    "test_link": "1",
+    "test_feedback": "1",
     "test_live": "2",
     "test_page_sides": "2",
     "test_players": "1",
