@@ -50,13 +50,6 @@ DRIVES = {
     "test_page_sides": "2",
     "test_transports": "2",
 }
-    "test_link": "1",
-    "test_feedback": "1",
-    "test_live": "2",
-    "test_page_sides": "2",
-    "test_players": "1",
-    "test_transports": "2",
-}
 
 
 @pytest.fixture(scope="session", autouse=True)
