@@ -41,19 +41,27 @@ RETAINED = ("state", "telemetry", "configuration")
 
 
 class _Client(Client):
-    """A client whose loop survives a broker that violates the protocol, and which knows how a connection ended.
+    """A client whose loop survives a broker that violates the protocol, and which knows how a connection began.
 
     on_broken  called with the violation
     heard      the first bytes that arrived over the connection
-    error      of its socket; None: none occurred
+    error      of its socket before it was in use; None: none occurred
     """
 
     on_broken: Callable[[Exception], None]
     heard = b""
     error: OSError | None = None
 
-    def _sock_recv(self, bufsize: int) -> bytes:
-        """paho keeps neither what it could not read nor the error to itself: without this override both are unknown."""
+    def begin(self) -> None:
+        """To be called before each connection: paho keeps neither what it could not read nor the error to itself."""
+        self.heard, self.error = b"", None
+        self.__dict__["_sock_recv"] = self._recv_first  # of this instance only
+
+    def use(self) -> None:
+        """To be called once a connection works: it reads as paho does, since a flood takes four reads a message."""
+        self.__dict__.pop("_sock_recv", None)
+
+    def _recv_first(self, bufsize: int) -> bytes:
         try:
             data = super()._sock_recv(bufsize)
         except BlockingIOError:
@@ -230,7 +238,8 @@ class ControlLink:
 
     def _begin(self, client: Client, _data: object) -> None:
         """Use the current keys, which may have been replaced since the last connection."""
-        self._client.heard, self._client.error, self._is_explained = b"", None, False
+        self._client.begin()
+        self._is_explained = False
         if self._login is None:
             return
         try:
@@ -294,6 +303,7 @@ class ControlLink:
             retry.daemon = True
             retry.start()
             return
+        self._client.use()
         self._listened = time.monotonic()
         if self._brief < MOST_BRIEF:
             self._report_connected()
