@@ -21,6 +21,7 @@ from runner.core.events import parse
 from runner.core.model import plain
 from runner.core.step import start, step
 from runner.h264.access_unit import read_unit
+from runner.operator.station import LinkState
 from runner.page.server import PageServer
 from runner.records import CameraState, VehicleState, applied_to_json
 
@@ -60,7 +61,8 @@ class Station(SimpleNamespace):
                 roi = dict(zip(("x", "y", "width", "height"), camera.roi, strict=True))
                 self.step(event="roi_set", camera=name, **roi)
         self.units = {name: self.encoded(name, picture) for name, picture in pictures.items()}
-        super().__init__(state=self.published(), note=print, user="anna", answer_s=1.0, attention=None)
+        told = {"note": print, "user": "anna", "answer_s": 1.0, "attention": None, "link_state": LinkState()}
+        super().__init__(state=self.published(), **told)
 
     def step(self, **event):
         self.run = step(self.vehicle, self.run, parse({"t": 0, **event}))

@@ -11,7 +11,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from drives import write_drive
+from drives import measured, write_drive
 from helpers import Command
 
 from rig import CHECKOUT, SMALL_ROBOT, answers, free_port, process, run, until
@@ -97,7 +97,9 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     words = ("log=drive", "log.video=true", *SHORT["demo"], *FEWER, *SMALL, LOOP, *ports())
     assert run("demo", *words, cwd=directory).returncode == 0
     shutil.copytree(directory / "drive", directory / "kept")
-    write_drive(directory / "other", seconds=20, congested=0.5)  # such a drive shows what the link carries
+    write_drive(
+        directory / "other", seconds=20, congested=0.5, change=measured
+    )  # such a drive shows what the link carries
     shutil.copytree(directory / "other", directory / "drives" / "monday")
     return directory
 

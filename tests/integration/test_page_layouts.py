@@ -39,6 +39,7 @@ from runner.core.events import parse
 from runner.core.model import plain
 from runner.core.step import start, step
 from runner.h264.access_unit import read_unit
+from runner.operator.station import LinkState
 from runner.page.server import PageServer
 from runner.page.viewer import PageViewer
 from runner.records import (
@@ -71,7 +72,7 @@ class Station(SimpleNamespace):
             for name, setting in run.decision.settings.items()
         }
         state = VehicleState(1.0, "", run.decision.mode, plain(run.decision.total), cameras)
-        own = {"user": "anna", "answer_s": 1.0}
+        own = {"user": "anna", "answer_s": 1.0, "link_state": LinkState()}
         super().__init__(state=state, note=print, attention=None, requests=[], seen=[], **own)
 
     def captured_here(self, camera, captured):
