@@ -123,7 +123,7 @@ def served(picture, layouts, *words, vehicle=SMALL_ROBOT, conf=None):
 
 
 def controlling(page):
-    until(lambda: page.evaluate("tod.control") == "you")
+    until(lambda: page.evaluate("window.tod?.control") == "you")
 
 
 def pulled(page, selector, right, down):
