@@ -38,7 +38,7 @@ class CameraClient:
         self._usual_us = int(client.get_property("tcp-timeout"))
         self._reply_s = max(source.first_reply_s, self._usual_us / 1e6)
         self._chosen: int | None = None  # index in the description
-        self._last: tuple[str, ...] = ()  # the last request
+        self._last: tuple[str, ...] = ()  # the last request, also once PLAYING is requested while it is unanswered
         self._sends = 0  # of it
         self._asked: tuple[str, float] | None = None  # request without an answer, and when it was sent
         self._heard = time.monotonic()  # when it last sent or received anything
@@ -65,7 +65,7 @@ class CameraClient:
         kind, code, _text = message.parse_progress()
         self._heard = time.monotonic()
         if kind == Gst.ProgressType.START:
-            self._is_opening, self._last = True, ()  # also once it has failed over UDP, and tries TCP
+            self._is_opening = True
         elif kind != Gst.ProgressType.CONTINUE:
             self._asked = None
             self.has_failed = kind == Gst.ProgressType.ERROR
