@@ -37,6 +37,7 @@ class SupervisedPipeline:
     on_report  called once with each reason, until the pipeline works again
     rebuilt    how often a pipeline that had worked was rebuilt
     must_wait   whether it must not be built again yet
+    adapts      called with an error of this pipeline: whether the next one avoids it, which is then built at once
     before_stop  called before this pipeline is stopped, in the thread that stops it
     """
 
@@ -55,6 +56,7 @@ class SupervisedPipeline:
         self._outage = Outage(on_report)
         self.rebuilt = 0
         self.must_wait: Callable[[], bool] = lambda: False
+        self.adapts: Callable[[GLib.Error], bool] = lambda _: False
         self.before_stop: Callable[[], object] = lambda: None
 
     def start(self) -> None:
@@ -92,14 +94,18 @@ class SupervisedPipeline:
         """Tear down now, rebuild soon; nothing happens if it is stopped."""
         if self._retry or self._stopped:
             return
-        now = self._ended = time.monotonic()
+        now = time.monotonic()
         if self._works:
             self.rebuilt += 1
             self._lost = now
         if self._worked or now - self._lost > PATIENCE_S:
             self._outage.report_failure(why, self._lost)
+        self._rebuild(max(0.0, self._begun + RETRY_S - now))
+
+    def _rebuild(self, after_s: float) -> None:
+        self._ended = time.monotonic()
         self._tear_down()
-        self._retry = later(max(0.0, self._begun + RETRY_S - now), self._retry_start)
+        self._retry = later(after_s, self._retry_start)
 
     def _retry_start(self) -> None:
         if self._change and self._change.is_alive() and time.monotonic() - self._ended < STOPPED_S:
@@ -112,10 +118,13 @@ class SupervisedPipeline:
         self.start()
 
     def _on_failed(self, _bus: Gst.Bus, message: Gst.Message) -> None:
-        if concerns_file(message):
+        if concerns_file(message) or self._retry or self._stopped:
             return
-        failed = message.type == Gst.MessageType.ERROR
-        self.restart(message.parse_error()[0].message if failed else STREAM_ENDED)
+        error = message.parse_error()[0] if message.type == Gst.MessageType.ERROR else None
+        if error and self.adapts(error):
+            self._rebuild(0)
+        else:
+            self.restart(error.message if error else STREAM_ENDED)
 
     def _on_first_buffer(self, pad: Gst.Pad, _buffer: PassingBuffer) -> bool:
         """From a streaming thread."""

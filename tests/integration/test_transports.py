@@ -12,7 +12,8 @@ import pytest
 from rig import needs_root, over_tcp, streaming, until
 from rtsp_client import RtspClient
 from runner.core.commands import Command
-from runner.gst.receiver import OVER_TCP
+from runner.gst.patient_media import PatientMedia
+from runner.gst.receiver import OLDER, OVER_TCP
 
 pytestmark = pytest.mark.gst
 CAMERA = "rear"
@@ -67,6 +68,22 @@ def test_a_viewer_that_falls_back_to_tcp_is_named():
         until(
             lambda: {"rear: over TCP, UDP ports 28000-28005 are in use", f"operator: rear: {OVER_TCP}"} <= set(reported)
         )
+
+
+@pytest.mark.parametrize("lists_both", [True, pytest.param(False, marks=[pytest.mark.soak, pytest.mark.players])])
+def test_a_vehicle_of_an_older_version_is_shown(monkeypatch, lists_both):
+    """It has no path with feedback, and may list its stream once for each profile, as the library does."""
+    monkeypatch.setattr("runner.gst.server.FEEDBACK", "another")
+    if lists_both:
+        monkeypatch.setattr("runner.gst.camera_media.CameraMedia", PatientMedia)
+    with driving() as (side, operator, _, reported):
+        until(lambda: received(operator).frames > 5, every_s=0.1)
+        assert operator._receivers[CAMERA]._is_repaired is lists_both
+        for connection in list(side._server._connections.values()):
+            connection.close()
+        until(lambda: received(operator).rebuilt == 1, every_s=0.1)
+        until(lambda: any("works again" in line for line in reported))
+        assert [line for line in reported if "older" in line or "Not" in line] == [f"operator: {CAMERA}: {OLDER}"]
 
 
 @needs_root  # to see packets as they are sent
