@@ -353,6 +353,16 @@ def test_a_second_viewer_over_the_uplink_is_refused(outside):
             until(lambda: third.session or third.open() == [200, 200, 200])
 
 
+def test_a_viewer_that_is_admitted_over_tcp_after_all_blames_no_ports(outside):
+    """It was refused over UDP since another one was watching."""
+    with serving() as vehicle, RtspClient(vehicle.url(), source=outside) as second:
+        with RtspClient(vehicle.url(), source=outside) as first:
+            assert first.open() == [200, 200, 200]
+            assert second.open(udp=True) == [200, 453]
+        until(lambda: second.session or second.open() == [200, 200, 200])
+        assert not [line for line in vehicle.reported if "over TCP" in line]
+
+
 def test_more_viewers_are_admitted_if_the_configuration_allows_them(outside):
     with serving("media.max_viewers=2") as vehicle, ExitStack() as stack:
         viewers = [stack.enter_context(RtspClient(vehicle.url(), source=outside)) for _ in range(3)]
