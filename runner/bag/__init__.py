@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from runner.bag.files import METADATA, SUFFIXES, BagFiles, is_named_like_a_bag
 from runner.bag.messages import Decoder, decoder
-from runner.bag.pictures import DEPTH_M, BadPicture, Picture, read_compressed, read_image, stamp_ns
+from runner.bag.pictures import BadPicture, Picture, read_compressed, read_image, stamp_ns
 from runner.bag.storage import Channel, UnreadableError
-from runner.core.model import ModelError, suggest
+from runner.core.model import DEPTH_M, ModelError, suggest
 from runner.errors import reason
 from runner.system.clocks import SECOND_NS
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 from runner.bag.compressed import BAYER, DISTANCES, compressed_form, video_form
+from runner.core.model import DEPTH_M
 from runner.system.clocks import SECOND_NS
 
 # By encoding (sensor_msgs/image_encodings.hpp), GStreamer's name of the format and bytes of a pixel in the first plane.
@@ -35,7 +36,6 @@ WIDE = {
     **{f"bayer_{pattern}16": (f"bayer_{pattern}8", 2) for pattern in BAYER},
 }
 ENCODINGS = (*FORMATS, *WIDE)
-DEPTH_M = 20.0  # distance that is shown white, unless a source states another
 SUBSAMPLED = ("NV12", "NV21")  # a second plane, of half as many rows as long as those of the first one
 ALIGNED = 4  # bytes: rows begin at multiples in GStreamer
 

@@ -24,6 +24,7 @@ Kbps = Fraction
 Value = bool | int | float | str  # type of an element's property in YAML
 
 PLACEHOLDER = re.compile(r"\{(\w+)\}")  # in the properties of elements: "{clip}"
+DEPTH_M = 20.0  # distance that is shown white, unless a source states another
 SMALLEST_SIDE_PX = 16  # one H.264 macroblock; encoders refuse less
 MOST_BUFFER_MS = 10_000  # of the encoder's rate control, as x264enc allows
 
@@ -263,7 +264,7 @@ class Source:
     render_s: float = 0
     plays_bags: bool = False
     subscribes: bool = False
-    depth_m: float = 20.0
+    depth_m: float = DEPTH_M
     stand_in: tuple[Element, ...] = ()
 
     def __post_init__(self) -> None:
@@ -288,7 +289,7 @@ class BagTopic:
 
     path: str
     topic: str
-    depth_m: float = 20.0
+    depth_m: float = DEPTH_M
 
 
 @dataclass(frozen=True, slots=True)

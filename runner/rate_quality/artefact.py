@@ -69,7 +69,7 @@ def to_json(measured: Measured) -> dict[str, Any]:
         "tod_runner": version("tod-runner"),
         "name": measured.name,
         "content": digest(
-            [clip.sha256 + clip.topic for clip in measured.clips.values()], measured.encoder, measured.masks
+            ["".join(map(str, clip.identity)) for clip in measured.clips.values()], measured.encoder, measured.masks
         ),
         "sequences": sequences,
         "masks": dict(measured.masks),
@@ -154,7 +154,7 @@ def dumps(document: Mapping[str, Any]) -> bytes:
 
 
 def _clip_to_json(clip: Clip) -> dict[str, Any]:
-    properties = {key: value for key, value in asdict(clip).items() if key != "path" and value != ""}
+    properties = {key: value for key, value in asdict(clip).items() if key != "path" and value not in ("", None)}
     rounded = {key: round(value, 3) for key, value in properties.items() if key.startswith(("si", "ti"))}
     return {"file": Path(clip.path).name, **properties, "fps": plain(Fraction(clip.fps)), **rounded}
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-from runner.core.model import BagTopic, Camera, ModelError
+from runner.core.model import DEPTH_M, BagTopic, Camera, ModelError
 from runner.errors import ArgumentError, RunError
 from runner.graph import COLORIMETRY, launch, to_limited_range
 from runner.lanes import BAG, FRAMES, LaneSet
@@ -32,6 +32,7 @@ class Sequence:
     fps            frames per second
     lossless       whether its codec keeps every sample
     topic          of the bag; "" for a clip
+    depth_m        of the bag, see `BagTopic`, unless it is the usual one; None, too, for a clip
     colorimetry    of a full-range clip, in limited range; "" for any other one
     si, ti         spatial and temporal information, the maximum over all frames (ITU-T P.910); si_mean, ti_mean: mean
     """
@@ -49,11 +50,17 @@ class Sequence:
     si_mean: float
     ti_mean: float
     topic: str = ""
+    depth_m: float | None = None
     colorimetry: str = ""
 
     @property
     def bag(self) -> BagTopic | None:
-        return BagTopic(self.path, self.topic) if self.topic else None
+        return BagTopic(self.path, self.topic, self.depth_m or DEPTH_M) if self.topic else None
+
+    @property
+    def identity(self) -> tuple[object, ...]:
+        """What determines its pictures."""
+        return _identity(self.sha256, asdict(self))
 
     @property
     def decode(self) -> str:
@@ -86,23 +93,30 @@ def survey(footage: Footage, cache: Cache, on_note: Callable[[str], None]) -> Se
     on_note  called with a line when the analysis starts, since it takes a while
     raises   UserError if it cannot be used
     """
-    path, topic = (Path(footage.path), footage.topic) if isinstance(footage, BagTopic) else (footage, "")
-    properties = _bag_form(footage) if isinstance(footage, BagTopic) else _clip_form(footage)
-    whole = BagTopic(str(path.resolve()), topic) if topic else path.resolve()
+    whole: Footage
+    if isinstance(footage, BagTopic):
+        path, properties = Path(footage.path), _bag_form(footage)
+        whole = replace(footage, path=str(path.resolve()))
+    else:
+        path, properties, whole = footage, _clip_form(footage), footage.resolve()
     sha256 = file_digest(path)
-    key = digest("survey", SURVEY_VERSION, sha256, *filter(None, [topic]))
+    key = digest("survey", SURVEY_VERSION, *_identity(sha256, properties))
     known = cache.load(key)
     if known is None:
-        on_note(f"analysing {path} {topic}".rstrip())
+        on_note(f"analysing {path} {properties.get('topic', '')}".rstrip())
         known = _analyse(
             whole, decoding(whole, properties["fps"], properties.get("colorimetry", "")), properties["fps"]
         )
         cache.store(key, known)
-    sequence = Sequence(path=str(path.resolve()), sha256=sha256, topic=topic, **properties, **known)
+    sequence = Sequence(path=str(path.resolve()), sha256=sha256, **properties, **known)
     if sequence.frames < FEWEST_FRAMES:
         found = f"{path}: {sequence.frames} frames"
         raise ArgumentError(ARGUMENT, found, f"is too short, at least {FEWEST_FRAMES} are needed")
     return sequence
+
+
+def _identity(sha256: str, form: Mapping[str, Any]) -> tuple[object, ...]:
+    return tuple(filter(None, [sha256, form.get("topic"), form.get("depth_m")]))
 
 
 def _clip_form(path: Path) -> dict[str, Any]:
@@ -121,7 +135,8 @@ def _bag_form(footage: BagTopic) -> dict[str, Any]:
     except ModelError as error:
         raise ArgumentError(ARGUMENT, str(error.found), error.rule) from None
     size = {"width": form.width, "height": form.height, "fps": form.fps}
-    return {**size, "codec": form.format, "lossless": form.format not in LOSSY}
+    shown = {"topic": footage.topic, "depth_m": None if footage.depth_m == DEPTH_M else footage.depth_m}
+    return {**size, "codec": form.format, "lossless": form.format not in LOSSY, **shown}
 
 
 def _is_recording(path: Path) -> bool:

@@ -129,8 +129,7 @@ class Sweep:
     def _key(self, lane: Lane) -> str:
         if lane not in self._keys:
             text = fragment(self.plan, self.plan.camera.full_roi, lane)
-            source = (self.clip.sha256, *filter(None, [self.clip.topic]))
-            parts = (*source, str(self.clip.fps), text, self.encoder, self.stride, self.mask_digest)
+            parts = (*self.clip.identity, str(self.clip.fps), text, self.encoder, self.stride, self.mask_digest)
             self._keys[lane] = digest("point", LANES_VERSION, *parts)
         return self._keys[lane]
 

@@ -137,7 +137,7 @@ def _topics(path: Path, vehicle: Vehicle, names: Sequence[str]) -> Mapping[str, 
         try:
             with Bag(path) as bag:
                 topic = bag.find(PICTURES, None if named is None else str(named), "pictures")
-            found[name] = BagTopic(str(path), topic)
+            found[name] = BagTopic(str(path), topic, camera.source.depth_m)
         except ModelError as error:
             at = f"cameras.{name}.topic" if error.key == "topic" else "sequence"
             problems.append(Problem(COMMAND_LINE, at, str(error.found), error.rule))

@@ -27,8 +27,10 @@ from runner.gst import Gst
 from runner.gst.pictures import luma_of
 from runner.gst.sequence import discover, with_clip_range
 from runner.plans import compile_plans
+from runner.rate_quality.cache import Cache
 from runner.rate_quality.metrics import find_metric
-from runner.rate_quality.sequence import decoding
+from runner.rate_quality.sequence import FEWEST_FRAMES, decoding, survey
+from runner.verbs.model import _topics
 
 pytestmark = pytest.mark.gst
 
@@ -181,6 +183,20 @@ def test_footage_its_recording_and_the_live_stream_have_the_same_quality(
     found = [measured(tod, sequence, tmp_path) for sequence in (path, recorded)]
     found.append(live(source, sent))
     assert max(found) - min(found) < 0.001, found
+
+
+def test_distances_are_measured_as_white_as_the_source_says(tmp_path):
+    """Also after the same bag has been measured with another range."""
+    ramp = np.linspace(0, 5000, WIDTH).astype(np.uint16)  # mm
+    frames = [np.tile(np.roll(ramp, number)[:, None], (HEIGHT, 1, 1)) for number in range(FEWEST_FRAMES)]
+    bag = write_bag(tmp_path / "bag", "mcap", {"/front": list(_messages("16UC1", frames))})
+
+    def detail(*words: str) -> float:
+        vehicle = configuration(["source=bag", f"source.bag={bag}", "source.topic=/front", *words]).vehicle()
+        return survey(_topics(bag, vehicle, [CAMERA])[CAMERA], Cache(tmp_path / "cache", print), print).si
+
+    far = detail()
+    assert detail("source.depth_m=5") == pytest.approx(4 * far, rel=0.02)
 
 
 def measured(tod, sequence: Path, directory: Path) -> float:
