@@ -174,7 +174,9 @@ def test_rtsp_over_tcp_is_queued_where_udp_is_dropped():
 
 @needs_root
 @pytest.mark.alone
-@pytest.mark.parametrize("feedback", [False, True], ids=["AVP", "AVPF"])
+@pytest.mark.parametrize(
+    "feedback", [pytest.param(False, marks=pytest.mark.soak, id="AVP"), pytest.param(True, id="AVPF")]
+)
 def test_two_viewers_share_the_total_although_one_has_a_narrow_link(feedback):
     """Both copies leave the vehicle over one link; most packets of the second one are lost behind it.
 

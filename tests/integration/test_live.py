@@ -163,6 +163,7 @@ def test_a_killed_vehicle_leaves_a_drive_that_can_be_read(broker, vehicle, tmp_p
     assert run("replay", f"input={tmp_path / 'drive'}").returncode == 0
 
 
+@pytest.mark.soak
 def test_a_given_duration_begins_when_the_vehicle_is_online(broker, tmp_path):
     ports = (f"control.port={broker.port}", f"media.port={free_port()}")
     with process("operator", *ROBOT, *ports, "duration_s=4", f"log={tmp_path}") as operator:
@@ -310,6 +311,7 @@ def test_a_sweep_drives_each_of_its_runs_as_if_started_alone(tmp_path):
         assert (tmp_path / "out" / name / "index.html").exists()
 
 
+@pytest.mark.soak
 @pytest.mark.skipif(not CLIPS, reason="needs the recorded clips")
 def test_the_demo_runs_a_real_clip_along_a_real_map(tmp_path):
     words = (

@@ -113,6 +113,7 @@ def test_a_model_writes_what_the_contract_requires(measured):
     assert "the sequence is 320x192 at 25 Hz, the camera 1920x1040 at 40 Hz" in printed
 
 
+@pytest.mark.soak
 @pytest.mark.timed
 def test_its_camera_is_mounted_and_drives(tod, measured, tmp_path):
     directory, document, _ = measured

@@ -975,6 +975,7 @@ STATES = [
 ]
 
 
+@pytest.mark.soak
 def test_every_text_is_readable_by_day_and_by_night(chromium, picture, tmp_path):
     with served(picture, Layouts(tmp_path)) as (server, _), opened(chromium, server.url) as page:
         all_live(page)

@@ -103,7 +103,8 @@ def test_a_hung_station_is_dropped_and_reconnected(chromium):
 
 
 @pytest.mark.alone
-@pytest.mark.parametrize("attempts", [12, pytest.param(25, marks=pytest.mark.soak)])
+@pytest.mark.soak
+@pytest.mark.parametrize("attempts", [12, 25])
 def test_a_restarted_station_is_reconnected_promptly(chromium, attempts):
     """However many attempts have failed: browsers delay WebSockets after repeated failures."""
     with sides() as (url, vehicle, operator), vehicle(), opened(chromium, url, refused=True) as page:
@@ -284,6 +285,7 @@ def h265(tmp_path):
     return f"conf={tmp_path / 'conf'}"
 
 
+@pytest.mark.soak
 def test_h265_is_played_or_refused_with_the_reason(chromium, h265):
     with sides(h265, "+graph@cameras.rear.graph=h265") as (url, vehicle, _), vehicle(), opened(chromium, url) as page:
         until(lambda: {"live", "unsupported"} >= {camera["status"] for camera in measure(page).values()})

@@ -332,6 +332,7 @@ def are_still(seen):
     return seen() == before
 
 
+@pytest.mark.soak
 def test_connections_survive_the_expiry_of_certificates(keys):
     """Certificates of both sides expire while they stream; nobody new is admitted."""
     ends = datetime.now(UTC) + timedelta(seconds=12)
@@ -668,7 +669,7 @@ def _unencrypted(plan):
     return (replace(client, properties={**client.properties, "location": location}), *rest)
 
 
-@pytest.mark.parametrize("graph", ["h264_rtsp", "h264_srt"])
+@pytest.mark.parametrize("graph", ["h264_rtsp", pytest.param("h264_srt", marks=pytest.mark.soak)])
 def test_a_demo_with_keys_streams_and_shows_no_secret(keys, tmp_path, graph):
     """Neither in its output nor its drive, nor the MCAP of that, nor what a list of processes shows.
 
