@@ -481,6 +481,11 @@ class Client:
     def close(self) -> None:
         self.pipeline.set_state(self._gst.State.NULL)
 
+    def end(self) -> None:
+        """Let go of the pipeline: it holds this client by its callbacks, and would keep two descriptors open."""
+        self.close()
+        del self.pipeline, self._sink
+
 
 @contextmanager
 def watching(plan: Any, *, pictures: bool = False, feedback: bool = False) -> Iterator[Client]:
@@ -488,7 +493,7 @@ def watching(plan: Any, *, pictures: bool = False, feedback: bool = False) -> It
     try:
         yield client
     finally:
-        client.close()
+        client.end()
 
 
 CAMERA_VIDEO = (
