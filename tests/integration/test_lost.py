@@ -76,12 +76,12 @@ def test_a_strict_vehicle_does_not_start_without_a_clip(tmp_path):
 
 NOWHERE = 'address="rtsp://127.0.0.1:1/x"'
 ABSENT = {
-    "device": ("v4l2", ("device=/dev/video99",), "Cannot identify device"),
+    "device": ("v4l2", ("device=/dev/video99",), "Cannot identify device '/dev/video99'"),
     "no camera": ("v4l2", ("device=/dev/null",), "/dev/null is no camera"),
-    "credentials": ("rtsp", (NOWHERE, "credentials=/none"), "credentials /none: no such file"),
-    "address": ("rtsp", (NOWHERE,), "Could not"),
-    "bag": ("bag", ("bag=/none.mcap", "topic=/camera"), "/none.mcap: no such file"),
-    "topic": ("ros", ("topic=/camera",), "it has delivered nothing for 3 s"),
+    "credentials": ("rtsp", (f"source.{NOWHERE}", "source.credentials=/none"), "credentials /none: no such file"),
+    "address": ("rtsp", (f"source.{NOWHERE}",), "Could not"),
+    "bag": ("bag", ("source.bag=/none.mcap", "source.topic=/camera"), "/none.mcap: no such file"),
+    "topic": ("ros", ("source.topic=/camera",), "it has delivered nothing for 3 s"),
 }
 
 
@@ -94,7 +94,7 @@ def test_every_kind_of_source_may_be_missing(kind, graph, broker, tmp_path):
     source, keys, why = ABSENT[kind]
     if graph == "h264_srt" and kind in ("address", "topic"):
         pytest.skip("a camera that dials is tried by its own pipeline")
-    own = (f"+source@cameras.mast.source={source}", *(f"cameras.mast.source.{key}" for key in keys))
+    own = (f"+source@cameras.mast.source={source}", *(f"cameras.mast.{key}" for key in keys))
     words = (*ROBOT, *own, f"graph={graph}", f"media.port={free_port()}", f"control.port={broker.port}")
     with process("vehicle", *words, f"log={tmp_path / 'drive'}") as vehicle, live_frames([*words]) as frames:
         operator = Operator(broker)
