@@ -8,6 +8,7 @@ import threading
 from gi.repository import GLib, Gst
 
 from runner.graph import Plan
+from runner.gst.probes import BufferProbe, PassingBuffer
 
 CHECK_MS = 1000
 BEHIND_S = 0.3  # a clip that lags by more skips the lag instead of catching up
@@ -28,8 +29,7 @@ def loop_clip(pipeline: Gst.Bin, plan: Plan) -> None:
     pace = identity.get_static_pad("sink")
     _Loop(pace.get_peer(), identity, float(plan.camera.fps))
     _report_no_latency(pace)
-    clip = _Pace(identity, float(plan.camera.fps))
-    GLib.timeout_add(CHECK_MS, clip.check)
+    GLib.timeout_add(CHECK_MS, _Pace(identity).check)
 
 
 class _Loop:
@@ -98,29 +98,41 @@ class _Pace:
     """Skips the time by which a clip lags, as a camera loses frames.
 
     Otherwise a machine after an overload would play overdue frames at full speed, and stay overloaded.
+
+    A frame's own time tells whether it is overdue. Frames that are missing do not: they are also missing after a skip
+    that went too far, and another one would only make the clip stand still again, at every check.
     """
 
-    def __init__(self, identity: Gst.Element, fps: float) -> None:
-        self._identity, self._fps = identity.weak_ref(), fps  # of the element, not of its Python wrapper
-        self._base_lag: float | None = None  # s by which frames lag behind the clock without overload
+    def __init__(self, identity: Gst.Element) -> None:
+        self._identity = identity.weak_ref()  # of the element, not of its Python wrapper
+        self._next = BufferProbe(identity.get_static_pad("sink"), self._on_frame)
 
     def check(self) -> bool:
-        """Once a second; ends with the pipeline."""
+        """Check the next frame; once a second. Ends with the pipeline."""
         identity = self._identity()
         if identity is None:
             return False
-        clock, pad = identity.get_clock(), identity.get_static_pad("sink")
-        frames = identity.get_property("stats").get_value("num-buffers")
-        if identity.get_state(0).state != Gst.State.PLAYING or clock is None or not frames:
-            return True
-        behind = (clock.get_time() - identity.get_base_time()) / Gst.SECOND - frames / self._fps
-        if self._base_lag is None or behind < self._base_lag:
-            self._base_lag = behind
-        elif behind > self._base_lag + BEHIND_S:
-            lost = int((behind - self._base_lag) * Gst.SECOND)
-            pad.get_peer().set_offset(pad.get_peer().get_offset() + lost)
-            self._base_lag = behind
+        if identity.get_state(0).state == Gst.State.PLAYING:
+            self._next.arm()
         return True
+
+    def _on_frame(self, pad: Gst.Pad, frame: PassingBuffer) -> bool:
+        """In the streaming thread, so no frame passes meanwhile."""
+        late = _late_ns(pad, frame.pts)
+        if late > BEHIND_S * Gst.SECOND:
+            above = pad.get_peer()
+            above.set_offset(above.get_offset() + late)
+        return True
+
+
+def _late_ns(pad: Gst.Pad, pts: int | None) -> int:
+    """By how much a frame is overdue at a pad; 0 if that is unknown."""
+    element, segment = pad.get_parent_element(), pad.get_sticky_event(Gst.EventType.SEGMENT, 0)
+    clock = element.get_clock()
+    if clock is None or segment is None or pts is None:
+        return 0
+    due: int = element.get_base_time() + segment.parse_segment().to_running_time(Gst.Format.TIME, pts)
+    return int(clock.get_time()) - due
 
 
 def fixed_rate(pipeline: Gst.Bin) -> list[Gst.Element]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from contextlib import contextmanager
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from rtsp_client import RtspClient
 from runner.core.commands import Command
 
 WIDTH, HEIGHT, KBPS = 424, 240, 1000
+STILL_S = 1.2  # for which a clip stands still, at most
 WORDS = (*SMALL_ROBOT, "source=appsrc", "cameras.rear.fps=40")
 
 
@@ -102,6 +104,44 @@ def test_openh264_is_not_restarted_by_the_pictures_that_it_leaves_out_itself():
         time.sleep(1)  # the first picture after the cut is larger
         assert kbps(side, 4) <= 1.3 * 300
     assert not [line for line in reported if "Hz" in line]
+
+
+def jump_ahead(side):
+    """Make the times of a clip's pictures jump ahead, as a skip does that goes too far."""
+    above = side._pipeline("rear")._pipeline.get_by_name("pace").get_static_pad("sink").get_peer()
+    above.set_offset(above.get_offset() + int(STILL_S / 2 * 1e9))
+
+
+def hold_up(side):
+    """Hold up a clip, as a machine that is overloaded does."""
+    from runner.gst import Gst
+
+    def on_picture(_pad, _info):
+        time.sleep(STILL_S)
+        return Gst.PadProbeReturn.REMOVE
+
+    side._pipeline("rear")._pipeline.get_by_name("gate").get_static_pad("src").add_probe(
+        Gst.PadProbeType.BUFFER, on_picture
+    )
+
+
+@pytest.mark.parametrize("disturb", [jump_ahead, pytest.param(hold_up, marks=[pytest.mark.soak, pytest.mark.sources])])
+def test_a_clip_that_stood_still_once_plays_at_its_rate_again(tmp_path, disturb):
+    """And not with a pause each second: the stall of a process left one camera of eight at half its rate."""
+    from runner.gst.clip_writer import write_clip
+
+    clip = tmp_path / "clip.mp4"
+    write_clip(clip, (bytes([number]) * (64 * 48 * 3 // 2) for number in range(100)), 64, 48, Fraction(25))
+    words = ("source=file", f"source.clip={clip}", "cameras.rear.fps=25")
+    with streaming(*SMALL_ROBOT, *words, cameras=("rear",)) as (side, _, (plan,), _), watching(plan) as client:
+        side.turn([Command("rear", "sending", True), Command("rear", "size", (WIDTH, HEIGHT))])
+        until(lambda: client.frames_with_retry() > 5)
+        disturb(side)
+        time.sleep(STILL_S)
+        began, (before, _) = time.monotonic(), side.sent()["rear"]
+        time.sleep(1.5)
+        after, _ = side.sent()["rear"]
+        assert (after - before) / (time.monotonic() - began) == pytest.approx(25, rel=0.15)
 
 
 @pytest.mark.soak
