@@ -42,7 +42,8 @@ def quality(factor, kbps, hard=1.0):
 def point(factor, kbps, *, actual=None, hard=1.0, frames=40, noise=0.0):
     wobble = noise * np.sin(np.arange(frames) * (1 + 3 * float(factor)))
     scores = tuple(quality(factor, kbps, hard) + wobble)
-    return Point(factor, kbps, kbps if actual is None else actual, 10 * float(factor) ** 2, {"mssim": scores})
+    mean = kbps if actual is None else actual
+    return Point(factor, kbps, mean, mean, 10 * float(factor) ** 2, {"mssim": scores})
 
 
 def at(curves, kbps, factor):
@@ -135,8 +136,9 @@ def test_a_factor_with_no_use_for_more_bitrate_stays_as_good():
 
 
 def test_points_that_all_miss_their_target_are_refused():
-    with pytest.raises(ValueError, match="no encoding meets its target bitrate"):
-        draw_curves([point(Fraction(1), 50, actual=200)], SCORE)
+    nearest = "no encoding meets its target bitrate; the nearest: factor 1 reaches 200 at 100 kbit/s"
+    with pytest.raises(ValueError, match=nearest):
+        draw_curves([point(Fraction(1), 50, actual=200), point(Fraction(1), 100, actual=200)], SCORE)
 
 
 def test_single_points_of_each_factor_are_too_few():
@@ -215,6 +217,13 @@ def test_a_choice_warns_of_its_limits():
     assert "only 10 frames were scored; use a longer sequence" in short.warnings
     one = choose(grid([Fraction(1, 2)]), CRITERIA)
     assert "the curves never cross between 50 and 4000 kbit/s: factor 0.5 is the best" in one.warnings
+
+
+def test_a_choice_tells_of_an_encoder_that_holds_its_bitrate_in_the_mean_only():
+    points = [replace(p, second_kbps=1.5 * p.actual_kbps) if p.scaling == 1 else p for p in grid()]
+    assert choose(points, CRITERIA).warnings == (
+        "factor 1 exceeds 20 of its targets in some second: it reaches 75 at a target of 50 kbit/s",
+    )
 
 
 def test_lower_is_better_reverses_everything():

@@ -207,7 +207,7 @@ def test_quality_between_measured_points(
 def test_quality_is_read_from_the_curve_that_model_draws() -> None:
     """Of bent points; two of them, where the encoder cannot use more, are at the same bitrate."""
     rates, scores = (100, 200, 400, 800), (0.6, 0.8, 0.85, 0.86)
-    points = [Point(Fraction(1, 2), r, r, 1.0, {"mssim": (s,)}) for r, s in zip(rates, scores, strict=True)]
+    points = [Point(Fraction(1, 2), r, r, r, 1.0, {"mssim": (s,)}) for r, s in zip(rates, scores, strict=True)]
     curves = draw_curves(points, mean_score("mssim"))
     document = {
         "metric": "mssim",

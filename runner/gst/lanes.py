@@ -16,7 +16,6 @@ from gi.repository import GLib, Gst
 from runner.errors import RunError
 from runner.gst.caps import structure
 from runner.gst.pictures import LumaPlane, luma_of
-from runner.gst.pipeline import passed_counts
 from runner.lanes import BAG, FRAMES, LaneSet
 
 POLL_NS = 200 * 1_000_000
@@ -31,12 +30,12 @@ class Encoded:
     """Result of one lane.
 
     frames    decoded pictures
-    bytes     of coded video
+    sent      of coded video: times, s, and bytes
     encode_s  CPU time of the encoder in its own thread, s
     """
 
     frames: int = 0
-    bytes: int = 0
+    sent: list[tuple[float, int]] = field(default_factory=list)
     encode_s: float = 0.0
 
 
@@ -76,14 +75,13 @@ def run_lanes(
     results = [Encoded() for _ in lanes.lanes]
     for number, lane in enumerate(lanes.lanes):
         _watch_encoder(pipeline.get_by_name(lane.encoder), results[number])
+        _watch_sizes(pipeline.get_by_name(lane.counter), results[number])
         sink = pipeline.get_by_name(lane.sink)
         sink.connect("new-sample", lambda s, n=number: _on_sample(run, s, n, results[n], on_picture))
     try:
         if pipeline.set_state(Gst.State.PLAYING) == Gst.StateChangeReturn.FAILURE:
             raise RunError(_message(pipeline.get_bus().pop_filtered(Gst.MessageType.ERROR)))
         _wait(pipeline, run, on_progress)
-        for result, lane in zip(results, lanes.lanes, strict=True):
-            result.bytes = passed_counts(pipeline.get_by_name(lane.counter))[1]
     finally:
         pipeline.set_state(Gst.State.NULL)
     return results
@@ -158,6 +156,15 @@ def _watch_encoder(encoder: Gst.Element, result: Encoded) -> None:
 
     encoder.get_static_pad("sink").add_probe(Gst.PadProbeType.BUFFER, on_input)
     encoder.get_static_pad("src").add_probe(Gst.PadProbeType.BUFFER, on_output)
+
+
+def _watch_sizes(counter: Gst.Element, result: Encoded) -> None:
+    def on_coded(_pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+        unit = info.get_buffer()
+        result.sent.append((unit.pts / Gst.SECOND, unit.get_size()))
+        return Gst.PadProbeReturn.OK
+
+    counter.get_static_pad("src").add_probe(Gst.PadProbeType.BUFFER, on_coded)
 
 
 def _on_sample(run: _Run, sink: Gst.Element, lane: int, result: Encoded, on_picture: OnDecoded) -> Gst.FlowReturn:

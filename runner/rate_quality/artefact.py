@@ -165,6 +165,7 @@ def _point_to_json(point: Point) -> dict[str, Any]:
         "scaling": plain(point.scaling),
         "target_kbps": point.target_kbps,
         "actual_kbps": round(point.actual_kbps, 2),
+        "second_kbps": round(point.second_kbps, 2),
         "encode_ms": round(point.encode_ms, 4),
         **scores,
     }

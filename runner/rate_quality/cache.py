@@ -75,6 +75,7 @@ def point_to_json(point: Point, identities: Mapping[str, str]) -> dict[str, Any]
     """identities: by metric, everything that determines its scores"""
     return {
         "actual_kbps": point.actual_kbps,
+        "second_kbps": point.second_kbps,
         "encode_ms": point.encode_ms,
         "scores": {identities[name]: scores for name, scores in point.scores.items()},
     }
@@ -87,4 +88,4 @@ def point_from_json(
     if any(identity not in data["scores"] for identity in identities.values()):
         return None
     scores = {name: tuple(data["scores"][identity]) for name, identity in identities.items()}
-    return Point(scaling, kbps, data["actual_kbps"], data["encode_ms"], scores)
+    return Point(scaling, kbps, data["actual_kbps"], data["second_kbps"], data["encode_ms"], scores)

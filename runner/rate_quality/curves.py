@@ -14,6 +14,8 @@ from itertools import combinations, pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.core.model import plain
+
 Values = NDArray[np.float64]
 
 GRID = 400  # bitrates at which curves are compared, log-spaced
@@ -29,6 +31,7 @@ class Point:
     """One encoding of a sequence.
 
     actual_kbps  output of the encoder
+    second_kbps  the same in the second in which it was highest
     encode_ms    CPU time of the encoder for each frame
     scores       by metric, the quality of each sampled frame
     """
@@ -36,12 +39,18 @@ class Point:
     scaling: Fraction
     target_kbps: int
     actual_kbps: float
+    second_kbps: float
     encode_ms: float
     scores: Mapping[str, tuple[float, ...]]
 
     @property
     def meets_target(self) -> bool:
         return self.actual_kbps <= MAX_OVERSHOOT * self.target_kbps
+
+    @property
+    def holds_target(self) -> bool:
+        """Whether it meets its target in each second, not just in the mean."""
+        return self.second_kbps <= MAX_OVERSHOOT * self.target_kbps
 
     @property
     def saturated(self) -> bool:
@@ -110,13 +119,16 @@ def draw_curves(points: Iterable[Point], score: Score) -> Curves:
 
     raises  ValueError if no point meets its target
     """
+    measured = sorted(points, key=lambda p: (p.scaling, p.target_kbps))
     valid: dict[Fraction, list[Point]] = {}
-    for point in sorted(points, key=lambda p: (p.scaling, p.target_kbps)):
+    for point in measured:
         if point.meets_target:
             valid.setdefault(point.scaling, []).append(point)
     targets = [point.target_kbps for group in valid.values() for point in group]
     if not targets:
-        raise ValueError("no encoding meets its target bitrate")
+        best = min(measured, key=lambda point: point.actual_kbps / point.target_kbps)
+        reached = f"factor {plain(best.scaling)} reaches {best.actual_kbps:.0f} at {best.target_kbps} kbit/s"
+        raise ValueError(f"no encoding meets its target bitrate; the nearest: {reached}")
     kbps = np.geomspace(min(targets), max(targets), GRID)
     return Curves(kbps, {factor: _curve(group, score, kbps) for factor, group in valid.items()})
 

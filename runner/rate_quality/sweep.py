@@ -21,7 +21,7 @@ from runner.rate_quality.task import Cancelled, Task, run_task
 if TYPE_CHECKING:
     from runner.rate_quality.metrics import Mask, Metric
 
-LANES_VERSION = 3  # increment with every change that affects scores
+LANES_VERSION = 4  # increment with every change that affects points
 PIXELS_AT_ONCE = 16_000_000  # in the lanes of all tasks together, which keeps memory below 2 GB
 
 

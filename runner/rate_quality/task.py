@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -16,6 +16,7 @@ from runner.rate_quality.curves import Point
 if TYPE_CHECKING:
     from runner.rate_quality.metrics import Luma, Mask, Metric, QualityMeter
 
+SAME_S = 1e-4  # by which times may be rounded
 OVERHEAD = 0.1  # cost of decoding and scoring a lane of any size, in encodings at full size
 
 
@@ -69,12 +70,13 @@ def run_task(task: Task, on_progress: Callable[[float], None] = lambda share: No
         )
         for one in scoring:
             one.finish(references)
-        seconds = task.frames / task.compiled.fps
+        seconds = float(task.frames / task.compiled.fps)
         return [
             Point(
                 scaling=lane.scaling,
                 target_kbps=lane.kbps,
-                actual_kbps=round(8 * result.bytes / 1000 / float(seconds), 2),
+                actual_kbps=round(_kbps(sum(size for _, size in result.sent), seconds), 2),
+                second_kbps=round(_kbps(_most_at_once(result.sent), min(1.0, seconds)), 2),
                 encode_ms=round(1000 * result.encode_s / max(1, result.frames), 4),
                 scores=one.close(),
             )
@@ -87,6 +89,22 @@ def run_task(task: Task, on_progress: Callable[[float], None] = lambda share: No
         for one in scoring:
             with suppress(RunError):
                 one.close()
+
+
+def _kbps(size: int, seconds: float) -> float:
+    return 8 * size / 1000 / seconds
+
+
+def _most_at_once(sent: Sequence[tuple[float, int]]) -> int:
+    """Bytes of the second with the most. sent: times, s, and bytes."""
+    size = most = begin = 0
+    for at, new in sent:
+        size += new
+        while sent[begin][0] <= at - 1 + SAME_S:
+            size -= sent[begin][1]
+            begin += 1
+        most = max(most, size)
+    return most
 
 
 class _References:
