@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -551,13 +552,14 @@ class OperatorSide:
     def take_arrivals(self) -> Arrivals:
         """Arrivals since the last call; to be called from one thread."""
         receivers = self._receivers
-        counted = [receiver.take_packets() for receiver in receivers.values()]
+        counted = [receiver.take_counts() for receiver in receivers.values()]
         return Arrivals(
             frames={name: receiver.take_arrivals() for name, receiver in receivers.items()},
             newest={name: receiver.newest for name, receiver in receivers.items() if receiver.newest},
             packets=sum(received for received, _ in counted),
             lost=sum(lost for _, lost in counted),
             damaged=[name for name, receiver in receivers.items() if receiver.is_damaged],
+            arrived=list(chain.from_iterable(receiver.take_packets() for receiver in receivers.values())),
         )
 
     def stop(self) -> None:

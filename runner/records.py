@@ -347,12 +347,17 @@ class Arrival(NamedTuple):
     arrived   of its last packet, s by this machine's monotonic clock
     captured  s by the vehicle's clock; from an arbitrary origin if the transport carries only the RTP timestamp
     whole     whether no packet of it was initially missing
+    first     as `arrived`, of its first packet, by the kernel; None: the kernel does not state both
     """
 
     arrived: float
     captured: float
     bytes: int
     whole: bool = True
+    first: float | None = None
+
+
+ArrivedPacket = tuple[float, int]  # s by this machine's monotonic clock, bytes without headers; there are thousands a s
 
 
 class SentFrame(NamedTuple):
@@ -374,6 +379,7 @@ class Arrivals(NamedTuple):
     newest         by camera, the newest access unit that has left the jitter buffer
     packets, lost  RTP packets of all cameras received, and initially missing
     damaged        cameras whose newest picture shows unrecovered packet loss
+    arrived        packets of all cameras, those of `frames` and maybe later ones, repeated ones included; in no order
     """
 
     frames: Mapping[str, Sequence[Arrival]]
@@ -381,6 +387,7 @@ class Arrivals(NamedTuple):
     packets: int = 0
     lost: int = 0
     damaged: Sequence[str] = ()
+    arrived: Sequence[ArrivedPacket] = ()
 
 
 class UnitReceived(NamedTuple):
@@ -390,6 +397,11 @@ class UnitReceived(NamedTuple):
     delay_s  s from its capture, by the vehicle's clock, to that arrival; minus a constant, since clocks differ
     bytes    without packet headers
     whole    whether no packet of it was initially missing
+    train_s  s from the arrival of its first packet to that of its last
+    train_packets, train_bytes  what arrived in that time of all cameras, repeated packets included, without the first
+             packet; 0: it was one packet, or the transport does not tell
+    carried_packets, carried_bytes  what arrived of all cameras after the last packet of the previous unit and until the
+             last packet of this one, repeated packets included; 0: the transport does not tell
     """
 
     camera: str
@@ -397,6 +409,11 @@ class UnitReceived(NamedTuple):
     delay_s: float
     bytes: int
     whole: bool = True
+    train_s: float = 0.0
+    train_packets: int = 0
+    train_bytes: int = 0
+    carried_packets: int = 0
+    carried_bytes: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -66,9 +66,9 @@ class Stream:
     def taken(self, frame: int, ms: float = 40) -> list[tuple[float, float, int, bool]]:
         """Frames taken `ms` after the start of one: number, ms from its start to its arrival, bytes, whole."""
         found = []
-        for arrived, captured, size, whole in self.frames.take(self.at(frame, ms)):
-            number = round(20 * (captured - CAPTURED))
-            found.append((number, round(1000 * (arrived - number / 20), 3), size, whole))
+        for each in self.frames.take(self.at(frame, ms)):
+            number = round(20 * (each.captured - CAPTURED))
+            found.append((number, round(1000 * (each.arrived - number / 20), 3), each.bytes, each.whole))
         return found
 
     @property
@@ -139,6 +139,43 @@ def test_packets_that_are_read_late_arrived_earlier_and_their_frame_is_not_overd
         frames.add(Packet(number, 4500, number == 3, 1000, CAPTURED), read, read - 0.2)
         assert not frames.is_late(read + 0.005)
     assert [frame.arrived for frame in frames.take(10.21)] == [pytest.approx(10.003)]
+
+
+def receive(*packets: tuple[int, float | None], stamp: int = 4500) -> ArrivingFrames:
+    """A frame of packets with these numbers, of which 3 is the last one, and the times of the kernel."""
+    frames = ArrivingFrames()
+    for number, at in packets:
+        frames.add(Packet(number, stamp, number == 3, 1000 + number, CAPTURED), 10.0 if at is None else at + 0.2, at)
+    return frames
+
+
+def test_a_frame_began_when_the_kernel_received_its_first_packet() -> None:
+    (frame,) = receive((1, 10.001), (2, 10.004), (3, 10.006)).take(10.3)
+    assert (frame.first, frame.arrived, frame.whole) == (10.001, 10.006, True)
+
+
+@pytest.mark.parametrize("times", [(None, None, None), (10.001, 10.004, None), (None, 10.004, 10.006)])
+def test_when_a_frame_began_is_unknown_unless_the_kernel_states_its_first_and_last_packet(times: list[float]) -> None:
+    """Over TCP and SRT packets are read after others, and by a process that other threads hold up."""
+    (frame,) = receive(*zip((1, 2, 3), times, strict=True)).take(10.3)
+    assert (frame.first, frame.arrived) == (None, times[-1] or 10.0)
+
+
+def test_a_frame_in_two_parts_began_with_the_first_one() -> None:
+    frames = receive((1, 10.001), (2, 10.002))
+    first = frames.take(10.3)
+    frames.add(Packet(3, 4500, True, 1003, CAPTURED), 10.4, 10.35)
+    parts = [(each.first, each.arrived, each.bytes, each.whole) for each in (*first, *frames.take(10.4))]
+    assert parts == [(10.001, 10.002, 2003, False), (10.001, 10.35, 1003, False)]
+
+
+def test_every_packet_that_arrives_is_counted_once() -> None:
+    """Also those that are repeated, retransmitted or reordered, and strays; in the order in which they are handled."""
+    frames = receive((2, 10.002), (1, 10.001), (1, 10.001))
+    frames.add(Packet(1, 4500, False, 1001, CAPTURED), 10.4, 10.3, retransmitted=True)
+    frames.add(Packet(30_000, 0, False, 500, CAPTURED), 10.5)
+    expected = [(10.002, 1002), (10.001, 1001), (10.001, 1001), (10.3, 1001), (10.5, 500)]
+    assert (frames.take_packets(), frames.take_packets()) == (expected, [])
 
 
 def test_a_reordered_packet_is_not_missing() -> None:

@@ -14,7 +14,7 @@ INSIDE_MTU = 14  # RTP header (RFC 3550) and fragmentation header (RFC 6184, FU-
 
 def on_the_wire(graph: Graph, size: int) -> int:
     """Bytes on the wire, headers included, of an access unit of `size` bytes."""
-    return size + -(-size // _payload(graph)) * _header(graph)
+    return size + -(-size // payload_bytes(graph)) * header_bytes(graph)
 
 
 def wire_kbps(cameras: Iterable[Camera], video: Kbps) -> Kbps:
@@ -35,14 +35,16 @@ def video_kbps(cameras: Iterable[Camera], wire: Kbps) -> Kbps:
 @lru_cache(maxsize=64)  # for a few sets of cameras that are on
 def _overhead(cameras: tuple[Camera, ...]) -> tuple[Kbps, Fraction]:
     """kbit/s of one more packet per access unit, and bytes on the wire per byte of full packets."""
-    fixed = sum((_header(camera.graph) * 8 * camera.fps / 1000 for camera in cameras), Fraction(0))
-    factors = [1 + Fraction(_header(camera.graph), _payload(camera.graph)) for camera in cameras]
+    fixed = sum((header_bytes(camera.graph) * 8 * camera.fps / 1000 for camera in cameras), Fraction(0))
+    factors = [1 + Fraction(header_bytes(camera.graph), payload_bytes(camera.graph)) for camera in cameras]
     return fixed, max(factors, default=Fraction(1))
 
 
-def _payload(graph: Graph) -> int:
+def payload_bytes(graph: Graph) -> int:
+    """Of video in a full packet."""
     return max(1, int(graph.settings.get("mtu_bytes", MTU_BYTES)) - INSIDE_MTU)
 
 
-def _header(graph: Graph) -> int:
+def header_bytes(graph: Graph) -> int:
+    """Of a packet on the wire, below the payload of the video."""
     return int(graph.settings.get("header_bytes", HEADER_BYTES))

@@ -7,9 +7,9 @@ from collections import deque
 from dataclasses import dataclass
 from math import inf
 
-from runner.records import Arrival
+from runner.records import Arrival, ArrivedPacket
 
-MAX_FRAMES = 1024  # unread frames; beyond that the oldest are dropped
+MAX_FRAMES, MAX_PACKETS = 1024, 16_384  # not taken yet; beyond that the oldest are dropped
 TAIL_S = 0.01  # a frame whose last packet is missing counts as ended after this long without a packet ...
 TAIL_GAPS = 2  # ... and after this many times the longest recent gap within a frame: a slow link spreads packets out
 GAP_DECAY = 0.99  # factor by which that gap decays with each packet
@@ -18,7 +18,7 @@ NTP_EPOCH_S = 2_208_988_800  # 1900-01-01 to 1970-01-01 (RFC 5905)
 RTP_HZ = 90_000  # of video (RFC 6184)
 HEADER_BYTES = 32  # of a packet: enough for the header without contributing sources, and the capture time
 CAPTURE_ID = 1  # of the header extension with the capture time
-EXTENDED, SOURCES, MARKER, HALF = 0x10, 0x0F, 0x80, 0x8000  # RFC 3550, section 5.1; half of all sequence numbers
+EXTENDED, SOURCES, MARKER, NUMBERS = 0x10, 0x0F, 0x80, 0x10000  # RFC 3550, section 5.1; so many sequence numbers
 # Jump of the sequence number, ahead or back, that marks a restarted stream if the next packet follows (RFC 3550, A.1).
 DROPOUT, MISORDER = 3000, 100
 WINDOW_S = 5.0  # the usual transit time is the shortest one in this window and the window before it
@@ -71,15 +71,19 @@ def _captured(extension: bytes) -> float | None:
 class ArrivingFrames:
     """Groups the packets of one camera into frames, in order of arrival.
 
-    The thread in which packets arrive adds them; any one other thread takes the frames.
+    The thread in which packets arrive adds them; any one other thread takes frames and packets.
     """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._frames: deque[Arrival] = deque(maxlen=MAX_FRAMES)
+        self._packets: deque[ArrivedPacket] = deque(maxlen=MAX_PACKETS)
         self._clock = MediaClock(1 / RTP_HZ)
         self._newest: Packet | None = None
-        self._handled = self._arrived = 0.0  # when the newest packet was added, and when it arrived
+        self._handled = 0.0  # when the newest packet was added
+        # When the kernel received the first packet of its frame, and the newest one; None: unknown.
+        self._first: float | None = None
+        self._received: float | None = None
         self._captured, self._bytes = 0.0, 0  # of its frame; bytes not emitted yet
         self._ahead: float | None = None  # how far capture times are ahead of the media clock, s; None: not stated yet
         self._whole = False  # no packet of the frame is missing so far
@@ -94,19 +98,19 @@ class ArrivingFrames:
         """Add a packet; returns whether it is newer than all earlier ones.
 
         now      s
-        arrived  when the kernel received it, s; None: now
+        arrived  when the kernel received it, s; None: unknown, so that it counts as arriving now
         """
-        arrived = now if arrived is None else arrived
         with self._lock:
-            ahead = 0 if self._newest is None else (packet.number - self._newest.number - 1) % (2 * HALF)
-            if ahead >= (HALF if retransmitted else 2 * HALF - MISORDER):
+            self._packets.append((now if arrived is None else arrived, packet.bytes))
+            ahead = 0 if self._newest is None else (packet.number - self._newest.number - 1) % NUMBERS
+            if ahead >= (NUMBERS // 2 if retransmitted else NUMBERS - MISORDER):
                 self._add_older(packet, retransmitted)
                 return False
             if ahead < DROPOUT:
                 self._add_newer(packet, now, arrived, retransmitted, whole=not ahead)
                 self._note_missing(packet.number, ahead)
                 return True
-            expected, self._restarted = self._restarted, (packet.number + 1) % (2 * HALF)
+            expected, self._restarted = self._restarted, (packet.number + 1) % NUMBERS
             if packet.number != expected:
                 return False
             self._ahead = None
@@ -122,7 +126,7 @@ class ArrivingFrames:
     def next_number(self) -> int:
         """Sequence number of the next packet expected."""
         newest = self._newest
-        return (newest.number + 1) % (2 * HALF) if newest else 0
+        return (newest.number + 1) % NUMBERS if newest else 0
 
     def take(self, now: float) -> list[Arrival]:
         """Frames that have ended since the last call, or are overdue."""
@@ -134,6 +138,13 @@ class ArrivingFrames:
             self._frames.clear()
             return taken
 
+    def take_packets(self) -> list[ArrivedPacket]:
+        """Packets that have arrived since the last call, repeated and retransmitted ones included."""
+        with self._lock:
+            taken = list(self._packets)
+            self._packets.clear()
+            return taken
+
     def _add_older(self, packet: Packet, retransmitted: bool) -> None:
         """Add a packet that was reordered, retransmitted or duplicated."""
         if retransmitted:
@@ -143,16 +154,19 @@ class ArrivingFrames:
             self._bytes += packet.bytes
             self.received, self.missing = self.received + 1, self.missing - 1
 
-    def _add_newer(self, packet: Packet, now: float, arrived: float, retransmitted: bool, *, whole: bool) -> None:
+    def _add_newer(
+        self, packet: Packet, now: float, arrived: float | None, retransmitted: bool, *, whole: bool
+    ) -> None:
         """Add a packet that is newer than all earlier ones. whole: no packet is missing before it."""
         self.received, self.missing = self.received + (not retransmitted), self.missing + retransmitted
         if self._newest is None or packet.stamp != self._newest.stamp:
             self._begin(packet, now, regular=whole and not retransmitted)
+            self._first = arrived
         elif not retransmitted:
             self._gap = max(now - self._handled, GAP_DECAY * self._gap)
         self._whole &= whole and not retransmitted
         self._newest, self._handled, self._bytes = packet, now, self._bytes + packet.bytes
-        self._arrived = arrived
+        self._received = arrived
         self._open, self._emitted = not packet.last, False
         if packet.last:
             self._emit()
@@ -160,7 +174,7 @@ class ArrivingFrames:
     def _note_missing(self, number: int, count: int) -> None:
         """`count` packets before the one with this number are missing."""
         self.missing += count
-        self._missing.extend(each % (2 * HALF) for each in range(number - min(count, MISORDER), number))
+        self._missing.extend(each % NUMBERS for each in range(number - min(count, MISORDER), number))
 
     def _begin(self, packet: Packet, now: float, *, regular: bool) -> None:
         """Begin a frame. regular: no packet is missing since the previous one, and it arrives as first sent."""
@@ -182,7 +196,8 @@ class ArrivingFrames:
 
     def _emit(self) -> None:
         if self._ahead is not None:
-            self._frames.append(Arrival(self._arrived, self._captured, self._bytes, self._whole))
+            at, first = (self._handled, None) if self._received is None else (self._received, self._first)
+            self._frames.append(Arrival(at, self._captured, self._bytes, self._whole, first))
         self._bytes, self._emitted = 0, True
 
 

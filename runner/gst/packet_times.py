@@ -11,15 +11,17 @@ SO_TIMESTAMPNS = 35  # asm-generic/socket.h
 REALTIME = 1  # GstSocketTimestampMode, GStreamer 1.20
 
 
-def state_arrivals(source: Gst.Element) -> None:
+def state_arrivals(source: Gst.Element) -> bool:
     """Make a udpsrc state in the DTS of each packet when the kernel received it, not when the element read it.
 
     The element asks the kernel for it when it opens, which a client's has done before it can be configured.
 
-    raises  OSError if the system lacks such times
+    returns  whether it will
+    raises   OSError if the system lacks such times
     """
     if source.find_property("socket-timestamp") is None or (used := source.get_property("used-socket")) is None:
-        return
+        return False
     with socket.socket(fileno=os.dup(used.get_fd())) as duplicate:
         duplicate.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
     source.set_property("socket-timestamp", REALTIME)
+    return True

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 from typing import TYPE_CHECKING
 
 from gi.repository import GLib, Gst, GstRtsp, GstSdp
@@ -25,7 +26,7 @@ from runner.gst.video_files import VideoFile, VideoFiles
 from runner.gst.viewers import user_agent
 from runner.h264.access_unit import AccessUnit, read_unit
 from runner.h264.damage import HEAD_BYTES, Damage
-from runner.records import Arrival
+from runner.records import Arrival, ArrivedPacket
 from runner.system.held_up import LateCheck
 from runner.system.recent import RecentValue
 
@@ -121,6 +122,7 @@ class Receiver:
         self._repairs = bool(settings.get("retransmission_ms"))
         self._buffers: list[RepairBuffer] = []
         self._over_udp = self._feedback = False  # transport and profile of the session
+        self._kernel_times = False  # whether packets state when the kernel received them
         self._may_use_udp = False  # until it is known which the session uses
         self._medium = 0  # of those that the vehicle offers
         self._is_older = self._older_reported = False  # whether the vehicle lacks the path with feedback
@@ -216,12 +218,16 @@ class Receiver:
         now = time.monotonic()
         return [arrival for buffer in self._buffers for arrival in buffer.frames.take(now)]
 
+    def take_packets(self) -> Iterator[ArrivedPacket]:
+        """Packets that arrived since the last call. From any one thread."""
+        return chain.from_iterable(buffer.frames.take_packets() for buffer in self._buffers)
+
     @property
     def is_damaged(self) -> bool:
         """Whether the newest picture shows unrecovered packet loss."""
         return self._begun and self._damage.is_damaged
 
-    def take_packets(self) -> tuple[int, int]:
+    def take_counts(self) -> tuple[int, int]:
         """RTP packets received, and initially missing, since the last call. From any one thread."""
         frames = [buffer.frames for buffer in self._buffers]
         received, missing = sum(each.received for each in frames), sum(each.missing for each in frames)
@@ -269,7 +275,7 @@ class Receiver:
         self._sink = pipeline.get_by_name(self._sink_name)
         self._next_picture = BufferProbe(self._sink.get_static_pad("sink"), self._on_frame)
         self._begun = False
-        self._buffers, self._over_udp, self._feedback = [], False, False
+        self._buffers, self._over_udp, self._feedback, self._kernel_times = [], False, False, False
         self._client = pipeline.get_by_name(self._client_name)
         for element in pipeline.iterate_recurse():
             self._on_element(pipeline, pipeline, element)
@@ -306,7 +312,7 @@ class Receiver:
     def _on_element(self, _pipeline: Gst.Pipeline, _parent: Gst.Bin, element: Gst.Element) -> None:
         factory = element.get_factory().get_name() if element.get_factory() else ""
         if factory == "rtpjitterbuffer":
-            self._buffers.append(RepairBuffer(element, self._reorder_ms))
+            self._buffers.append(RepairBuffer(element, self._reorder_ms, kernel_times=self._kernel_times))
         if factory == "udpsrc":
             self._over_udp = True
             self._time_packets(element)
@@ -324,7 +330,7 @@ class Receiver:
 
     def _time_packets(self, source: Gst.Element) -> None:
         try:
-            state_arrivals(source)
+            self._kernel_times = state_arrivals(source)
         except OSError as error:
             self._on_report(self._name, f"the kernel does not state when packets arrive: {error}")
 

@@ -37,11 +37,12 @@ class RepairBuffer:
     returns within seconds. In an outage's queue packets wait for seconds: lost ones would be awaited up to 1 s longer
     than the wait, and hold back the pictures behind them. So no packet may seem to be later than LONGEST_MS.
 
-    reorder_ms  minimum wait
+    reorder_ms    minimum wait
+    kernel_times  whether the DTS of packets state when the kernel received them, see `runner.gst.packet_times`
     """
 
-    def __init__(self, buffer: Gst.Element, reorder_ms: int) -> None:
-        self._buffer, self._reorder_ms = buffer, reorder_ms
+    def __init__(self, buffer: Gst.Element, reorder_ms: int, *, kernel_times: bool) -> None:
+        self._buffer, self._reorder_ms, self._kernel_times = buffer, reorder_ms, kernel_times
         # Frames arrive in bursts: the next expected packet belongs to the next frame and is not missing.
         buffer.set_property("rtx-next-seqnum", False)
         buffer.set_property("rtx-delay", REORDER_MS)
@@ -111,20 +112,20 @@ class RepairBuffer:
         request.set_value("seqnum", GObject.Value(GObject.TYPE_UINT, self.frames.next_number()))
         self._pad.push_event(Gst.Event.new_custom(Gst.EventType.CUSTOM_UPSTREAM, request))
 
-    def _arrived(self, buffer: PassingBuffer, now: float) -> float:
-        """When the kernel received a packet, s, where the DTS states it: see `runner.gst.packet_times`.
+    def _arrived(self, buffer: PassingBuffer, now: float) -> float | None:
+        """When the kernel received a packet, s; None: unknown.
 
         A DTS that cannot be right, because the kernel's clock is not this process's, is corrected.
         """
         dts = buffer.dts
-        if dts is None:
-            return now
+        if dts is None or not self._kernel_times:
+            return None
         base_time = self._buffer.get_base_time()  # a pipeline's clock is the monotonic one
         arrived: float = (base_time + dts) / Gst.SECOND
         if now - UNREAD_S < arrived < now + FUTURE_S:
             return min(arrived, now)
         buffer.dts = max(0, round(now * Gst.SECOND) - base_time)
-        return now
+        return None
 
     def _limit_lateness(self, packet: Packet, buffer: PassingBuffer) -> None:
         if (dts := buffer.dts) is None:

@@ -37,6 +37,7 @@ from runner.mqtt.messages import (
 )
 from runner.operator.meter import MeasuredRates, ReceptionMeter, StreamCounters
 from runner.operator.notes import decision_note
+from runner.operator.packet_count import PacketCount
 from runner.records import (
     Arrival,
     Arrivals,
@@ -159,6 +160,7 @@ class Station:
         self._newest: Mapping[str, Arrival] = {}  # by camera
         self._sampled = 0.0  # time.monotonic of `samples`
         self._late = LateCheck()
+        self._packets = PacketCount()
         self._delay_s: float | None = None  # of the first access unit: reported delays are relative to it
         self._run = secrets.randbits(32)  # identifies the reports of this process
         listen = {
@@ -280,14 +282,13 @@ class Station:
         """Report arrivals since the last report to the vehicle; to be called every REPORT_S, by one thread."""
         now = time.monotonic()
         self._check_capture_times(arrivals.newest, now)
-        frames = sorted((frame.arrived, name, frame) for name, some in arrivals.frames.items() for frame in some)
+        frames = [(name, frame) for name, some in arrivals.frames.items() for frame in some]
+        frames.sort(key=lambda each: each[1].arrived)
         if frames and self._delay_s is None:
-            self._delay_s = frames[0][2].arrived - frames[0][2].captured
+            self._delay_s = frames[0][1].arrived - frames[0][1].captured
         base = self._delay_s or 0.0
-        received = tuple(
-            UnitReceived(name, round(now - at, 4), round(at - frame.captured - base, 4), frame.bytes, frame.whole)
-            for at, name, frame in frames
-        )
+        self._packets.add(arrivals.arrived)
+        received = tuple(self._unit(name, frame, now, base) for name, frame in frames)
         if not self._may_reach_vehicle(now):
             return
         counts = (arrivals.packets, arrivals.lost)
@@ -305,6 +306,21 @@ class Station:
                 self._clock_requests.append(sent)
             report = replace(report, sent=sent)
         self.link.publish(self._receptions, to_json(report), behind=True)  # its arrivals are in no other report
+
+    def _unit(self, name: str, frame: Arrival, now: float, base: float) -> UnitReceived:
+        """A frame as it is reported; to be called in order of arrival. base: delays are less by it, s."""
+        at = frame.arrived
+        first = at if frame.first is None else frame.first
+        return UnitReceived(
+            name,
+            round(now - at, 4),
+            round(at - frame.captured - base, 4),
+            frame.bytes,
+            frame.whole,
+            round(at - first, 5),
+            *self._packets.between(first, at),
+            *self._packets.carried(at),
+        )
 
     def _worst_latency_ms(self, now: float) -> float | None:
         """Upper bound of the latency of the slowest displayed picture, ms; None: unknown, or nothing is displayed.

@@ -10,7 +10,7 @@ from statistics import median
 
 import pytest
 
-from rig import NOISE, SMALL_ROBOT, Operator, free_port, process, run
+from rig import NOISE, ROBOT_SIZES, SMALL_ROBOT, Operator, free_port, needs_root, process, run
 from runner.core.events import LinkMeasured, OperatorConnected
 from runner.core.link_cap import SILENCE_S
 from runner.core.uplink import LinkState
@@ -84,6 +84,33 @@ def test_a_replay_measures_the_link_again_bit_for_bit(drive):
     assert (logged.returncode, again.returncode) == (0, 0), again.stderr
     assert "link_measured" in logged.stdout
     assert again.stdout == logged.stdout
+
+
+@pytest.mark.parametrize(
+    "kind", [pytest.param("netns", marks=needs_root), pytest.param("relay", marks=[pytest.mark.soak])]
+)
+def test_frames_tell_the_rate_of_a_link_that_they_do_not_fill(kind, tmp_path):
+    """Each as a train of packets, and by what the link carried since the frame before, if it was still busy then."""
+    words = ("fps_max=5", "modes=open_loop", "pqos.kbps=3200", f"link={kind}", "link.share=1.25", "duration_s=6")
+    ports = (f"media.port={free_port()}", f"control.port={free_port()}")
+    done = run("demo", *ROBOT, *NOISE, *ports, *words, f"log={tmp_path}")
+    assert done.returncode == 0, done.stderr
+    reports = [line.report for line in read_drive(tmp_path).sides["vehicle"].of(ReceptionReported) if line.t > 2]
+    units = [(report.at - unit.ago_s, unit) for report in reports for unit in report.units]
+    shortest = {name: min(u.delay_s - u.train_s for _, u in units if u.camera == name) for name in ROBOT_SIZES}
+    trains = [kbps(u.train_packets, u.train_bytes, u.train_s) for _, u in units if u.whole and u.train_packets > 10]
+    busy = [
+        kbps(unit.carried_packets, unit.carried_bytes, at - before)
+        for (before, _), (at, unit) in pairwise(units)
+        if before > at - unit.delay_s + shortest[unit.camera] + 0.002 and at > before
+    ]
+    assert min(len(trains), len(busy)) > 15
+    assert (median(trains), median(busy)) == pytest.approx((4000, 4000), rel=0.1)
+
+
+def kbps(packets, size, seconds):
+    """As the link counts: IP packets, with the headers of IPv4, UDP and RTP."""
+    return 8 * (size + 40 * packets) / 1000 / seconds
 
 
 def test_a_side_that_is_held_up_is_not_mistaken_for_a_full_link(broker, tmp_path):

@@ -199,7 +199,7 @@ def jitter_buffer():
         buffer.dts = round(arrived_ms * Gst.MSECOND) % 2**64
         pipeline.get_by_name("source").emit("push-buffer", buffer)
 
-    repair = RepairBuffer(pipeline.get_by_name("buffer"), 5)
+    repair = RepairBuffer(pipeline.get_by_name("buffer"), 5, kernel_times=True)
     pipeline.get_by_name("sink").get_static_pad("sink").add_probe(Gst.PadProbeType.BUFFER, note)
     pipeline.set_state(Gst.State.PLAYING)
     try:

@@ -206,6 +206,27 @@ def test_latencies_are_right_though_the_vehicles_clock_is_ahead(both):
     assert station.headline() == f"delivery_robot, mode automatic, total 1500 kbit/s{expected}"
 
 
+def test_frames_are_reported_with_what_arrived_of_all_cameras(both):
+    """Between the first packet and the last, where known, and since the frame before; a report may cut a frame."""
+    station, vehicle, _ = both
+    report_until(station, vehicle, lambda: vehicle.reports)
+    now = time.monotonic() - 0.1
+    arrived = [
+        (now + ms / 1000, size) for ms, size in ((10, 900), (12, 1000), (15, 600), (16, 500), (19, 300), (21, 1))
+    ]
+    front = Arrival(now + 0.015, 1000.0, 1500, True, now + 0.010)
+    rear = Arrival(now + 0.021, 1000.0, 801, False, now + 0.012)
+    mast = Arrival(now + 0.021, 1000.0, 999, True)
+    station.report_reception(Arrivals({"front": [front]}, {}, arrived=arrived[:4]))
+    station.report_reception(Arrivals({"rear": [rear], "mast": [mast]}, {}, arrived=arrived[4:]))
+    units = until(lambda: (seen := [u for report in vehicle.reports for u in report["units"]]) and seen[2:] and seen)
+    assert [(unit[0], *unit[4:]) for unit in units] == [
+        ("front", True, pytest.approx(0.005), 2, 1600, 3, 2500),
+        ("rear", False, pytest.approx(0.009), 4, 1401, 3, 801),
+        ("mast", True, 0, 0, 0, 0, 0),
+    ]
+
+
 def test_a_steering_angle_is_passed_on_with_its_time_by_this_machines_clock(both):
     """None before that clock is compared with the vehicle's, and none of the future."""
     received = []

@@ -9,7 +9,7 @@ from statistics import median
 
 import pytest
 
-from rig import needs_root, over_tcp, streaming, until
+from rig import free_port, needs_root, over_tcp, streaming, until
 from rtsp_client import RtspClient
 from runner.core.commands import Command
 from runner.gst.patient_media import PatientMedia
@@ -68,6 +68,33 @@ def test_a_viewer_that_falls_back_to_tcp_is_named():
         until(
             lambda: {"rear: over TCP, UDP ports 28000-28005 are in use", f"operator: rear: {OVER_TCP}"} <= set(reported)
         )
+
+
+@pytest.mark.parametrize(
+    ("transport", "known"),
+    [
+        ("tcp", False),
+        pytest.param("udp", True, marks=[pytest.mark.soak, pytest.mark.players]),
+        pytest.param("srt", False, marks=[pytest.mark.soak, pytest.mark.players]),
+    ],
+)
+def test_when_a_frame_began_is_known_over_udp_only(transport, known):
+    """The others repair losses unseen, and what they deliver is read later than it arrived. Every packet is counted."""
+    words = ("graph=h264_srt", f"graph.first_port={free_port(3)}") if transport == "srt" else ()
+    with driving("fps_max=15", *words, tcp=transport == "tcp") as (_, operator, _, _):
+        frames, packets = [], []
+
+        def enough():
+            received(operator)  # a listener is rebuilt if nothing calls it
+            arrivals = operator.take_arrivals()
+            frames.extend(arrivals.frames[CAMERA])
+            packets.extend(arrivals.arrived)
+            return len(frames) > 20
+
+        until(enough, every_s=0.1)
+    assert {frame.first is not None for frame in frames[5:]} == {known}
+    begin, end = frames[5].arrived, frames[-1].arrived
+    assert sum(size for at, size in packets if begin < at <= end) == sum(frame.bytes for frame in frames[6:])
 
 
 @pytest.mark.parametrize("lists_both", [True, pytest.param(False, marks=[pytest.mark.soak, pytest.mark.players])])
