@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import random
 import selectors
 import sys
 import time
@@ -14,39 +13,29 @@ from dataclasses import asdict
 from typing import Any, NamedTuple
 
 from runner.link.bucket import Bucket
+from runner.link.losses import LossModel
+from runner.link.policer import Policer
 
 Delivery = Callable[[], object]
 UNLIMITED = {"kbps": 1e7, "queue_ms": 1000, "delay_ms": 0}
 
 
-class LossModel:
-    """Decides which packets are lost: Gilbert's two-state model (Bell System Technical Journal, 1960).
-
-    loss   share of all packets
-    burst  mean number lost in a row; 1: each independently
-    """
-
-    def __init__(self, loss: float, burst: float, seed: int = 1) -> None:
-        self._end_probability = min(1 / burst, 1 - loss)  # bursts may follow each other by chance
-        self._start_probability = 1.0 if loss >= 1 else loss * self._end_probability / (1 - loss)
-        self._random = random.Random(seed)  # the same losses in every run
-        self._losing = False
-
-    def draw(self) -> bool:
-        """Draw whether the next packet is lost."""
-        if self._start_probability:
-            change = self._end_probability if self._losing else self._start_probability
-            self._losing ^= self._random.random() < change
-        return self._losing
-
-
 class Direction:
-    """All traffic from one side to the other: one queue with one rate, then losses and the delay."""
+    """All traffic from one side to the other: a policer, one queue with one rate, then losses and the delay."""
 
-    def __init__(self, kbps: float, queue_ms: float, delay_ms: float, loss: float = 0.0, burst: float = 1.0) -> None:
+    def __init__(
+        self,
+        kbps: float,
+        queue_ms: float,
+        delay_ms: float,
+        loss: float = 0.0,
+        burst: float = 1.0,
+        policer: tuple[float, float] | None = None,
+    ) -> None:
         self._bucket: Bucket[Delivery] = Bucket(kbps, queue_ms, time.monotonic())
         self._delay_s = delay_ms / 1000
         self._losses, self._lost = LossModel(loss, burst), 0
+        self._policer, self._policed = Policer(*policer, now=time.monotonic()) if policer else None, 0
         self._delayed: deque[tuple[float, Delivery]] = deque()
         self._timer: asyncio.TimerHandle | None = None
         self._departed = asyncio.Event()
@@ -54,9 +43,13 @@ class Direction:
 
     def put(self, size: int, delivery: Delivery, *, keep: bool = False) -> None:
         """Queue a packet of `size` bytes; without `keep` it may be dropped or lost. `delivery` is called on arrival."""
+        now = time.monotonic()
+        if self._policer and not keep and not self._policer.passes(size, now):
+            self._policed += 1
+            return
         if not keep and self._losses.draw():
             delivery = self._lose
-        self._bucket.put(size, delivery, time.monotonic(), keep=keep)
+        self._bucket.put(size, delivery, now, keep=keep)
         self._deliver()
 
     def change(self, kbps: float | None, delay_ms: float | None) -> dict[str, Any]:
@@ -68,7 +61,8 @@ class Direction:
         if delay_ms is not None:
             self._delay_s = delay_ms / 1000
         self._deliver()
-        return asdict(self._bucket.counters(now)) | {"lost": self._lost}
+        counters = self._bucket.counters(now)
+        return asdict(counters) | {"dropped": counters.dropped + self._policed, "lost": self._lost}
 
     def _lose(self) -> None:
         self._lost += 1

@@ -19,6 +19,13 @@ class Rates(NamedTuple):
     down_delay_ms: float | None = None
 
 
+class Policing(NamedTuple):
+    """kbps, depth_ms: see `runner.link.policer.Policer`"""
+
+    kbps: float
+    depth_ms: float
+
+
 @dataclass(frozen=True)
 class OneWay:
     """Effect of the link on all traffic in one direction.
@@ -29,6 +36,7 @@ class OneWay:
     delay_at  further delay t seconds after the start of the drive, ms; packets stay in order. None: none
     loss      share of packets lost after the queue; with a relay, of UDP packets
     burst     mean number of packets lost in a row
+    policer   drops what exceeds a rate, before the queue; with a relay, of UDP packets. None: there is none
     """
 
     kbps_at: Callable[[float], float]
@@ -37,15 +45,16 @@ class OneWay:
     loss: float = 0.0
     burst: float = 1.0
     delay_at: Callable[[float], float] | None = None
+    policer: Policing | None = None
 
     def changing_delay_ms(self, t: float) -> float | None:
         """None: it does not change over time."""
         return self.delay_ms + self.delay_at(t) if self.delay_at else None
 
-    def settings(self, kbps: float | None) -> dict[str, float | None]:
+    def settings(self, kbps: float | None) -> dict[str, Any]:
         """For a forwarding process (`runner.link.direction`), at this rate."""
         own = {"queue_ms": self.queue_ms, "delay_ms": self.delay_ms, "loss": self.loss, "burst": self.burst}
-        return {"kbps": kbps, **own}
+        return {"kbps": kbps, **own, "policer": self.policer}
 
 
 @dataclass(frozen=True)
@@ -95,7 +104,7 @@ class LinkCounters:
     queue_ms   wait of a packet that arrives now
     bytes      forwarded from vehicle to operator
     packets    of these
-    dropped    packets that found the queue full
+    dropped    packets that found the queue full, or exceeded the rate of a policer
     lost       packets lost after the queue
     tcp_bytes  that competing TCP flows have delivered
     """

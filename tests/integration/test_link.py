@@ -22,7 +22,7 @@ from runner.core.commands import Command
 from runner.core.model import Endpoint
 from runner.errors import RunError
 from runner.link import Limit, limited_link
-from runner.link.limit import OneWay, Rates, TcpFlows
+from runner.link.limit import OneWay, Policing, Rates, TcpFlows
 from runner.mqtt.broker import private_broker
 from runner.plans import compile_plans
 
@@ -442,6 +442,28 @@ def test_both_directions_of_a_namespace_lose_and_delay_any_packet():
     assert 60 < passed < 140
     assert 0.3 * passed < returned < 0.7 * passed
     assert counters.lost == 200 - passed
+
+
+FLOOD = """
+import socket, sys, time
+out, began = socket.socket(type=socket.SOCK_DGRAM), time.monotonic()
+for number in range(250):  # of 1028 bytes on the link each, 2056 kbit/s
+    time.sleep(max(0, began + number * 0.004 - time.monotonic()))
+    out.sendto(bytes(1000), (sys.argv[1], 9))
+"""
+
+
+@needs_root
+def test_a_policer_drops_what_exceeds_its_rate_without_a_queue():
+    """Of a second at 2056 kbit/s it passes 1028 kbit/s and its depth; nothing waits."""
+    policed = replace(WIDE, policer=Policing(1028, 64))
+    with limited_link("netns", policed, *_ends(), print) as link:
+        flood = (sys.executable, "-c", FLOOD, link.broker.host)
+        subprocess.run([*link.vehicle_command, *flood], check=True, timeout=30)
+        counters = link._shaper.limit(Rates(5000, None))
+    assert counters.queue_ms == 0
+    assert counters.packets + counters.dropped == 250
+    assert 125 <= counters.packets <= 150
 
 
 @needs_root
