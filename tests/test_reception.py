@@ -25,7 +25,10 @@ NAMES = tuple(ROBOT.cameras)
 REPORT = ReceptionReport(
     at=100.04,
     as_of=3.2,
-    units=(UnitReceived("front", 0.012, 0.0031, 2500), UnitReceived("rear", 0.0, 0.004, 900, whole=False)),
+    units=(
+        UnitReceived("front", 0.012, 0.0031, 2500, True, 0.0042, 3, 2100, 4, 3300),
+        UnitReceived("rear", 0.0, 0.004, 900, whole=False),
+    ),
     packets=4,
     lost=1,
 )
@@ -37,7 +40,7 @@ def message(document: object, sender: str = "me", *, retained: bool = False) -> 
 
 def test_a_report_is_read_back_as_it_was_sent() -> None:
     assert read_reception(message(to_json(REPORT))) == REPORT
-    assert to_json(REPORT)["units"][0] == ("front", 0.012, 0.0031, 2500, True)
+    assert to_json(REPORT)["units"][0] == ("front", 0.012, 0.0031, 2500, True, 0.0042, 3, 2100, 4, 3300)
     older = {**to_json(REPORT), "units": [unit[:4] for unit in to_json(REPORT)["units"]]}
     assert all(unit.whole for unit in read_reception(message(older)).units)
     line = ReceptionReported(3.25, "me", True, REPORT)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping, Sequence
+from enum import StrEnum
 from typing import Any
 
 from runner.core import rules
@@ -39,6 +40,7 @@ def call_rule(name: str, parameters: Mapping[str, Any]) -> RuleCall:
     """A rule with its parameters checked against the rule's own signature.
 
     Parameters are numbers >= 0, made exact, in the unit at the end of their name; those like `halve_every_s` are > 0.
+    One whose default is a word is one of the words of its type.
     raises  ModelError
     """
     found = find_rule(name)
@@ -47,6 +49,11 @@ def call_rule(name: str, parameters: Mapping[str, Any]) -> RuleCall:
         if key not in known:
             hint = suggest(key, known) if known else f"; {name} takes none"
             raise ModelError(f"{name}.{key}", repr(value), f"unknown parameter{hint}")
+        words = known[key].default
+        if isinstance(words, StrEnum):
+            if value not in list(type(words)):
+                raise ModelError(f"{name}.{key}", repr(value), f"must be one of {', '.join(type(words))}")
+            continue
         if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < float("inf"):
             raise ModelError(f"{name}.{key}", repr(value), "must be a number of 0 or more")
         if "_every_" in key and value == 0:
@@ -54,7 +61,12 @@ def call_rule(name: str, parameters: Mapping[str, Any]) -> RuleCall:
     for key, parameter in known.items():
         if key not in parameters and parameter.default is inspect.Parameter.empty:
             raise ModelError(f"{name}.{key}", "missing", "required by this rule")
-    return RuleCall(found, {key: exact(value) for key, value in parameters.items()})
+    return RuleCall(found, {key: _value(known[key], value) for key, value in parameters.items()})
+
+
+def _value(parameter: inspect.Parameter, value: Any) -> Any:
+    words = parameter.default
+    return type(words)(value) if isinstance(words, StrEnum) else exact(value)
 
 
 def check_order(mode: Mode, calls: Sequence[RuleCall]) -> list[ModelError]:

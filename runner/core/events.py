@@ -11,6 +11,7 @@ from enum import StrEnum
 from fractions import Fraction
 from typing import Any
 
+from runner.core.evidence import Evidence
 from runner.core.model import Kbps, Mode, Roi, exact, plain
 from runner.core.uplink import LinkState
 
@@ -99,6 +100,7 @@ class LinkMeasured(_Event):
     queue_ms  queueing delay in front of the link
     loss      share of packets lost, 0 to 1
     rtt_ms    round trip of the control link
+    evidence  of the link's capacity; None: in older logs
     camera    set in older logs, which measured each camera; no rule reads these
     """
 
@@ -108,6 +110,7 @@ class LinkMeasured(_Event):
     state: LinkState | None = None
     rtt_ms: float | None = None
     jitter_ms: float | None = None
+    evidence: Evidence | None = None
     camera: str | None = None
 
 
@@ -236,6 +239,8 @@ def parse(document: Mapping[str, Any]) -> Event:
         values["mode"] = Mode(values["mode"])
     elif kind is LinkMeasured and "state" in values:
         values["state"] = LinkState(values["state"])
+        if "evidence" in values:
+            values["evidence"] = Evidence(**values["evidence"])
     elif kind is RoiSet:
         values["roi"] = Roi(*(int(values.pop(key)) for key in _ROI))
     elif kind is WeightsSet:
@@ -252,6 +257,8 @@ def to_json(event: Event) -> dict[str, Any]:
             continue
         if isinstance(value, Roi):
             document |= {key: getattr(value, key) for key in _ROI}
+        elif isinstance(value, Evidence):
+            document[name] = value._asdict()
         elif isinstance(value, Mapping):
             document[name] = {camera: plain(Fraction(of)) for camera, of in value.items()}
         else:

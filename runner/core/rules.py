@@ -10,17 +10,21 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
+from enum import StrEnum
 from fractions import Fraction
 from functools import cache
-from math import ceil, isfinite
+from math import ceil, inf, isfinite
 from typing import Any
 
 from runner.core import allocation, link_cap, scaling
+from runner.core import belief as uplink_belief
+from runner.core.belief import Belief
 from runner.core.budget import video_kbps, wire_kbps
 from runner.core.decision import Decision, Draft, Setting
 from runner.core.events import LinkMeasured
+from runner.core.evidence import Evidence
 from runner.core.link_memory import LEAST, UNCAPPED, LinkCap
-from runner.core.model import Camera, Kbps, Mode, Vehicle, exact, least_float, plain
+from runner.core.model import Camera, Kbps, Mode, Roi, Vehicle, exact, least_float, plain
 from runner.core.state import State
 from runner.errors import RunError
 
@@ -104,6 +108,24 @@ def rule(
     return register
 
 
+class _Last:
+    """A pure function that remembers its last result: most events leave its arguments as they were."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function = function
+        self._last: tuple[tuple[Any, ...], Any] = ((), None)
+
+    def __call__(self, *arguments: Any) -> Any:
+        before, result = self._last  # one object, in case several threads decide
+        if arguments != before:
+            result = self._function(*arguments)
+            self._last = (arguments, result)
+        return result
+
+
+_allocated = _Last(allocation.allocate_above_floors)
+
+
 # --- the paper's rules ------------------------------------------------------------------------------------------------
 
 
@@ -161,11 +183,12 @@ def share_above_floors(vehicle: Vehicle, state: State, draft: Draft, memory: Mem
     return draft.replaced(bitrate=_shared(vehicle, state, wanted, total)), memory
 
 
-def _shared(vehicle: Vehicle, state: State, wanted: Mapping[str, Kbps], total: Kbps) -> dict[str, Kbps]:
+def _shared(vehicle: Vehicle, state: State, wanted: Mapping[str, Kbps], total: Kbps) -> Mapping[str, Kbps]:
     """kbit/s by camera: floors first, then Eq. (2); the total counts every copy of a camera that leaves the vehicle."""
     floors = _floors(vehicle)
     if not state.copies:
-        return allocation.allocate_above_floors(wanted, total, state.weights, floors)
+        allocated: Mapping[str, Kbps] = _allocated(wanted, total, state.weights, floors)
+        return allocated
     copies = {name: state.copies.get(name, 1) for name in wanted}
     of_all = {name: own * copies[name] for name, own in wanted.items()}
     lowest = {name: floor * copies[name] for name, floor in floors.items()}
@@ -224,22 +247,36 @@ def share_equally(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) 
 @rule(needs=["bitrate"], gives=["scaling"], reads=["rois"])
 def scaling_from_rate_quality(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
     """Eq. (4): the factor whose bitrate range contains the allocation, converted to the full image."""
-    factors, reasons = {}, {}
     # At the start, sizes are chosen for the larger total that follows.
     later = draft.sized_for / draft.total if draft.sized_for and draft.total else None
+    factors, reasons = _scaled(vehicle, state.on, state.rois, draft.demand, draft.bitrate, later)
+    return draft.replaced(scaling=factors, reasons=reasons), memory
+
+
+@_Last
+def _scaled(
+    vehicle: Vehicle,
+    on: Mapping[str, bool],
+    rois: Mapping[str, Roi],
+    demand: Mapping[str, Kbps],
+    bitrate: Mapping[str, Kbps],
+    later: Fraction | None,
+) -> tuple[Mapping[str, Fraction], Mapping[str, str]]:
+    """Factor and reason by camera. later: the total that follows, in multiples of the present one."""
+    factors, reasons = {}, {}
     for name, camera in vehicle.cameras.items():
-        if not state.on[name]:
+        if not on[name]:
             continue
-        allocated, roi, full = draft.bitrate[name], state.rois[name], camera.full_roi
+        allocated, roi, full = bitrate[name], rois[name], camera.full_roi
         kbps, sized_for = _whole(allocated), allocated if later is None else allocated * later
-        bitrate = scaling.as_full_image(sized_for, roi, full)
+        of_full = scaling.as_full_image(sized_for, roi, full)
         # A camera that cannot be sent gets the smallest factor, however few its pixels.
-        factors[name], why = scaling.select_scaling(camera.rate_quality, bitrate if kbps else allocation.ZERO)
+        factors[name], why = scaling.select_scaling(camera.rate_quality, of_full if kbps else allocation.ZERO)
         seen = ""
         if kbps and (later is not None or (roi is not full and roi != full)):
-            seen = f", as {_whole(bitrate)} for the full image" + ("" if later is None else " after the start")
-        reasons[name] = f"{kbps} of {_short(draft.demand[name])} kbit/s{seen}, {why}"
-    return draft.replaced(scaling=factors, reasons=reasons), memory
+            seen = f", as {_whole(of_full)} for the full image" + ("" if later is None else " after the start")
+        reasons[name] = f"{kbps} of {_short(demand[name])} kbit/s{seen}, {why}"
+    return factors, reasons
 
 
 @rule(needs=["demand"], gives=["total", "bitrate", "scaling"], reads=["copies", "manual", "on"])
@@ -392,6 +429,132 @@ def cap_by_link(
     lowered = _lower_total(draft, video_kbps(cameras, carried), why)
     # A new size restarts the encoder, so sizes at the start are chosen for the time after it.
     return lowered.replaced(sized_for=lowered.uncapped) if cap.provisional else lowered, memory
+
+
+FLOOR = Kbps(500)
+START_S = 5.0  # until the first pictures of all cameras have arrived and are reported
+
+
+class Ceiling(StrEnum):
+    """What the total never exceeds, beside what the cameras can use."""
+
+    NONE = "none"
+    PREDICTION = "prediction"
+
+
+@rule(
+    needs=["total"],
+    gives=["total"],
+    reads=["copies", "link", "on", "operator_lost", "operator_since", "prediction", "rois", "t", "weights"],
+)
+def follow_link(
+    vehicle: Vehicle,
+    state: State,
+    draft: Draft,
+    memory: Memory,
+    *,
+    ceiling: Ceiling = Ceiling.NONE,
+    reserve_kbps: Kbps = allocation.ZERO,
+    start: Fraction = Fraction(1, 2),
+    after_s: Fraction = Fraction(2),
+    halve_every_s: Fraction = Fraction(1),
+    floor_kbps: Kbps = FLOOR,
+) -> Step:
+    """The total is what the uplink is believed to carry; see `runner.core.belief`.
+
+    The belief follows the reports of the operator's side, and takes predictions for evidence, as far as they proved
+    right. With `ceiling: prediction`, and in modes C and S, the total before this rule is a limit, too. Of the link,
+    `reserve_kbps` are left to other traffic. When an operator connects, the total starts at the share `start`.
+
+    Without reports, a prediction is a limit that fades: once it is older than its own `valid_s`, otherwise `after_s`,
+    the total is halved, and again every `halve_every_s`, down to `floor_kbps`.
+
+    Memory: `Belief`.
+    """
+    assert draft.total is not None
+    cameras = sent_cameras(vehicle, state)
+    belief: Belief | None = memory.get("follow_link")
+    link = state.link
+    evidence = None if link is None else link.evidence
+    is_measured = link is not None and state.t - link.t < START_S
+    if not cameras or state.operator_since is None or link is None or evidence is None or not is_measured:
+        return _unmeasured(state, draft, start, after_s, halve_every_s, floor_kbps), memory
+    predicted = None
+    most = float(wire_kbps(cameras, sum(_wanted_of_all(vehicle, state, draft), allocation.ZERO)))
+    if state.mode is Mode.AUTOMATIC and state.prediction is not None and not _is_stale(state, after_s):
+        predicted = float(wire_kbps(cameras, state.prediction.kbps))
+    if belief is None or belief.since != state.operator_since:
+        first = float(wire_kbps(cameras, draft.total))
+        belief = uplink_belief.begin(state.operator_since, first * float(start), most, predicted)
+    belief = uplink_belief.predict(belief._replace(most=most), state.t, predicted)
+    if link.t > belief.reported:
+        belief = uplink_belief.observe(belief, link.t, _of_every_copy(state, evidence), (link.rtt_ms or 0.0) / 1000)
+    limit = inf
+    if state.mode is not Mode.AUTOMATIC or ceiling is Ceiling.PREDICTION:
+        limit = float(wire_kbps(cameras, draft.total) + reserve_kbps)
+    floors = float(_capped_floors(vehicle, state, draft, cameras, reserve_kbps))
+    belief = uplink_belief.decide(belief, state.t, evidence.silent_s, floors, limit)
+    carried = video_kbps(cameras, max(_least(cameras), exact(round(belief.total, 1)) - reserve_kbps))
+    total = _tenths(min(carried, draft.total) if limit < inf else carried)
+    memory = {**memory, "follow_link": belief}
+    if total == draft.total:
+        return draft.replaced(measured=True), memory
+    note = f"total {_short(draft.total)} -> {_short(total)}: {_why_believed(belief, evidence)}"
+    return draft.noted(note, total=total, measured=True, uncapped=max(draft.total, total)), memory
+
+
+def _unmeasured(
+    state: State,
+    draft: Draft,
+    start: Fraction,
+    after_s: Fraction,
+    halve_s: Fraction,
+    floor: Kbps,
+) -> Draft:
+    """A prediction is a limit, at most its lower bound, that fades; an operator's total stays."""
+    assert draft.total is not None
+    before, why = draft.total, ""
+    total = before
+    if state.mode is Mode.AUTOMATIC:
+        lower = None if state.prediction is None else state.prediction.lower_kbps
+        if lower is not None and lower < total:
+            total, why = lower, "lower bound of the prediction"
+        age, limit = _age(state, after_s)
+        if age > limit:
+            halvings = min(64, int((age - limit) / halve_s) + 1)  # 64 are below any floor
+            total = max(Fraction(total) / 2**halvings, min(floor, total) if total >= 1 else floor)
+            why = f"no prediction for {float(age):.1f} s, limit {plain(limit)} s"
+    if state.operator_since is not None and state.t - state.operator_since < START_S and start < 1:
+        draft = draft.replaced(sized_for=total)
+        total, why = total * start, "the link has not been measured yet"
+    if total == before:
+        return draft
+    return draft.noted(f"total {_short(before)} -> {_short(total)}: {why}", total=_tenths(total), uncapped=before)
+
+
+def _why_believed(belief: Belief, evidence: Evidence) -> str:
+    if evidence.silent_s:
+        return f"nothing has arrived for {evidence.silent_s:.1f} s"
+    return f"capacity of the link, believed to be {belief.kbps:.0f}"
+
+
+def _wanted_of_all(vehicle: Vehicle, state: State, draft: Draft) -> Iterable[Kbps]:
+    return (own * state.copies.get(name, 1) for name, own in _wanted(vehicle, state, draft).items())
+
+
+def _of_every_copy(state: State, evidence: Evidence) -> Evidence:
+    """The operator measures one copy of each camera."""
+    if not state.copies:
+        return evidence
+    # All copies carry the same, so that a number of copies for each kbit is enough.
+    names = [name for name, on in state.on.items() if on]
+    ratio = sum(state.copies.get(name, 1) for name in names) / max(1, len(names))
+    return evidence._replace(
+        busy_kbit=ratio * evidence.busy_kbit,
+        train_kbit=ratio * evidence.train_kbit,
+        kbit=ratio * evidence.kbit,
+        lost_kbit=ratio * evidence.lost_kbit,
+    )
 
 
 def sent_cameras(vehicle: Vehicle, state: State) -> tuple[Camera, ...]:
@@ -588,7 +751,9 @@ def decide(vehicle: Vehicle, state: State, memory: Memory) -> tuple[Decision, Me
             raise RuleFailed(f"rule {call.name} failed: {problem}")
         asked = draft.total if asked is None else asked
     assert draft.total is not None and asked is not None
-    settings = {name: _setting(state, draft, name) for name in vehicle.cameras}
+    settings = _settings(
+        vehicle, state.on, state.lost, state.rois, draft._replace(total=None, uncapped=None, measured=False)
+    )
     # Without a prediction there is only the measurement, so the total without it is unknown.
     uncapped = draft.total if draft.uncapped is None or draft.measured else draft.uncapped
     return Decision(state.mode, draft.total, settings, asked, uncapped), memory
@@ -648,10 +813,16 @@ def reads(vehicle: Vehicle, mode: Mode) -> frozenset[str]:
     return frozenset({"mode", "on", "lost", "rois"}).union(*(call.reads for call in vehicle.modes[mode]))
 
 
-def _setting(state: State, draft: Draft, name: str) -> Setting:
-    roi, on = state.rois[name], state.on[name]
-    if not on or name in state.lost:
-        why = f"lost: {state.lost[name]}" if on else "switched off"
+@_Last
+def _settings(
+    vehicle: Vehicle, on: Mapping[str, bool], lost: Mapping[str, str], rois: Mapping[str, Roi], draft: Draft
+) -> Mapping[str, Setting]:
+    return {name: _setting(on[name], lost.get(name), rois[name], draft, name) for name in vehicle.cameras}
+
+
+def _setting(on: bool, lost: str | None, roi: Roi, draft: Draft, name: str) -> Setting:
+    if not on or lost is not None:
+        why = f"lost: {lost}" if on else "switched off"
         return Setting(on, False, allocation.ZERO, 0, 0, None, roi, 0, 0, why)
     kbps, factor = _whole(draft.bitrate[name]), draft.scaling[name]
     sending = draft.sending and kbps >= 1

@@ -96,6 +96,9 @@ class ReceivedUnit:
     whole     whether no packet was initially missing
     playout   s for which the transport holds a unit back, which hides a shorter wait in the queue
     late      s by which the vehicle at least took longer than usual to send it: no queue
+    train_s   from the arrival of its first packet to that of its last
+    train     bytes on the wire of all cameras that arrived in that time, without the first packet; 0: unknown
+    carried   bytes on the wire of all cameras that arrived after the last packet of the previous unit; 0: unknown
     """
 
     camera: str
@@ -105,6 +108,9 @@ class ReceivedUnit:
     whole: bool = True
     playout: float = 0.0
     late: float = 0.0
+    train_s: float = 0.0
+    train: int = 0
+    carried: int = 0
 
 
 @dataclass(frozen=True, slots=True)

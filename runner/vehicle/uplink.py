@@ -9,11 +9,12 @@ from operator import attrgetter
 
 from msgspec import UNSET
 
-from runner.core.budget import on_the_wire
+from runner.core.budget import header_bytes, on_the_wire
 from runner.core.events import LinkMeasured
-from runner.core.model import Vehicle, exact
+from runner.core.evidence import EvidenceMemory, observe, rounded
+from runner.core.model import Graph, Vehicle, exact
 from runner.core.uplink import LinkReport, ReceivedUnit, UplinkMemory, estimate
-from runner.records import ReceptionReported
+from runner.records import ReceptionReported, UnitReceived
 
 ROUND_TRIPS = 64  # remembered; the smallest is the round trip
 LONGEST_S = 60.0  # upper limit of a reported round trip
@@ -29,6 +30,7 @@ class MeasuredUplink:
     _at: float = 0.0
     _t: float = 0.0
     _memory: UplinkMemory = field(default_factory=UplinkMemory)
+    _evidence: EvidenceMemory = field(default_factory=EvidenceMemory)
     _round_trips: deque[float] = field(default_factory=lambda: deque(maxlen=ROUND_TRIPS))
 
     def is_rival(self, reported: ReceptionReported) -> bool:
@@ -43,11 +45,13 @@ class MeasuredUplink:
             return None
         source = (reported.operator, reported.report.run)
         if source != self._source or reported.report.at < self._at:
-            self._source, self._memory = source, UplinkMemory()
+            self._source, self._memory, self._evidence = source, UplinkMemory(), EvidenceMemory()
             self._round_trips.clear()
         self._at, self._t = reported.report.at, reported.t
         self._round_trips.append(max(0.0, reported.t - reported.report.as_of))
-        self._memory, link = estimate(self._memory, _on_the_wire(self.vehicle, reported))
+        report = _on_the_wire(self.vehicle, reported)
+        self._memory, link = estimate(self._memory, report)
+        self._evidence, evidence = observe(self._evidence, report)
         if link is None:
             return None
         return LinkMeasured(
@@ -57,6 +61,7 @@ class MeasuredUplink:
             loss=round(link.loss, 4),
             state=link.state,
             rtt_ms=round(1000 * min(*self._round_trips, LONGEST_S), 1),
+            evidence=rounded(evidence) if evidence else None,
         )
 
 
@@ -65,17 +70,25 @@ def _on_the_wire(vehicle: Vehicle, reported: ReceptionReported) -> LinkReport:
     report = reported.report
     late_s = repeat(0.0) if reported.late_s is UNSET else reported.late_s
     units = [
-        ReceivedUnit(
-            unit.camera,
-            report.at - unit.ago_s - unit.delay_s,
-            report.at - unit.ago_s,
-            on_the_wire(vehicle.cameras[unit.camera].graph, unit.bytes),
-            unit.whole,
-            float(vehicle.cameras[unit.camera].graph.settings.get("srt_latency_ms", 0)) / 1000,
-            late,
-        )
+        _unit(vehicle.cameras[unit.camera].graph, report.at, unit, late)
         for unit, late in zip(report.units, late_s, strict=False)
         if unit.camera in vehicle.cameras
     ]
     arrived = tuple(sorted(units, key=attrgetter("arrived")))
     return LinkReport(report.at, arrived, report.packets, report.lost, reported.all_received is True)
+
+
+def _unit(graph: Graph, at: float, unit: UnitReceived, late: float) -> ReceivedUnit:
+    header = header_bytes(graph)
+    return ReceivedUnit(
+        unit.camera,
+        at - unit.ago_s - unit.delay_s,
+        at - unit.ago_s,
+        on_the_wire(graph, unit.bytes),
+        unit.whole,
+        float(graph.settings.get("srt_latency_ms", 0)) / 1000,
+        late,
+        unit.train_s,
+        unit.train_bytes + unit.train_packets * header,
+        unit.carried_bytes + unit.carried_packets * header,
+    )

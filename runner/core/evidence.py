@@ -1,0 +1,209 @@
+"""What the frames that arrived tell of the uplink's capacity, and of the queue in front of it. Pure.
+
+A first-in, first-out link tells its capacity at any load. Without a queue, frame i would have arrived at u_i: when it
+was captured, plus the shortest delay of its path. If the frame before it arrived at a_(i-1) > u_i, the link was busy
+from a_(i-1) to a_i, and carried what arrived in that time (Lindley's recursion, solved for the service time). The
+packets of one frame are a packet train: what arrived between its first and its last packet passed the link in that
+time, whether or not the frame had to wait. An offset between the clocks of both sides cancels out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from math import inf
+from types import MappingProxyType
+from typing import NamedTuple
+
+from runner.core.uplink import LinkReport, ReceivedUnit
+
+JITTER_S = 0.004  # of an arrival: half of 8 ms, a usual grant cycle of a mobile uplink
+BUSY_S = JITTER_S / 4  # a frame that waited longer found the link busy
+BUCKET_S = 10.0  # the path's delay is the shortest of the current time bucket and the previous one
+GAP_S = 0.12  # three reports: without arrivals for longer, the link has stalled
+GAPS_S = 4 * GAP_S  # a slow link has gap after gap
+EXPIRED_S = 120.0  # without a frame for longer, the clocks may have drifted apart: paths are measured anew
+ONE_CLOCK_S = 10.0  # delays that differ by more are not of the same clock
+SAME_S = 0.001  # a capture time that goes back by more reveals that a clock was set
+FIRST_INTERVAL_S = 1 / 15
+
+
+class Evidence(NamedTuple):
+    """Of one report.
+
+    busy_kbit, busy_s         carried while the link was known to be busy, and the time this took
+    train_kbit, train_s       the same for the packet trains of frames that met no queue
+    trains                    their number
+    unqueued                  number of frames that met no queue
+    kbit      all that arrived since the previous report
+    wait_s    the standing queue: the shortest wait in the last frame interval
+    growth    by which waits grew, s per s
+    lost_kbit lost since the previous report
+    age_s     from the middle of these services to the report
+    silent_s  without arrivals beyond GAP_S, although something is on its way
+    backlog   the newest frame was sent before a stall had ended
+    """
+
+    busy_kbit: float = 0.0
+    busy_s: float = 0.0
+    train_kbit: float = 0.0
+    train_s: float = 0.0
+    trains: int = 0
+    unqueued: int = 0
+    kbit: float = 0.0
+    wait_s: float = 0.0
+    growth: float = 0.0
+    lost_kbit: float = 0.0
+    age_s: float = 0.0
+    silent_s: float = 0.0
+    backlog: bool = False
+
+
+class Path(NamedTuple):
+    """Shortest delay of a camera's first packets, s: of the previous time bucket and of this one, which began then."""
+
+    before: float
+    now: float
+    began: float
+
+    @property
+    def delay(self) -> float:
+        return min(self.before, self.now)
+
+    def after(self, delay: float, t: float) -> Path:
+        if t - self.began > BUCKET_S:
+            return Path(self.now, delay, t)
+        return self._replace(now=delay) if delay < self.now else self
+
+
+@dataclass(frozen=True, slots=True)
+class EvidenceMemory:
+    """Of what has arrived until now.
+
+    paths     by camera
+    seen      by camera: capture time of its newest frame, and its wait, s
+    waits     (arrival, wait) of the frames of the last frame interval
+    interval  between two frames of a camera, averaged, s
+    last      arrival of the newest frame; None: there was none
+    resumed   when frames arrived again after the last stall
+    """
+
+    paths: Mapping[str, Path] = field(default_factory=lambda: MappingProxyType({}))
+    seen: Mapping[str, tuple[float, float]] = field(default_factory=lambda: MappingProxyType({}))
+    waits: tuple[tuple[float, float], ...] = ()
+    interval: float = FIRST_INTERVAL_S
+    last: float | None = None
+    resumed: float = -inf
+
+
+def observe(memory: EvidenceMemory, report: LinkReport) -> tuple[EvidenceMemory, Evidence | None]:
+    """What a report tells; None before the first frame."""
+    units, last = report.units, memory.last
+    if not units:
+        if last is None:
+            return memory, None
+        silent = 0.0 if report.all_received else max(0.0, report.at - last - GAP_S)
+        return memory, Evidence(wait_s=_standing(memory), silent_s=silent)
+    if _is_of_another_clock(memory, units):
+        memory, last = EvidenceMemory(), None
+    began = units[0].arrived
+    gap = 0.0 if last is None else began - last
+    ended_stall = gap > GAP_S
+    if ended_stall and began - memory.resumed > GAPS_S:
+        # What a stalled link releases arrives at once, and says nothing about its capacity, nor its losses.
+        memory, _ = _add_frames(replace(memory, resumed=began), units, report.at)
+        return memory, Evidence(wait_s=_standing(memory), backlog=True)
+    if ended_stall:
+        memory = replace(memory, resumed=began)
+    memory, evidence = _add_frames(memory, units, report.at)
+    lost = report.lost * evidence.kbit / max(1, report.packets)
+    return memory, evidence._replace(wait_s=_standing(memory), lost_kbit=lost)
+
+
+def _is_of_another_clock(memory: EvidenceMemory, units: Iterable[ReceivedUnit]) -> bool:
+    first = next(iter(units))
+    if memory.last is not None and first.arrived - memory.last > EXPIRED_S:
+        return True
+    captured = {name: at for name, (at, _) in memory.seen.items()}
+    for unit in units:
+        if unit.captured < captured.get(unit.camera, -inf) - SAME_S:
+            return True
+        captured[unit.camera] = unit.captured
+    return False
+
+
+def _add_frames(memory: EvidenceMemory, units: tuple[ReceivedUnit, ...], at: float) -> tuple[EvidenceMemory, Evidence]:
+    """Add the frames of a report, in order of arrival."""
+    paths, seen, waits, interval, last = (
+        dict(memory.paths),
+        dict(memory.seen),
+        list(memory.waits),
+        memory.interval,
+        memory.last,
+    )
+    busy_kbit = busy_s = train_kbit = train_s = grown = grown_s = served = due = 0.0
+    unqueued = trains = services = 0
+    for unit in units:
+        first = unit.arrived - unit.train_s
+        path = paths[unit.camera] = _path(paths, unit, first)
+        due = unit.captured + unit.late + path.delay
+        wait = 0.0 if last is None else max(0.0, last - due)
+        is_busy = wait > BUSY_S
+        if unit.whole:
+            if is_busy and last is not None and unit.arrived > last:
+                busy_kbit, busy_s = busy_kbit + _kbit(unit.carried or unit.bytes), busy_s + unit.arrived - last
+                served, services = served + due + wait, services + 1
+            elif not unit.playout:
+                unqueued += 1
+                served, services = served + due, services + 1
+                if unit.train:
+                    train_kbit, train_s, trains = train_kbit + _kbit(unit.train), train_s + unit.train_s, trains + 1
+        waited = max(0.0, first - due)
+        captured, before = seen.get(unit.camera, (unit.captured, waited))
+        after_s = unit.captured - captured
+        if 0 < after_s < 1:
+            grown, grown_s = grown + waited - before, grown_s + after_s
+            interval += 0.1 * (after_s - interval)
+        seen[unit.camera] = unit.captured, waited
+        waits.append((unit.arrived, waited + (unit.playout if is_busy else 0.0)))
+        last = unit.arrived if last is None else max(last, unit.arrived)
+    assert last is not None
+    kept = tuple(entry for entry in waits if entry[0] >= last - interval)
+    evidence = Evidence(
+        busy_kbit=busy_kbit,
+        busy_s=busy_s,
+        train_kbit=train_kbit,
+        train_s=train_s,
+        trains=trains,
+        unqueued=unqueued,
+        kbit=sum(_kbit(unit.carried or unit.bytes) for unit in units),
+        growth=grown / grown_s if grown_s else 0.0,
+        age_s=at - served / services if services else 0.0,
+        backlog=due < memory.resumed,
+    )
+    return replace(memory, paths=paths, seen=seen, waits=kept, interval=interval, last=last), evidence
+
+
+def _path(paths: Mapping[str, Path], unit: ReceivedUnit, first: float) -> Path:
+    """The path of a camera once its frame, whose first packet arrived then, is known."""
+    delay = first - unit.captured - unit.late
+    path = paths.get(unit.camera)
+    if path is None:
+        # A camera that starts while a queue lasts would mistake it for its path.
+        others = (other.delay for other in paths.values() if abs(other.delay - delay) < ONE_CLOCK_S)
+        shortest = min([delay, *others])
+        return Path(shortest, shortest, unit.arrived)
+    return path.after(delay, unit.arrived) if unit.whole else path
+
+
+def _standing(memory: EvidenceMemory) -> float:
+    return min(wait for _, wait in memory.waits)
+
+
+def _kbit(size: int) -> float:
+    return size * 8 / 1000
+
+
+def rounded(evidence: Evidence) -> Evidence:
+    """As it is logged: to a microsecond and a bit."""
+    return Evidence._make(round(value, 6) if type(value) is float else value for value in evidence)
