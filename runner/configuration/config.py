@@ -14,7 +14,7 @@ from runner.core.model import Vehicle
 from runner.errors import ArgumentError
 
 if TYPE_CHECKING:
-    from runner.configuration.experiment import Experiment, LinkSettings
+    from runner.configuration.experiment import Experiment, LinkSettings, RateAtTime
     from runner.configuration.origin import Composed
     from runner.pqos import Pqos
     from runner.pqos.track import Track
@@ -100,15 +100,20 @@ class Configuration:
             builder.check_requests(experiment.requests)
         return builder.checked(experiment)
 
-    def link(self) -> LinkSettings | None:
-        """The limited link between the demo's sides, if any."""
+    def link(self, rates: RateAtTime | None = None) -> LinkSettings | None:
+        """The limited link between the demo's sides, if any.
+
+        rates  to follow if it names no file; None: what the source of predictions states
+        """
         from runner.configuration.experiment import read_link, true_rates
 
         builder = self._builder
         if "link" not in self.document:
             return None
-        rates = builder.part(("pqos",), lambda settings: true_rates(settings, self._bases))
-        link = builder.part(("link",), lambda settings: read_link(settings, rates, self._bases)) if rates else None
+        followed = rates or builder.part(("pqos",), lambda settings: true_rates(settings, self._bases))
+        if followed is None:
+            return builder.checked(None)
+        link = builder.part(("link",), lambda settings: read_link(settings, followed, self._bases))
         if link:
             builder.check_link(link)
         return builder.checked(link)

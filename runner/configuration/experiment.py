@@ -14,7 +14,7 @@ from runner.pqos.settings import find_file, within
 from runner.schema import event_problem
 
 if TYPE_CHECKING:  # a side that drives loads no evaluation tool
-    from runner.link.limit import Limit, OneWay, TcpFlows
+    from runner.link.limit import Limit, OneWay, Policing, TcpFlows
     from runner.pqos.track import Track
 
 RateAtTime = Callable[[float], Kbps]  # rate in force at a time of the drive (s), kbit/s
@@ -92,7 +92,9 @@ def read_link(data: Mapping[str, Any], predicted: RateAtTime, bases: Sequence[Pa
     reverse = _reverse(back, data["loop"], bases) if back else None
     tcp = _tcp(data["tcp"]) if data.get("tcp") else None
     delay_at = _delays(data, data["loop"], bases)
-    return LinkSettings(data["kind"], Limit(kbps_at, **_path(data), delay_at=delay_at, reverse=reverse, tcp=tcp))
+    policer = _policer(data["policer"]) if data.get("policer") else None
+    limit = Limit(kbps_at, **_path(data), delay_at=delay_at, policer=policer, reverse=reverse, tcp=tcp)
+    return LinkSettings(data["kind"], limit)
 
 
 def _recorded(data: Mapping[str, Any], loop: bool, bases: Sequence[Path]) -> RateAtTime:
@@ -138,7 +140,13 @@ def _tcp(data: Mapping[str, Any]) -> TcpFlows:
     )
 
 
-def _path(data: Mapping[str, Any]) -> dict[str, float]:
+def _policer(data: Mapping[str, Any]) -> Policing:
+    from runner.link.limit import Policing
+
+    return Policing(float(data["kbps"]), float(data["depth_ms"]))
+
+
+def _path(data: Mapping[str, Any]) -> dict[str, Any]:
     """Parameters of one direction of the link other than its rate."""
     lost = {"loss": float(data.get("loss", 0)), "burst": float(data.get("loss_burst", 1))}
     return {"queue_ms": float(data["queue_ms"]), "delay_ms": float(data["delay_ms"])} | lost

@@ -36,6 +36,21 @@ class Verb(NamedTuple):
 
 NO_YES = ("false", "true")
 CONVERSION = ("output", "vehicle", "bag", "width_px", "height_px", "fps", "overwrite")
+SIMULATED = (
+    *("links", "predictions", "seeds", "windows", "duration_s", "workers", "output", "figure", "log"),
+    *(
+        "control",
+        "encoder_error",
+        "late_ms",
+        "report_jitter_ms",
+        "report_loss",
+        "bursts",
+        "slot_ms",
+        "credit_ms",
+        "peak",
+        "grant_ms",
+    ),
+)
 KEYS = ("output", "vehicle", "controller", "watcher", "predictor", "positioner", "broker", "host", "rotate", "revoke")
 VERBS = {
     "print": Verb(
@@ -66,6 +81,12 @@ VERBS = {
         ("input", "output", "log", "link", "positions", "topic"),
         sweeps=True,
         choices={"link": ("logged", "again")},
+    ),
+    "simulate": Verb(
+        "drives over simulated links: a table for each prediction",
+        "runner.verbs.simulate",
+        SIMULATED,
+        choices={"bursts": ("true", "false"), "control": ("true", "false")},
     ),
     "vehicle": Verb(
         "the vehicle's side: cameras, RTSP server, rules", "runner.verbs.vehicle", ("log", "drives", "duration_s")

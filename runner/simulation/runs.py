@@ -1,0 +1,304 @@
+"""Many simulated drives, each described in words that reach a worker process."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+from runner.configuration.config import Configuration, configuration
+from runner.configuration.files import conf_directories
+from runner.core.model import Kbps, ModelError, Vehicle, suggest
+from runner.errors import ArgumentError
+from runner.link.limit import Limit, OneWay
+from runner.link.losses import LossModel
+from runner.link.policer import Policer
+from runner.pqos.settings import find_file
+from runner.simulation.drive import Conditions, Drive, Link, Recorder, Simulation
+from runner.simulation.families import FAMILIES, generate, is_family
+from runner.simulation.figures import Figures, figures
+from runner.simulation.predictions import KINDS, prediction
+from runner.simulation.queues import KBIT, OPPORTUNITY_BYTES, CreditQueue, OpportunityQueue, Queue, RateQueue
+from runner.simulation.steps import Steps
+
+CONFIGURED = "configured"  # the link, or the predictions, of the configuration
+OPPORTUNITIES = {".up", ".down", ".pps"}  # names of files with opportunities to send
+DURATION_S = 60.0
+MARGIN_S = 5.0  # of a link behind the end of a drive: predictions look ahead
+# Without link=, of links by name: as wide as their name or file says, and 30 ms of round trip.
+UNNAMED_LINK = (
+    *("link=netns", "link.share=1", "link.queue_ms=300", "link.delay_ms=15"),
+    "link.reverse={kbps: 100000, queue_ms: 300, delay_ms: 15}",
+)
+LEAST_KBPS = 500.0  # windows of a trace in which the link carries less on average are left out
+
+
+class Scheduler(NamedTuple):
+    """See `runner.simulation.queues.CreditQueue`."""
+
+    peak: float
+    credit_ms: float
+    grant_ms: float
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What all drives of a command have in common.
+
+    overrides, conf  of the configuration
+    duration_s       of each drive; None: as its experiment says, or DURATION_S
+    slot_ms, bursts  see `runner.simulation.queues.RateQueue`
+    scheduler        in place of that; None: none
+    """
+
+    overrides: tuple[str, ...]
+    conf: Path | None
+    duration_s: float | None = None
+    conditions: Conditions = field(default_factory=Conditions)
+    slot_ms: float = 0.0
+    bursts: bool = True
+    scheduler: Scheduler | None = None
+
+
+class Job(NamedTuple):
+    """One drive.
+
+    link        a family, a file, or CONFIGURED
+    begin_s     of the link's window
+    prediction  one of KINDS, or CONFIGURED
+    run, words  name of the experiment's run, and the overrides that it adds
+    """
+
+    link: str
+    begin_s: float
+    prediction: str
+    seed: int
+    duration_s: float = DURATION_S
+    run: str = ""
+    words: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Of its directory among others."""
+        return f"{self.link_name}-{self.begin_s:g}-{self.prediction}-{self.seed}"
+
+    @property
+    def link_name(self) -> str:
+        return self.run or (self.link if is_family(self.link) else Path(self.link).stem)
+
+
+class Result(NamedTuple):
+    """A job's figures; took_s: processor time; drive: what happened, where it was asked for."""
+
+    job: Job
+    figures: Figures
+    took_s: float
+    drive: Drive | None
+
+
+def jobs(setup: Setup, links: Sequence[str], predictions: Sequence[str], seeds: int, windows: int) -> list[Job]:
+    """All combinations.
+
+    windows  of each file, at most; links that are generated have one
+    raises   ArgumentError, ConfigError
+    """
+    for kind in predictions:
+        if kind not in (*KINDS, CONFIGURED):
+            raise ArgumentError("predictions", repr(kind), f"unknown{suggest(kind, (*KINDS, CONFIGURED))}")
+    found = []
+    for link in links:
+        for each in _of_link(setup, link, windows):
+            found += [each._replace(prediction=kind, seed=seed) for kind in predictions for seed in range(1, seeds + 1)]
+    return found
+
+
+def _of_link(setup: Setup, link: str, windows: int) -> list[Job]:
+    """Drives over one link: windows of a file, or runs of an experiment."""
+    job = Job(link, 0.0, "", 0, DURATION_S if setup.duration_s is None else setup.duration_s)
+    if link == CONFIGURED:
+        runs = _composed(setup, job)[0].experiment().runs or {"": ()}
+        return [_timed(setup, job._replace(run=name, words=words)) for name, words in runs.items()]
+    if is_family(link):
+        return [job]
+    return [job._replace(begin_s=begin) for begin in _windows(setup, job, windows)]
+
+
+def _timed(setup: Setup, job: Job) -> Job:
+    """A run of an experiment, with its own duration."""
+    config = _composed(setup, job)[0]
+    timed = setup.duration_s is None and "experiment" in config.document
+    return job._replace(duration_s=config.experiment().duration_s) if timed else job
+
+
+def _windows(setup: Setup, job: Job, most: int) -> list[float]:
+    """Where windows of a file begin, evenly taken from those in which the link carries something."""
+    rates, length = _file(job.link, setup.conf)[0], job.duration_s
+    begins = [begin * length for begin in range(int((rates.times[-1] + 1) / length))] or [0.0]
+    usable = [begin for begin in begins if rates.mean(begin, begin + length) >= LEAST_KBPS]
+    return [usable[i * len(usable) // most] for i in range(most)] if len(usable) > most else usable or begins[:1]
+
+
+@lru_cache(maxsize=16)
+def _file(name: str, conf: Path | None) -> tuple[Steps, tuple[float, ...]]:
+    """The rates of a file, as long as it lasts, and its opportunities to send, s, if it has such.
+
+    raises  ArgumentError
+    """
+    try:
+        path = find_file({"file": name}, "file", [*conf_directories(conf), Path.cwd()])
+        if path.suffix in OPPORTUNITIES:
+            return _opportunities(path)
+        from runner.pqos.table import RATE, TIME, read_table
+
+        times, rates = read_table(path, (TIME, RATE)).T.tolist()
+    except ModelError as error:
+        hint = f"; or a family: {', '.join(FAMILIES)}" if "no such" in error.rule else ""
+        raise ArgumentError("links", error.found or name, error.rule + hint) from None
+    return Steps([t - times[0] for t in times], rates), ()
+
+
+def _opportunities(path: Path) -> tuple[Steps, tuple[float, ...]]:
+    """A recording of mahimahi: in each line the ms of an opportunity to send 1500 bytes. The rate is that of a second.
+
+    raises  ModelError
+    """
+    lines = path.read_text(encoding="utf-8", errors="replace").split()
+    wrong = next((number for number, line in enumerate(lines, 1) if not line.isdecimal()), None)
+    if wrong or not lines:
+        found = f"{path}:{wrong}: {lines[wrong - 1]}" if wrong else str(path)
+        raise ModelError("file", found, "must have a time in whole ms in each line, rising")
+    times = tuple(sorted(int(line) / 1000 for line in lines))
+    counts = [0] * (int(times[-1]) + 1)
+    for t in times:
+        counts[int(t)] += 1
+    return Steps(range(len(counts)), [count * OPPORTUNITY_BYTES * KBIT for count in counts]), times
+
+
+def _composed(setup: Setup, job: Job) -> tuple[Configuration, Vehicle, Limit]:
+    """The configuration of a job, its vehicle, and its link; the rate of the link is that of CONFIGURED only."""
+    return _compose((*_link_words(setup), *setup.overrides, *job.words), setup.conf, job.link == CONFIGURED)
+
+
+@lru_cache(maxsize=64)
+def _compose(words: tuple[str, ...], conf: Path | None, configured: bool) -> tuple[Configuration, Vehicle, Limit]:
+    config = configuration(words, conf, runnable=False)
+    vehicle = config.vehicle()
+    link = config.link(None if configured else lambda _: Kbps(0))
+    if link is None:
+        raise ArgumentError("link", "null", "must not be null: it describes the link that is simulated")
+    return config, vehicle, link.limit
+
+
+def _link_words(setup: Setup) -> tuple[str, ...]:
+    return () if any(word.startswith(("link=", "+link=", "experiment=")) for word in setup.overrides) else UNNAMED_LINK
+
+
+def check(setup: Setup, wanted: Iterable[Job]) -> None:
+    """raises ConfigError, ArgumentError if a configuration is wrong"""
+    for job in wanted:
+        config, _, _ = _composed(setup, job)
+        if job.prediction == CONFIGURED:
+            config.pqos()
+        config.experiment()
+
+
+def run_job(setup: Setup, job: Job, keep: bool = False, log: tuple[Path, float] | None = None) -> Result:
+    """Simulate one drive.
+
+    keep  return what happened, too
+    log   directory in which it is logged, and when it began, s since 1970
+    """
+    config, vehicle, limit = _composed(setup, job)
+    began = time.process_time()
+    capacity = _capacity(setup, job, limit, float(config.document["link"]["share"]))
+    if job.prediction == CONFIGURED:
+        seen, _ = config.pqos()
+    else:
+        seen = prediction(job.prediction, capacity, job.duration_s, job.seed)
+    link, requests = _link(setup, job, limit, capacity), config.experiment().requests
+    with _recorder(setup, job, log) as recorder:
+        drive = Simulation(vehicle, link, seen, job.duration_s, setup.conditions, job.seed, recorder, requests).run()
+    return Result(job, figures(drive), time.process_time() - began, drive if keep else None)
+
+
+@contextmanager
+def _recorder(setup: Setup, job: Job, log: tuple[Path, float] | None) -> Iterator[Recorder]:
+    """Writes the drive, which exists only when it is complete."""
+    if log is None:
+        yield Recorder()
+        return
+    from runner.simulation.log import DriveFiles
+
+    config, vehicle, _ = _composed(setup, job)
+    note = f"simulated: link {job.link} from {job.begin_s:g} s, prediction {job.prediction}, seed {job.seed}"
+    files = DriveFiles(log[0], vehicle, config.document, log[1], note)
+    try:
+        yield files
+    except BaseException:
+        files.discard()
+        raise
+    files.close()
+
+
+def _capacity(setup: Setup, job: Job, limit: Limit, share: float) -> Steps:
+    duration_s = job.duration_s + MARGIN_S
+    if job.link == CONFIGURED:
+        return Steps.of(limit.kbps_at, duration_s)
+    rates = (
+        generate(job.link, job.seed, duration_s)
+        if is_family(job.link)
+        else _file(job.link, setup.conf)[0].moved(job.begin_s)
+    )
+    return Steps(rates.times, [share * rate for rate in rates.values])
+
+
+def _link(setup: Setup, job: Job, limit: Limit, capacity: Steps) -> Link:
+    """The link that the configuration describes, with this capacity."""
+    back, seed = limit.reverse, job.seed
+    return Link(
+        capacity,
+        _queue(setup, job, limit, capacity),
+        one_way_s=limit.delay_ms / 1000,
+        back_s=back.delay_ms / 1000 if back else 0.0,
+        delay_at=_in_seconds(limit),
+        back_at=_in_seconds(back) if back else None,
+        losses=LossModel(limit.loss, limit.burst, seed) if limit.loss else None,
+        back=RateQueue(_back_rates(back, job), back.queue_ms) if back else None,
+        back_losses=LossModel(back.loss, back.burst, seed) if back and back.loss else None,
+        tcp=limit.tcp,
+    )
+
+
+def _back_rates(back: OneWay, job: Job) -> Steps:
+    return Steps.of(back.kbps_at, job.duration_s)
+
+
+def _queue(setup: Setup, job: Job, limit: Limit, capacity: Steps) -> Queue:
+    policer = Policer(*limit.policer) if limit.policer else None
+    times = () if job.link == CONFIGURED or is_family(job.link) else _file(job.link, setup.conf)[1]
+    if times:
+        end = job.begin_s + job.duration_s + MARGIN_S
+        within = [t - job.begin_s for t in times if job.begin_s <= t < end]
+        return OpportunityQueue(within, limit.queue_ms, policer)
+    slot_s = setup.slot_ms / 1000
+    if setup.scheduler:
+        peak, credit_ms, grant_ms = setup.scheduler
+        return CreditQueue(
+            capacity,
+            limit.queue_ms,
+            peak=peak,
+            credit_s=credit_ms / 1000,
+            grant_s=grant_ms / 1000,
+            slot_s=slot_s,
+            policer=policer,
+        )
+    return RateQueue(capacity, limit.queue_ms, bursts=setup.bursts, slot_s=slot_s, policer=policer)
+
+
+def _in_seconds(way: OneWay) -> Callable[[float], float] | None:
+    delay_at = way.delay_at
+    return (lambda t: delay_at(t) / 1000) if delay_at else None

@@ -1,0 +1,122 @@
+"""The vehicle's side: the rules engine, fed as `runner.vehicle.loop` feeds it. Pure."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+
+from msgspec import UNSET
+
+from runner.core.events import ClockAdvanced, ControlPassed, Event, OperatorConnected, OperatorDisconnected
+from runner.core.model import Vehicle
+from runner.core.step import Run, start, step
+from runner.errors import RunError
+from runner.pqos import Pqos
+from runner.records import ReceptionReport, ReceptionReported, SentFrame
+from runner.simulation.encoder import Encoder
+from runner.vehicle.operators import Operators
+from runner.vehicle.sending import SendingTimes
+from runner.vehicle.uplink import MeasuredUplink
+
+OPERATOR = "operator"  # id of the only one
+LOOK_S = 0.02  # between two looks at what the payloaders have sent
+KEY_FRAME_S = 0.5  # between two key frames that repair a camera's pictures, as in runner.vehicle.loop
+OnStep = Callable[[Event, Run, Run], None]
+
+
+@dataclass
+class SimulatedVehicle:
+    """on_step: called with each event and the run before and after it; on_report: with each reception report."""
+
+    vehicle: Vehicle
+    pqos: Pqos
+    encoders: Mapping[str, Encoder]
+    on_step: OnStep
+    on_report: Callable[[ReceptionReported], None]
+    _sent: deque[tuple[str, SentFrame]] = field(default_factory=deque)  # that were not looked at yet
+    _key_frames: dict[str, float] = field(default_factory=dict)  # by camera, time of the last request for one
+    _in_control: str = ""
+
+    def __post_init__(self) -> None:
+        self.run = start(self.vehicle)
+        self._uplink, self._sending = MeasuredUplink(self.vehicle), SendingTimes()
+        self._operators = Operators(self.vehicle.expires_s)
+
+    def take(self, event: Event) -> None:
+        """Process an event, and the prediction that follows from it."""
+        self._step(event)
+        if prediction := self.pqos.observe(event):
+            self._step(prediction)
+
+    def take_start(self) -> None:
+        """The loop begins."""
+        self.take(ClockAdvanced(t=0.0))
+
+    def connect(self, t: float) -> None:
+        """The operator's side connects."""
+        self._operators.connected(OPERATOR, t)
+        self._note_presence(t)
+
+    def tick(self, t: float) -> None:
+        """Work that is due ten times a second."""
+        self.take(ClockAdvanced(t=t))
+        self._operators.expire_silent(t)
+        self._note_presence(t)
+
+    def sent(self, camera: str, captured: float, t: float) -> None:
+        """A frame has been sent."""
+        unsent = t // LOOK_S * LOOK_S
+        self._sent.append((camera, SentFrame(captured, unsent, unsent + LOOK_S)))
+
+    def take_report(self, report: ReceptionReport, t: float) -> None:
+        """A reception report arrives."""
+        self._operators.message_received(OPERATOR, t)
+        self._note_presence(t)
+        reported = self._with_lateness(ReceptionReported(t, OPERATOR, True, report))
+        self.on_report(reported)
+        if measured := self._uplink.take(reported):
+            self.take(measured)
+        if report.damaged is not UNSET:
+            for name in self._due(report.damaged, t):
+                self.encoders[name].key = True
+
+    def _step(self, event: Event) -> None:
+        before = self.run
+        self.run = after = step(self.vehicle, before, event)
+        if after.fault:
+            raise RunError(after.fault)
+        for command in after.commands:
+            self.encoders[command.camera].turn(command)
+        self.on_step(event, before, after)
+
+    def _note_presence(self, t: float) -> None:
+        in_control = self._operators.in_control
+        if in_control != self._in_control:
+            self._in_control = in_control
+            self.take(ControlPassed(t=t, operator=in_control))
+        if bool(self._operators.present) != (self.run.state.operator_since is not None):
+            self.take(OperatorConnected(t=t) if self._operators.present else OperatorDisconnected(t=t))
+
+    def _with_lateness(self, reported: ReceptionReported) -> ReceptionReported:
+        """As in `runner.vehicle.loop`: with what this side knows of its own delays."""
+        report, seen = reported.report, reported.t // LOOK_S * LOOK_S
+        while self._sent and self._sent[0][1].sent <= seen:
+            name, frame = self._sent.popleft()
+            self._sending.add({name: (frame,)})
+        if not report.units:
+            return replace(reported, all_received=self._sending.is_all_received(report.as_of) or UNSET)
+        assert report.offset_s is not UNSET
+        captured = report.at - report.offset_s
+        late_s = tuple(
+            round(self._sending.late_s(unit.camera, captured - unit.ago_s - unit.delay_s), 4) for unit in report.units
+        )
+        return replace(reported, late_s=late_s if any(late_s) else UNSET)
+
+    def _due(self, damaged: tuple[str, ...], t: float) -> Iterator[str]:
+        """Cameras that need a key frame now."""
+        for name in damaged:
+            encoder = self.encoders[name]
+            if encoder.sends and encoder.restarts and t - self._key_frames.get(name, -KEY_FRAME_S) >= KEY_FRAME_S:
+                self._key_frames[name] = t
+                yield name
