@@ -29,8 +29,7 @@ THIN, THICK = 0.05, 0.2  # least and greatest margin, ln; a larger change is one
 OPTIMISM = (
     0.1  # ln: by so much more is sent after HORIZON_S in which no frame waited; after twice the time, twice as much
 )
-CREDIT_KBIT, MOST_CREDIT_KBIT = 20.0, 80.0  # an idle link saves two packets, the least burst of a token bucket, or more
-CREDIT = 0.1  # weight of one comparison of trains with the rate of the busy link
+CREDIT, MOST_CREDIT_KBIT = 0.3, 80.0  # weight of one comparison of trains with the rate of the busy link, and its limit
 YIELDED = 1 / 3  # of the best capacity: competing traffic gets no more than the rest
 BEST_S = 60.0  # memory of the best capacity
 LOSSY, LOSS_S = 0.1, 0.5  # share of losses, in this time, that random loss does not reach
@@ -68,7 +67,7 @@ class Belief(NamedTuple):
     reported, observed, waited  times of the last report, of the last with frames, and of the last with a frame that
                 found the link busy
     credit      kbit that an idle link passes at once
-    trains      (kbit, s, number) of the trains since `waited`
+    trains      (kbit, s, number) of the trains of an idle link since `waited`
     """
 
     t: float
@@ -89,7 +88,7 @@ class Belief(NamedTuple):
     reported: float = 0.0
     observed: float = 0.0
     waited: float = 0.0
-    credit: float = CREDIT_KBIT
+    credit: float = 0.0
     trains: tuple[float, float, int] = NO_TRAINS
     policer: Policer = Policer()
     levels: History[float] = ()
@@ -145,7 +144,7 @@ def decide(b: Belief, t: float, silent_s: float, floors: float = 0.0, ceiling: f
     """
     silent_s = max(silent_s, t - b.reported - ABSENT_S, 0.0)
     # A queue that was there before the first frame is seen by its losses only.
-    drain = YIELDED if b.loss > LOSSY else max(YIELDED, min(1.0, 1 - max(0.0, b.queue - GOAL_S) / HORIZON_S))
+    drain = YIELDED if b.loss > LOSSY else max(YIELDED, min(1.0, 1 - b.queue / HORIZON_S))
     total = exp(b.m - b.margin) * drain
     total = max(total, YIELDED * exp(b.best), min(floors, exp(b.best - THICK)))
     total = min(total, b.policer.kbps * exp(-THIN))
@@ -179,7 +178,8 @@ def _measure_queue(b: Belief, seen: Evidence) -> Belief:
 
 def _losses(b: Belief, arrived: History[Arrived], dt: float) -> Losses:
     newest = arrived[-1][1]
-    kbit, lost = sum(of.kbit for _, of in arrived), sum(of.lost for _, of in arrived)
+    recent = [of for at, of in arrived if at > b.policer.since]
+    kbit, lost = sum(of.kbit for of in recent), sum(of.lost for of in recent)
     queued = any(of.queue > GOAL_S for _, of in arrived)
     return Losses(newest.kbit, newest.lost, kbit, lost, _rate(arrived, b.t, LOSS_S), queued, dt)
 
@@ -216,16 +216,27 @@ def _weigh(b: Belief, seen: Evidence, rtt_s: float) -> Belief:
     # Changes of the prediction since these frames were served do not apply to them.
     later = b.forward - (value_at(b.forwards, served) or 0.0) if b.forwards[-1][0] > served else 0.0
     kbps = exp(b.m - later)
-    least = seen.train_kbit - seen.trains * b.credit
     if seen.busy_kbit:
         b = _weigh_busy(b, seen, kbps)
-    if least > seen.train_kbit / 2:
-        b = _weigh_trains(b, seen, kbps, least)
+    if seen.trains:
+        b = _weigh_trains(
+            b,
+            _surprise(seen.train_kbit / kbps, seen.train_s),
+            seen.train_kbit / kbps,
+            seen.train_s,
+            seen.trains,
+            seen.backlog,
+        )
+    least = seen.idle_kbit - seen.idle * max(0.0, b.credit)
+    if least > seen.idle_kbit / 2:
+        slower = _surprise(seen.idle_kbit / kbps, seen.idle_s)
+        surprise = slower if slower < 0 else max(0.0, _surprise(least / kbps, seen.idle_s))
+        b = _weigh_trains(b, surprise, seen.idle_kbit / kbps, seen.idle_s, seen.idle, seen.backlog)
     elif not seen.busy_kbit and seen.unqueued and not seen.backlog:
         b = _send_more(b)
-    if seen.trains:
+    if seen.idle:
         kbit, took_s, number = b.trains
-        b = b._replace(trains=(kbit + seen.train_kbit, took_s + seen.train_s, number + seen.trains))
+        b = b._replace(trains=(kbit + seen.idle_kbit, took_s + seen.idle_s, number + seen.idle))
     return _contend(b, seen.growth)
 
 
@@ -233,7 +244,7 @@ def _weigh_busy(b: Belief, seen: Evidence, kbps: float) -> Belief:
     credit, (kbit, took_s, number) = b.credit, b.trains
     if number:  # what these trains got at once
         saved = (kbit - took_s * seen.busy_kbit / seen.busy_s) / number
-        credit += CREDIT * (min(MOST_CREDIT_KBIT, max(0.0, saved)) - credit)
+        credit += CREDIT * (max(-MOST_CREDIT_KBIT, min(MOST_CREDIT_KBIT, saved)) - credit)
     b = b._replace(waited=b.t, credit=credit, trains=NO_TRAINS)
     surprise = _surprise(seen.busy_kbit / kbps, seen.busy_s)
     is_steady = seen.growth * REPORT_S < JITTER_S and b.loss < LOSSY
@@ -242,11 +253,8 @@ def _weigh_busy(b: Belief, seen: Evidence, kbps: float) -> Belief:
     return _update(b, surprise, seen.busy_kbit / kbps, seen.busy_s, 1, seen.backlog)
 
 
-def _weigh_trains(b: Belief, seen: Evidence, kbps: float, least: float) -> Belief:
-    """least: kbit of the trains without what an idle link passes at once"""
-    slower = _surprise(seen.train_kbit / kbps, seen.train_s)
-    surprise = slower if slower < 0 else max(0.0, _surprise(least / kbps, seen.train_s))
-    b = _update(b, surprise, seen.train_kbit / kbps, seen.train_s, seen.trains, seen.backlog)
+def _weigh_trains(b: Belief, surprise: float, expected_s: float, seen_s: float, number: int, backlog: bool) -> Belief:
+    b = _update(b, surprise, expected_s, seen_s, number, backlog)
     # Others send between frames, not within one: the link itself is narrower.
     return b._replace(best=max(b.m, (b.best + b.m) / 2)) if surprise < 0 else b
 

@@ -32,8 +32,10 @@ class Evidence(NamedTuple):
     """Of one report.
 
     busy_kbit, busy_s         carried while the link was known to be busy, and the time this took
-    train_kbit, train_s       the same for the packet trains of frames that met no queue
+    train_kbit, train_s       the same for the packet trains of frames that found it busy
     trains                    their number
+    idle_kbit, idle_s, idle   the same for trains of frames that met no queue: an idle link may pass the first packets
+                              of each at once
     unqueued                  number of frames that met no queue
     kbit      all that arrived since the previous report
     wait_s    the standing queue: the shortest wait in the last frame interval
@@ -49,6 +51,9 @@ class Evidence(NamedTuple):
     train_kbit: float = 0.0
     train_s: float = 0.0
     trains: int = 0
+    idle_kbit: float = 0.0
+    idle_s: float = 0.0
+    idle: int = 0
     unqueued: int = 0
     kbit: float = 0.0
     wait_s: float = 0.0
@@ -141,8 +146,9 @@ def _add_frames(memory: EvidenceMemory, units: tuple[ReceivedUnit, ...], at: flo
         memory.interval,
         memory.last,
     )
-    busy_kbit = busy_s = train_kbit = train_s = grown = grown_s = served = due = 0.0
-    unqueued = trains = services = 0
+    busy_kbit = busy_s = grown = grown_s = served = due = 0.0
+    unqueued = services = 0
+    trains = {False: (0.0, 0.0, 0), True: (0.0, 0.0, 0)}  # by whether the frame found the link busy
     for unit in units:
         first = unit.arrived - unit.train_s
         path = paths[unit.camera] = _path(paths, unit, first)
@@ -156,8 +162,9 @@ def _add_frames(memory: EvidenceMemory, units: tuple[ReceivedUnit, ...], at: flo
             elif not unit.playout:
                 unqueued += 1
                 served, services = served + due, services + 1
-                if unit.train:
-                    train_kbit, train_s, trains = train_kbit + _kbit(unit.train), train_s + unit.train_s, trains + 1
+            if unit.train and not unit.playout:
+                kbit, took_s, number = trains[is_busy]
+                trains[is_busy] = kbit + _kbit(unit.train), took_s + unit.train_s, number + 1
         waited = max(0.0, first - due)
         captured, before = seen.get(unit.camera, (unit.captured, waited))
         after_s = unit.captured - captured
@@ -172,9 +179,12 @@ def _add_frames(memory: EvidenceMemory, units: tuple[ReceivedUnit, ...], at: flo
     evidence = Evidence(
         busy_kbit=busy_kbit,
         busy_s=busy_s,
-        train_kbit=train_kbit,
-        train_s=train_s,
-        trains=trains,
+        train_kbit=trains[True][0],
+        train_s=trains[True][1],
+        trains=trains[True][2],
+        idle_kbit=trains[False][0],
+        idle_s=trains[False][1],
+        idle=trains[False][2],
         unqueued=unqueued,
         kbit=sum(_kbit(unit.carried or unit.bytes) for unit in units),
         growth=grown / grown_s if grown_s else 0.0,

@@ -49,7 +49,7 @@ class Losses(NamedTuple):
     """Of a report, and of the last seconds.
 
     kbit, lost         received and lost according to this report, kbit
-    recent_kbit, recent_lost   the same of the last seconds
+    recent_kbit, recent_lost   the same of the last seconds, but not before the last test or trial
     kbps               received rate of the last seconds
     queued             whether a queue existed within them
     dt                 s since the previous report

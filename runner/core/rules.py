@@ -552,6 +552,7 @@ def _of_every_copy(state: State, evidence: Evidence) -> Evidence:
     return evidence._replace(
         busy_kbit=ratio * evidence.busy_kbit,
         train_kbit=ratio * evidence.train_kbit,
+        idle_kbit=ratio * evidence.idle_kbit,
         kbit=ratio * evidence.kbit,
         lost_kbit=ratio * evidence.lost_kbit,
     )
