@@ -37,6 +37,7 @@ STUCK_S = 2.0  # a queue that is constant for this long while the link is not bu
 HALVE_S = 0.2  # in which the total is halved while nothing arrives
 ABSENT_S = 0.3  # without a report for longer, perhaps nothing arrives
 LOWEST = 50.0  # kbit/s: with less nothing is measured
+STEADY = 0.03  # a change of the total by less than this share is not worth commands to all encoders
 NO_TRAINS = (0.0, 0.0, 0)
 
 
@@ -149,7 +150,9 @@ def decide(b: Belief, t: float, silent_s: float, floors: float = 0.0, ceiling: f
     total = max(total, YIELDED * exp(b.best), min(floors, exp(b.best - THICK)))
     total = min(total, b.policer.kbps * exp(-THIN))
     total = max(LOWEST, total * 2 ** (-silent_s / HALVE_S))
-    return b._replace(total=min(total, b.most, ceiling))
+    total = min(total, b.most, ceiling)
+    is_same = abs(total - b.total) < STEADY * b.total and b.total <= min(b.most, ceiling)
+    return b if is_same else b._replace(total=total)
 
 
 def _ln(kbps: float, most: float) -> float:
