@@ -219,17 +219,12 @@ def _weigh(b: Belief, seen: Evidence, rtt_s: float) -> Belief:
     # Changes of the prediction since these frames were served do not apply to them.
     later = b.forward - (value_at(b.forwards, served) or 0.0) if b.forwards[-1][0] > served else 0.0
     kbps = exp(b.m - later)
-    if seen.busy_kbit:
+    if seen.busy_kbit and seen.busy_s:
         b = _weigh_busy(b, seen, kbps)
-    if seen.trains:
-        b = _weigh_trains(
-            b,
-            _surprise(seen.train_kbit / kbps, seen.train_s),
-            seen.train_kbit / kbps,
-            seen.train_s,
-            seen.trains,
-            seen.backlog,
-        )
+    if seen.trains and seen.train_kbit:
+        expected_s = seen.train_kbit / kbps
+        surprise = _surprise(expected_s, seen.train_s)
+        b = _weigh_trains(b, surprise, expected_s, seen.train_s, seen.trains, seen.backlog)
     least = seen.idle_kbit - seen.idle * max(0.0, b.credit)
     if least > seen.idle_kbit / 2:
         slower = _surprise(seen.idle_kbit / kbps, seen.idle_s)

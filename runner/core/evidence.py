@@ -15,16 +15,11 @@ from math import inf
 from types import MappingProxyType
 from typing import NamedTuple
 
-from runner.core.uplink import LinkReport, ReceivedUnit
+from runner.core.uplink import BUCKET_S, EXPIRED_S, GAP_S, ONE_CLOCK_S, SAME_S, LinkReport, ReceivedUnit
 
 JITTER_S = 0.004  # of an arrival: half of 8 ms, a usual grant cycle of a mobile uplink
 BUSY_S = JITTER_S / 4  # a frame that waited longer found the link busy
-BUCKET_S = 10.0  # the path's delay is the shortest of the current time bucket and the previous one
-GAP_S = 0.12  # three reports: without arrivals for longer, the link has stalled
 GAPS_S = 4 * GAP_S  # a slow link has gap after gap
-EXPIRED_S = 120.0  # without a frame for longer, the clocks may have drifted apart: paths are measured anew
-ONE_CLOCK_S = 10.0  # delays that differ by more are not of the same clock
-SAME_S = 0.001  # a capture time that goes back by more reveals that a clock was set
 FIRST_INTERVAL_S = 1 / 15
 
 
@@ -156,9 +151,10 @@ def _add_frames(memory: EvidenceMemory, units: tuple[ReceivedUnit, ...], at: flo
         wait = 0.0 if last is None else max(0.0, last - due)
         is_busy = wait > BUSY_S
         if unit.whole:
-            if is_busy and last is not None and unit.arrived > last:
-                busy_kbit, busy_s = busy_kbit + _kbit(unit.carried or unit.bytes), busy_s + unit.arrived - last
-                served, services = served + due + wait, services + 1
+            if is_busy:
+                if last is not None and unit.arrived > last:
+                    busy_kbit, busy_s = busy_kbit + _kbit(unit.carried or unit.bytes), busy_s + unit.arrived - last
+                    served, services = served + due + wait, services + 1
             elif not unit.playout:
                 unqueued += 1
                 served, services = served + due, services + 1

@@ -432,7 +432,6 @@ def cap_by_link(
 
 
 FLOOR = Kbps(500)
-START_S = 5.0  # until the first pictures of all cameras have arrived and are reported
 
 
 class Ceiling(StrEnum):
@@ -476,11 +475,11 @@ def follow_link(
     belief: Belief | None = memory.get("follow_link")
     link = state.link
     evidence = None if link is None else link.evidence
-    is_measured = link is not None and state.t - link.t < START_S
+    is_measured = link is not None and state.t - link.t < link_cap.START_S
     if not cameras or state.operator_since is None or link is None or evidence is None or not is_measured:
         return _unmeasured(state, draft, start, after_s, halve_every_s, floor_kbps), memory
     predicted = None
-    most = float(wire_kbps(cameras, sum(_wanted_of_all(vehicle, state, draft), allocation.ZERO)))
+    most = float(wire_kbps(cameras, _of_all(state, _wanted(vehicle, state, draft))))
     if state.mode is Mode.AUTOMATIC and state.prediction is not None and not _is_stale(state, after_s):
         predicted = float(wire_kbps(cameras, state.prediction.kbps))
     if belief is None or belief.since != state.operator_since:
@@ -524,7 +523,7 @@ def _unmeasured(
             halvings = min(64, int((age - limit) / halve_s) + 1)  # 64 are below any floor
             total = max(Fraction(total) / 2**halvings, min(floor, total) if total >= 1 else floor)
             why = f"no prediction for {float(age):.1f} s, limit {plain(limit)} s"
-    if state.operator_since is not None and state.t - state.operator_since < START_S and start < 1:
+    if state.operator_since is not None and state.t - state.operator_since < link_cap.START_S and start < 1:
         draft = draft.replaced(sized_for=total)
         total, why = total * start, "the link has not been measured yet"
     if total == before:
@@ -536,10 +535,6 @@ def _why_believed(belief: Belief, evidence: Evidence) -> str:
     if evidence.silent_s:
         return f"nothing has arrived for {evidence.silent_s:.1f} s"
     return f"capacity of the link, believed to be {belief.kbps:.0f}"
-
-
-def _wanted_of_all(vehicle: Vehicle, state: State, draft: Draft) -> Iterable[Kbps]:
-    return (own * state.copies.get(name, 1) for name, own in _wanted(vehicle, state, draft).items())
 
 
 def _of_every_copy(state: State, evidence: Evidence) -> Evidence:
