@@ -23,7 +23,7 @@ from runner.link.bucket import Bucket
 from runner.link.policer import Policer
 from runner.simulation import control, drive, operator, vehicle
 from runner.simulation.encoder import Encoder, EncoderModel
-from runner.simulation.families import FAMILIES, generate
+from runner.simulation.families import FAMILIES, LEFT_OUT, generate
 from runner.simulation.figures import cuts, percentile
 from runner.simulation.predictions import prediction
 from runner.simulation.queues import CreditQueue, OpportunityQueue, RateQueue
@@ -169,10 +169,11 @@ def test_a_policer_drops_what_exceeds_its_rate() -> None:
 
 
 def test_links_are_generated_by_their_seed() -> None:
-    for name in FAMILIES:
+    for name in (*FAMILIES, *LEFT_OUT):
         assert generate(name, 3, 20).values == generate(name, 3, 20).values
         assert len(generate(name, 3, 20).times) == 200
-    assert generate("markov", 3, 20).values != generate("markov", 4, 20).values
+    for name in ("markov", *LEFT_OUT):
+        assert generate(name, 3, 20).values != generate(name, 4, 20).values
 
 
 def test_cuts_are_falls_within_a_short_time() -> None:

@@ -100,7 +100,7 @@ class Result(NamedTuple):
     drive: Drive | None
 
 
-def jobs(setup: Setup, links: Sequence[str], predictions: Sequence[str], seeds: int, windows: int) -> list[Job]:
+def jobs(setup: Setup, links: Sequence[str], predictions: Sequence[str], seeds: Sequence[int], windows: int) -> list[Job]:
     """All combinations.
 
     windows  of each file, at most; links that are generated have one
@@ -112,7 +112,7 @@ def jobs(setup: Setup, links: Sequence[str], predictions: Sequence[str], seeds: 
     found = []
     for link in links:
         for each in _of_link(setup, link, windows):
-            found += [each._replace(prediction=kind, seed=seed) for kind in predictions for seed in range(1, seeds + 1)]
+            found += [each._replace(prediction=kind, seed=seed) for kind in predictions for seed in seeds]
     return found
 
 

@@ -8,9 +8,10 @@ encoders, link, repair and reports are models; the rules are those of the vehicl
 is encoded and nobody waits: one core simulates a minute with eight cameras in about a second. All cores are used.
 
 links= names the links: synthetic (all that are generated: gauss_0.2_5, gauss_0.5_5, gauss_0.5_1, gauss_0.3_0.3, markov,
-step, ramp, outage, saw), a CSV file as link.file, a file of mahimahi with opportunities to send (.up, .pps), or
-configured: the link of the configuration, and the runs of its experiment. Of a file at most windows= parts of
-duration_s are driven. Everything else about the link is that of link=: link.queue_ms, link.delay_ms, link.delay_file,
+step, ramp, outage, saw), left_out (handover, shared: no number of any rule was chosen by them), a CSV file as link.file,
+a file of mahimahi with opportunities to send (.up, .pps), or configured: the link of the configuration, and the runs of
+its experiment. Of a file at most windows= parts of duration_s are driven. seeds= is their number, or FIRST-LAST.
+Everything else about the link is that of link=: link.queue_ms, link.delay_ms, link.delay_file,
 link.loss, link.loss_burst, link.policer, link.tcp, link.reverse, link.share. Without link= it has a queue of 300 ms and
 15 ms each way.
 
@@ -36,6 +37,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import time
 from collections.abc import Iterator, Sequence
 from math import isfinite
@@ -58,17 +60,18 @@ Place = tuple[Path, float]  # directory of a drive, and when it began, s since 1
 
 
 def run(arguments: Arguments) -> int:
-    from runner.simulation.families import FAMILIES
+    from runner.simulation.families import FAMILIES, LEFT_OUT
     from runner.simulation.predictions import KINDS
     from runner.simulation.runs import CONFIGURED, check, jobs
 
     setup = _setup(arguments)
     repeated = CONFIGURED if any(word.startswith("experiment=") for word in arguments.overrides) else ""
     named = _list(arguments, "links", repeated or SYNTHETIC)
-    links = [link for name in named for link in (FAMILIES if name == SYNTHETIC else [name])]
+    several = {SYNTHETIC: FAMILIES, "left_out": LEFT_OUT}
+    links = [link for name in named for link in several.get(name, (name,))]
     chosen = _list(arguments, "predictions", repeated or ALL)
     kinds = [kind for name in chosen for kind in (KINDS if name == ALL else [name])]
-    wanted = jobs(setup, links, kinds, _count(arguments, "seeds", 1), _count(arguments, "windows", 6))
+    wanted = jobs(setup, links, kinds, _seeds(arguments), _count(arguments, "windows", 6))
     check(setup, wanted)
     figure, places = arguments.path("figure"), _places(arguments, wanted)
     if figure and figure.suffix not in FORMATS:
@@ -129,6 +132,15 @@ def _count(arguments: Arguments, key: str, default: int) -> int:
     if not text.isdecimal() or not int(text):
         raise ArgumentError(key, repr(text), "must be a whole number of 1 or more")
     return int(text)
+
+
+def _seeds(arguments: Arguments) -> range:
+    text = arguments.values.get("seeds", "1")
+    found = re.fullmatch(r"(?:(\d+)-)?(\d+)", text, re.ASCII)
+    first, last = (int(found[1] or 1), int(found[2])) if found else (1, 0)
+    if not 1 <= first <= last:
+        raise ArgumentError("seeds", repr(text), "must be their number, or the first and the last: 3 or 100-102")
+    return range(first, last + 1)
 
 
 def _places(arguments: Arguments, wanted: Sequence[Job]) -> list[Place | None]:
