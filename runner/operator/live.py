@@ -139,6 +139,8 @@ class LiveOperator:
             self._repeat("sample", SAMPLE_S, lambda: self._sample(side))
         except RunError as error:  # GStreamer has hung for GIVE_UP_S; the main thread raises it
             self._failure = error
+        for request in self._requests:
+            self.station.note(f"the request at {request.at_s:g} s was not made: the drive ended before")
 
     def _report(self) -> None:
         """In its own thread, since a sample waits for GLib: to the vehicle a missing report means a bad link."""

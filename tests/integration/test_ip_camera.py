@@ -83,7 +83,7 @@ def test_a_camera_that_froze_comes_back_and_viewers_keep_their_session(frozen_s)
     assert len(set(messages)) == len(messages) <= 5  # each reason once, however many attempts
 
 
-@pytest.mark.parametrize("fps_max", [15, 30])
+@pytest.mark.parametrize("fps_max", [15, 60])  # after a stall, frames come faster than 30 a second
 def test_frames_keep_the_times_of_a_camera_that_is_faster_or_slower(fps_max):
     """It sends 25 a second. None is repeated, and none waits for the next one."""
     from runner.gst import Gst

@@ -264,13 +264,16 @@ def test_an_experiment_is_driven_over_a_limited_link_and_reported(tmp_path):
         "# @package _global_\n"
         "defaults: [{override /vehicle: delivery_robot}, {override /source: test}, {override /link: relay}, _self_]\n"
         "link: {share: 0.7}\n"
-        "experiment: {about: x, duration_s: 4, runs: {equal: [modes=equal], paper: [modes=paper]},"
-        " requests: [{at_s: 2, request: {event: camera_switched, camera: mast, 'on': false}}]}\n"
+        "experiment: {about: x, duration_s: 6, runs: {equal: [modes=equal], paper: [modes=paper]},"
+        " requests: [{at_s: 2, request: {event: camera_switched, camera: mast, 'on': false}},"
+        " {at_s: 100, request: {event: camera_switched, camera: mast, 'on': true}}]}\n"
     )
     ports = ("page.serve=false", "fps_max=10", f"media.port={free_port()}", f"control.port={free_port()}")
     words = (f"conf={tmp_path / 'conf'}", "experiment=mine", *ports, f"output={tmp_path / 'out'}")
     done = run("demo", *words)
     assert done.returncode == 0, done.stderr
+    assert "was not applied" not in done.stderr
+    assert done.stderr.count("the request at 100 s was not made: the drive ended before") == 2
     for name in ("equal", "paper"):
         drive = read_drive(tmp_path / "out" / name)
         assert (sorted(drive.sides), drive.warnings) == (["link", "operator", "vehicle"], [])
