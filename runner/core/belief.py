@@ -19,6 +19,7 @@ from runner.core.learned import HORIZON_S, MEMORY_S, WRONG, Learned
 from runner.core.policer import Losses, Policer, police
 
 REPORT_S = 0.04  # between two reports
+LEAST_JITTER_S = JITTER_S / 2  # of an arrival, once learned
 LONGEST_S = 0.3  # a report that comes later counts as if it came after this time
 DRIFT = 0.02  # variance that a second adds to x while innovations are white
 HIGHEST_STEP = 0.4  # ln: a burst is never taken for more than 1.5 times the capacity
@@ -37,7 +38,7 @@ STUCK_S = 2.0  # a queue that is constant for this long while the link is not bu
 HALVE_S = 0.2  # in which the total is halved while nothing arrives
 ABSENT_S = 0.3  # without a report for longer, perhaps nothing arrives
 LOWEST = 50.0  # kbit/s: with less nothing is measured
-STEADY = 0.03  # a change of the total by less than this share is not worth commands to all encoders
+STEADY = 0.015  # a change of the total by less than this share is not worth commands to all encoders
 NO_TRAINS = (0.0, 0.0, 0)
 
 
@@ -67,6 +68,7 @@ class Belief(NamedTuple):
     forward     sum of all changes of m by predictions
     reported, observed, waited  times of the last report, of the last with frames, and of the last with a frame that
                 found the link busy
+    busy        the rate of the link when it was last busy, kbit/s
     credit      kbit that an idle link passes at once
     trains      (kbit, s, number) of the trains of an idle link since `waited`
     """
@@ -89,6 +91,7 @@ class Belief(NamedTuple):
     reported: float = 0.0
     observed: float = 0.0
     waited: float = 0.0
+    busy: float = 0.0
     credit: float = 0.0
     trains: tuple[float, float, int] = NO_TRAINS
     policer: Policer = Policer()
@@ -134,7 +137,7 @@ def observe(b: Belief, t: float, seen: Evidence, rtt_s: float) -> Belief:
     if seen.kbit:
         b = _weigh(_measure_queue(b, seen), seen, rtt_s)._replace(observed=t)
     b = b._replace(levels=recorded(b.levels, t, b.m, 1.0))
-    return b._replace(learned=b.learned.judged(t, dt, b.levels))
+    return b._replace(learned=b.learned.judged(t, dt, b.levels)) if seen.kbit else b
 
 
 def decide(b: Belief, t: float, silent_s: float, floors: float = 0.0, ceiling: float = inf) -> Belief:
@@ -145,7 +148,7 @@ def decide(b: Belief, t: float, silent_s: float, floors: float = 0.0, ceiling: f
     """
     silent_s = max(silent_s, t - b.reported - ABSENT_S, 0.0)
     # A queue that was there before the first frame is seen by its losses only.
-    drain = YIELDED if b.loss > LOSSY else max(YIELDED, min(1.0, 1 - b.queue / HORIZON_S))
+    drain = YIELDED if b.loss > LOSSY else max(YIELDED, min(1.0, 1 - (b.queue - JITTER_S) / HORIZON_S))
     total = exp(b.m - b.margin) * drain
     total = max(total, YIELDED * exp(b.best), min(floors, exp(b.best - THICK)))
     total = min(total, b.policer.kbps * exp(-THIN))
@@ -169,13 +172,16 @@ def _measure_queue(b: Belief, seen: Evidence) -> Belief:
     arrived = recorded(b.arrived, b.t, Arrived(queue, seen.kbit, seen.lost_kbit), STUCK_S)
     recent = [of for at, of in arrived if at > b.t - LOSS_S]
     lost = sum(of.lost for of in recent)
+    # Losses of a queue that was full when its path was first measured look like a policer's, until it drains.
+    policer = Policer(usual=b.policer.usual) if seen.shorter_s > GOAL_S else b.policer
     b = b._replace(
+        policer=policer,
         longer=longer,
         queue=queue,
         arrived=arrived,
         loss=lost / (lost + sum(of.kbit for of in recent)),
-        policer=police(b.policer, b.t, _losses(b, arrived, dt)),
     )
+    b = b._replace(policer=police(policer, b.t, _losses(b, arrived, dt)))
     return _widen(b._replace(arrived=(), longer=longer + queue, queue=0.0) if _is_stuck(b) else b, dt, seen.backlog)
 
 
@@ -232,6 +238,9 @@ def _weigh(b: Belief, seen: Evidence, rtt_s: float) -> Belief:
         b = _weigh_trains(b, surprise, seen.idle_kbit / kbps, seen.idle_s, seen.idle, seen.backlog)
     elif not seen.busy_kbit and seen.unqueued and not seen.backlog:
         b = _send_more(b)
+    if b.loss > LOSSY and not (seen.busy_kbit or seen.trains or seen.idle):
+        # No frame is whole: what arrives is what the link carries.
+        b = b._replace(m=min(b.m, log(max(LOWEST, _rate(b.arrived, b.t, LOSS_S)))))
     if seen.idle:
         kbit, took_s, number = b.trains
         b = b._replace(trains=(kbit + seen.idle_kbit, took_s + seen.idle_s, number + seen.idle))
@@ -240,15 +249,20 @@ def _weigh(b: Belief, seen: Evidence, rtt_s: float) -> Belief:
 
 def _weigh_busy(b: Belief, seen: Evidence, kbps: float) -> Belief:
     credit, (kbit, took_s, number) = b.credit, b.trains
-    if number:  # what these trains got at once
-        saved = (kbit - took_s * seen.busy_kbit / seen.busy_s) / number
+    busy = seen.busy_kbit / seen.busy_s
+    if number and b.t - b.waited < STUCK_S:
+        # What these trains got at once. A link that changed meanwhile is no reason: the faster rate is the one to meet.
+        saved = (kbit - took_s * max(busy, b.busy)) / number
         credit += CREDIT * (max(-MOST_CREDIT_KBIT, min(MOST_CREDIT_KBIT, saved)) - credit)
-    b = b._replace(waited=b.t, credit=credit, trains=NO_TRAINS)
+    b = b._replace(waited=b.t, busy=busy, credit=credit, trains=NO_TRAINS)
     surprise = _surprise(seen.busy_kbit / kbps, seen.busy_s)
-    is_steady = seen.growth * REPORT_S < JITTER_S and b.loss < LOSSY
-    if surprise < 0 and is_steady:  # a longer path looks as busy
-        return b
-    return _update(b, surprise, seen.busy_kbit / kbps, seen.busy_s, 1, seen.backlog)
+    after = _update(b, surprise, seen.busy_kbit / kbps, seen.busy_s, 2, seen.backlog)
+    is_steady = abs(seen.growth) * REPORT_S < JITTER_S and b.loss < LOSSY
+    if surprise < 0 and is_steady:  # A longer path looks as busy, and as narrow as what is sent.
+        rate = _rate(b.arrived, b.t, HORIZON_S)
+        least = min(b.m, log(rate) + b.margin) if rate else b.m
+        return after._replace(m=max(after.m, least))
+    return after
 
 
 def _weigh_trains(b: Belief, surprise: float, expected_s: float, seen_s: float, number: int, backlog: bool) -> Belief:
@@ -281,7 +295,7 @@ def _update(b: Belief, surprise: float, expected_s: float, seen_s: float, pieces
     noise, repeated = b.noise, surprise * b.innovation
     if repeated <= 0:  # innovations of one sign are a change, not noise
         new = scale * min(1.0, max(0.0, surprise * surprise - b.v))
-        noise += REPORT_S / MEMORY_S * (max(JITTER_S**2, new) - noise)
+        noise += REPORT_S / MEMORY_S * (max(LEAST_JITTER_S**2, new) - noise)
     v = min(1.0, b.v + max(0.0, repeated))
     k = v / (v + noise / scale)
     m = min(log(b.most), b.m + k * surprise)

@@ -34,6 +34,7 @@ class Evidence(NamedTuple):
     unqueued                  number of frames that met no queue
     kbit      all that arrived since the previous report
     wait_s    the standing queue: the shortest wait in the last frame interval
+    shorter_s by which the path of a camera proved shorter than known: what was first measured held a queue
     growth    by which waits grew, s per s
     lost_kbit lost since the previous report
     age_s     from the middle of these services to the report
@@ -52,6 +53,7 @@ class Evidence(NamedTuple):
     unqueued: int = 0
     kbit: float = 0.0
     wait_s: float = 0.0
+    shorter_s: float = 0.0
     growth: float = 0.0
     lost_kbit: float = 0.0
     age_s: float = 0.0
@@ -141,15 +143,17 @@ def _add_frames(memory: EvidenceMemory, units: tuple[ReceivedUnit, ...], at: flo
         memory.interval,
         memory.last,
     )
-    busy_kbit = busy_s = grown = grown_s = served = due = 0.0
+    busy_kbit = busy_s = grown = grown_s = served = due = shorter_s = 0.0
     unqueued = services = 0
     trains = {False: (0.0, 0.0, 0), True: (0.0, 0.0, 0)}  # by whether the frame found the link busy
     for unit in units:
         first = unit.arrived - unit.train_s
+        known = paths.get(unit.camera)
         path = paths[unit.camera] = _path(paths, unit, first)
+        shorter_s = max(shorter_s, 0.0 if known is None else known.delay - path.delay)
         due = unit.captured + unit.late + path.delay
         wait = 0.0 if last is None else max(0.0, last - due)
-        is_busy = wait > BUSY_S
+        is_busy = wait > max(BUSY_S, _idle(unit, last))
         if unit.whole:
             if is_busy:
                 if last is not None and unit.arrived > last:
@@ -183,6 +187,7 @@ def _add_frames(memory: EvidenceMemory, units: tuple[ReceivedUnit, ...], at: flo
         idle=trains[False][2],
         unqueued=unqueued,
         kbit=sum(_kbit(unit.carried or unit.bytes) for unit in units),
+        shorter_s=shorter_s,
         growth=grown / grown_s if grown_s else 0.0,
         age_s=at - served / services if services else 0.0,
         backlog=due < memory.resumed,
@@ -200,6 +205,14 @@ def _path(paths: Mapping[str, Path], unit: ReceivedUnit, first: float) -> Path:
         shortest = min([delay, *others])
         return Path(shortest, shortest, unit.arrived)
     return path.after(delay, unit.arrived) if unit.whole else path
+
+
+def _idle(unit: ReceivedUnit, last: float | None) -> float:
+    """For how long the link may have been idle between the frame before and this one, s: it may have been sent late."""
+    if last is None or not unit.train:
+        return 0.0
+    first_s = unit.train_s * (unit.bytes - unit.train) / unit.train
+    return unit.arrived - unit.train_s - first_s - last
 
 
 def _standing(memory: EvidenceMemory) -> float:

@@ -12,7 +12,7 @@ from runner.core.history import History, recorded, value_at
 
 MEMORY_S = 10.0  # of the gain, the bias and the error
 HORIZON_S = 0.2  # until a change of the total shows in what is measured
-PRIOR = 0.05  # weight of "changes of a prediction are right", and variance of their error to their square
+PRIOR = 0.05  # weight of "changes of a prediction are right"
 WRONG = 0.35  # deviation of a prediction that nobody has checked, ln
 KEPT_S = 1.0
 
@@ -20,7 +20,7 @@ KEPT_S = 1.0
 class Learned(NamedTuple):
     """ln             the newest prediction; None: there is none
     bias, error    mean of x - ln and variance about it
-    sxx, sxy, see  sums of the regression of the changes of x on those of ln, and of its squared errors
+    sxx, sxy       sums of the regression of the changes of x on those of ln
     past           earlier predictions
     """
 
@@ -29,7 +29,6 @@ class Learned(NamedTuple):
     error: float = WRONG**2
     sxx: float = PRIOR
     sxy: float = PRIOR
-    see: float = PRIOR**2
     past: History[float | None] = ()
 
     @property
@@ -38,12 +37,16 @@ class Learned(NamedTuple):
         return min(1.0, max(0.0, self.sxy / self.sxx))
 
     def followed(self, m: float, v: float, ln: float) -> tuple[float, float]:
-        """A belief's mean and variance after the prediction has changed to `ln`: news of a change, and of a level."""
+        """A belief's mean and variance after the prediction has changed to `ln`: news of a change, and of a level.
+
+        How far it moves is how uncertain it becomes: the next reports decide, or a gain would confirm itself.
+        """
         assert self.ln is not None
         change = ln - self.ln
-        m, v = m + self.gain * change, v + self.see / self.sxx * change * change
         k = v / (v + self.error)
-        return m + k * (ln + self.bias - m), (1 - k) * v
+        moved = m + self.gain * change
+        moved += k * (ln + self.bias - moved)
+        return moved, (1 - k) * v + (moved - m) ** 2
 
     def stated(self, t: float, ln: float | None) -> Learned:
         """With the prediction from t on."""
@@ -58,9 +61,7 @@ class Learned(NamedTuple):
         change, came, share, k = p1 - p0, now - before, dt / HORIZON_S, min(1.0, dt / MEMORY_S)
         sxx = self.sxx + share * change * change - k * (self.sxx - PRIOR)
         sxy = self.sxy + share * change * came - k * (self.sxy - PRIOR)
-        changed = self._replace(sxx=sxx, sxy=sxy)
-        see = self.see - k * (self.see - PRIOR**2) + share * (came - changed.gain * change) ** 2 * bool(change)
         seen = value_at(self.past, t - HORIZON_S / 2)  # what is measured now was served about then
         off = now - (p1 if seen is None else seen) - self.bias
         error = self.error + k * (min(1.0, off * off) - self.error)
-        return changed._replace(see=see, bias=self.bias + k * off, error=error)
+        return self._replace(sxx=sxx, sxy=sxy, bias=self.bias + k * off, error=error)

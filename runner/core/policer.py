@@ -18,7 +18,8 @@ PROVEN, REFUTED = (
     0.6,
 )  # of the losses expected if they do not depend on the rate: Poisson, 15: -3 and -1.5 deviations
 TRIAL_S, PASSED_S = 30.0, 2.0  # from the proof, or a failed trial, until more is tried; after a trial without losses
-TRIED = 0.05  # and how much more; twice as much where nothing was lost before
+TRIED = 0.05  # and how much more; twice as much where nothing was lost before, up to MOST_TRIED
+MOST_TRIED = 0.8
 RANDOM = 0.1  # share that losses which do not depend on the rate stay below
 USUAL_S = 60.0  # memory of losses that do not depend on the rate
 
@@ -74,7 +75,7 @@ def police(p: Policer, t: float, seen: Losses) -> Policer:
         share = seen.recent_lost / sent
         return Policer(min(p.kbps, seen.kbps), since=t, share=share, usual=p.usual, step=step)
     if p.kbps < inf and t - p.since > (TRIAL_S if p.step == TRIED else PASSED_S):
-        return p._replace(kbps=p.kbps * (1 + p.step), since=t, step=2 * TRIED)
+        return p._replace(kbps=p.kbps * (1 + p.step), since=t, step=min(MOST_TRIED, 2 * p.step))
     return p._replace(usual=p.usual * (1 - min(1.0, seen.dt / USUAL_S)))
 
 

@@ -100,7 +100,9 @@ class Result(NamedTuple):
     drive: Drive | None
 
 
-def jobs(setup: Setup, links: Sequence[str], predictions: Sequence[str], seeds: Sequence[int], windows: int) -> list[Job]:
+def jobs(
+    setup: Setup, links: Sequence[str], predictions: Sequence[str], seeds: Sequence[int], windows: int
+) -> list[Job]:
     """All combinations.
 
     windows  of each file, at most; links that are generated have one
