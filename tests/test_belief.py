@@ -131,7 +131,7 @@ def sent(rate: float, seconds: float, kbps: float = inf, share: float = 0.0, sta
 
 
 def test_losses_that_end_when_less_is_sent_are_a_policer() -> None:
-    policer = sent(3000, 7, kbps=2000)
+    policer = sent(3000, 4, kbps=2000)
     assert policer.proven
     assert policer.kbps == pytest.approx(2000, rel=0.1)
 
@@ -142,9 +142,11 @@ def test_losses_that_do_not_depend_on_the_rate_are_the_paths(share: float) -> No
 
 
 def test_a_policer_that_has_gone_is_forgotten() -> None:
-    policer = sent(3000, 5, kbps=2000)
-    assert sent(3000, 29, start=policer._replace(since=0.0)).kbps == policer.kbps
-    assert sent(3000, 60, start=policer._replace(since=0.0)).kbps > 3000
+    policer = sent(3000, 4, kbps=2000)
+    assert sent(3000, 4.9, start=policer._replace(since=0.0)).kbps == policer.kbps  # 5 s until more is tried
+    assert sent(3000, 15, start=policer._replace(since=0.0)).kbps == inf
+    failed = sent(3000, 9, kbps=2000)
+    assert sent(3000, 29, start=failed._replace(since=0.0)).kbps == failed.kbps  # then 30 s
 
 
 # --- the decision -----------------------------------------------------------------------------------------------------

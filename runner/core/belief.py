@@ -43,9 +43,10 @@ NO_TRAINS = (0.0, 0.0, 0)
 
 
 class Arrived(NamedTuple):
-    """Of one report: standing queue, s; received and lost, kbit."""
+    """Of one report: standing queue and longest wait, s; received and lost, kbit."""
 
     queue: float
+    longest: float
     kbit: float
     lost: float
 
@@ -169,7 +170,7 @@ def _measure_queue(b: Belief, seen: Evidence) -> Belief:
     dt = min(LONGEST_S, b.t - b.observed)
     longer = min(b.longer, seen.wait_s)
     queue = seen.wait_s - longer
-    arrived = recorded(b.arrived, b.t, Arrived(queue, seen.kbit, seen.lost_kbit), STUCK_S)
+    arrived = recorded(b.arrived, b.t, Arrived(queue, seen.longest_s - longer, seen.kbit, seen.lost_kbit), STUCK_S)
     recent = [of for at, of in arrived if at > b.t - LOSS_S]
     lost = sum(of.lost for of in recent)
     # Losses of a queue that was full when its path was first measured look like a policer's, until it drains.
@@ -189,8 +190,9 @@ def _losses(b: Belief, arrived: History[Arrived], dt: float) -> Losses:
     newest = arrived[-1][1]
     recent = [of for at, of in arrived if at > b.policer.since]
     kbit, lost = sum(of.kbit for of in recent), sum(of.lost for of in recent)
-    queued = any(of.queue > GOAL_S for _, of in arrived)
-    return Losses(newest.kbit, newest.lost, kbit, lost, _rate(arrived, b.t, LOSS_S), queued, dt)
+    queued = any(of.longest > GOAL_S for _, of in arrived)
+    rate = max(_rate(arrived, b.t, LOSS_S), _rate(arrived, b.t, STUCK_S))
+    return Losses(newest.kbit, newest.lost, kbit, lost, rate, queued, dt)
 
 
 def _rate(arrived: History[Arrived], t: float, within_s: float) -> float:
@@ -295,7 +297,7 @@ def _update(b: Belief, surprise: float, expected_s: float, seen_s: float, pieces
     noise, repeated = b.noise, surprise * b.innovation
     if repeated <= 0:  # innovations of one sign are a change, not noise
         new = scale * min(1.0, max(0.0, surprise * surprise - b.v))
-        noise += REPORT_S / MEMORY_S * (max(LEAST_JITTER_S**2, new) - noise)
+        noise += REPORT_S / MEMORY_S * (min(GOAL_S**2, max(LEAST_JITTER_S**2, new)) - noise)  # a queue is no noise
     v = min(1.0, b.v + max(0.0, repeated))
     k = v / (v + noise / scale)
     m = min(log(b.most), b.m + k * surprise)

@@ -19,7 +19,7 @@ from runner.core.uplink import BUCKET_S, EXPIRED_S, GAP_S, ONE_CLOCK_S, SAME_S, 
 
 JITTER_S = 0.004  # of an arrival: half of 8 ms, a usual grant cycle of a mobile uplink
 BUSY_S = JITTER_S / 4  # a frame that waited longer found the link busy
-GAPS_S = 4 * GAP_S  # a slow link has gap after gap
+GAP_INTERVALS = 1.5  # frame intervals without a frame are no gap, either
 FIRST_INTERVAL_S = 1 / 15
 
 
@@ -34,6 +34,7 @@ class Evidence(NamedTuple):
     unqueued                  number of frames that met no queue
     kbit      all that arrived since the previous report
     wait_s    the standing queue: the shortest wait in the last frame interval
+    longest_s the longest wait in it
     shorter_s by which the path of a camera proved shorter than known: what was first measured held a queue
     growth    by which waits grew, s per s
     lost_kbit lost since the previous report
@@ -53,6 +54,7 @@ class Evidence(NamedTuple):
     unqueued: int = 0
     kbit: float = 0.0
     wait_s: float = 0.0
+    longest_s: float = 0.0
     shorter_s: float = 0.0
     growth: float = 0.0
     lost_kbit: float = 0.0
@@ -104,22 +106,27 @@ def observe(memory: EvidenceMemory, report: LinkReport) -> tuple[EvidenceMemory,
     if not units:
         if last is None:
             return memory, None
-        silent = 0.0 if report.all_received else max(0.0, report.at - last - GAP_S)
+        silent = 0.0 if report.all_received else max(0.0, report.at - last - _gap_s(memory))
         return memory, Evidence(wait_s=_standing(memory), silent_s=silent)
     if _is_of_another_clock(memory, units):
         memory, last = EvidenceMemory(), None
     began = units[0].arrived
     gap = 0.0 if last is None else began - last
-    ended_stall = gap > GAP_S
-    if ended_stall and began - memory.resumed > GAPS_S:
+    ended_stall = gap > _gap_s(memory)
+    if ended_stall and began - memory.resumed > 4 * _gap_s(memory):  # a slow link has gap after gap
         # What a stalled link releases arrives at once, and says nothing about its capacity, nor its losses.
         memory, _ = _add_frames(replace(memory, resumed=began), units, report.at)
         return memory, Evidence(wait_s=_standing(memory), backlog=True)
     if ended_stall:
         memory = replace(memory, resumed=began)
     memory, evidence = _add_frames(memory, units, report.at)
-    lost = report.lost * evidence.kbit / max(1, report.packets)
+    # What was lost before the first frame says when the link began, not what it carries.
+    lost = 0.0 if last is None else report.lost * evidence.kbit / max(1, report.packets)
     return memory, evidence._replace(wait_s=_standing(memory), lost_kbit=lost)
+
+
+def _gap_s(memory: EvidenceMemory) -> float:
+    return max(GAP_S, GAP_INTERVALS * memory.interval)
 
 
 def _is_of_another_clock(memory: EvidenceMemory, units: Iterable[ReceivedUnit]) -> bool:
@@ -187,6 +194,7 @@ def _add_frames(memory: EvidenceMemory, units: tuple[ReceivedUnit, ...], at: flo
         idle=trains[False][2],
         unqueued=unqueued,
         kbit=sum(_kbit(unit.carried or unit.bytes) for unit in units),
+        longest_s=max(wait for _, wait in kept),
         shorter_s=shorter_s,
         growth=grown / grown_s if grown_s else 0.0,
         age_s=at - served / services if services else 0.0,

@@ -17,9 +17,11 @@ PROVEN, REFUTED = (
     0.25,
     0.6,
 )  # of the losses expected if they do not depend on the rate: Poisson, 15: -3 and -1.5 deviations
-TRIAL_S, PASSED_S = 30.0, 2.0  # from the proof, or a failed trial, until more is tried; after a trial without losses
-TRIED = 0.05  # and how much more; twice as much where nothing was lost before, up to MOST_TRIED
-MOST_TRIED = 0.8
+TEST_S = 3.0  # after which a test without an answer ends: so few losses do little harm
+FIRST_S, TRIAL_S, PASSED_S = 5.0, 30.0, 3.0  # until more is tried: after the proof, a failed trial, one without losses
+TRIED = 0.05  # by this share; twice as much where nothing was lost before, then twice that, until ...
+WRONG = 0.8  # ... a rate that may be exceeded by so much is none
+SLOWEST = 200.0  # kbit/s: with less there are too few packets to tell
 RANDOM = 0.1  # share that losses which do not depend on the rate stay below
 USUAL_S = 60.0  # memory of losses that do not depend on the rate
 
@@ -34,6 +36,7 @@ class Policer(NamedTuple):
     kbit, lost received and lost during the test, kbit
     usual      share of losses that does not depend on the rate
     step       share by which the next trial sends more
+    wait       s from `since` until then
     """
 
     kbps: float = inf
@@ -44,6 +47,7 @@ class Policer(NamedTuple):
     lost: float = 0.0
     usual: float = 0.0
     step: float = TRIED
+    wait: float = FIRST_S
 
 
 class Losses(NamedTuple):
@@ -51,7 +55,7 @@ class Losses(NamedTuple):
 
     kbit, lost         received and lost according to this report, kbit
     recent_kbit, recent_lost   the same of the last seconds, but not before the last test or trial
-    kbps               received rate of the last seconds
+    kbps               received rate: the greater of those of the last half second and the last two
     queued             whether a queue existed within them
     dt                 s since the previous report
     """
@@ -70,12 +74,15 @@ def police(p: Policer, t: float, seen: Losses) -> Policer:
     if p.kbps < inf and not p.proven:
         return _test(p, t, seen)
     sent = seen.recent_kbit + seen.recent_lost
-    if seen.recent_lost > FEW and seen.recent_lost > (POLICED + 2 * p.usual) * sent and not seen.queued and seen.kbps:
-        step = TRIED if p.kbps < inf else 2 * TRIED  # the first rate may be too low
-        share = seen.recent_lost / sent
-        return Policer(min(p.kbps, seen.kbps), since=t, share=share, usual=p.usual, step=step)
-    if p.kbps < inf and t - p.since > (TRIAL_S if p.step == TRIED else PASSED_S):
-        return p._replace(kbps=p.kbps * (1 + p.step), since=t, step=min(MOST_TRIED, 2 * p.step))
+    is_much = seen.recent_lost > FEW and seen.recent_lost > (POLICED + 2 * p.usual) * sent
+    if is_much and not seen.queued and seen.kbps > SLOWEST:
+        share, is_first = seen.recent_lost / sent, p.kbps == inf  # the first rate may be too low
+        step, wait = (2 * TRIED, FIRST_S) if is_first else (TRIED, TRIAL_S)
+        return Policer(min(p.kbps, seen.kbps), since=t, share=share, usual=p.usual, step=step, wait=wait)
+    if p.kbps < inf and t - p.since > p.wait:
+        if p.step >= WRONG:
+            return Policer(usual=p.usual)
+        return p._replace(kbps=p.kbps * (1 + p.step), since=t, step=2 * p.step, wait=PASSED_S)
     return p._replace(usual=p.usual * (1 - min(1.0, seen.dt / USUAL_S)))
 
 
@@ -85,11 +92,15 @@ def _test(p: Policer, t: float, seen: Losses) -> Policer:
     p = p._replace(kbit=p.kbit + seen.kbit, lost=p.lost + seen.lost)
     sent = p.kbit + p.lost
     if p.share * sent < ENOUGH:
-        return p
+        if t - p.since < TEST_S:
+            return p
+        # A rate that was proven before is kept.
+        return p._replace(proven=True, since=t) if p.wait == TRIAL_S else Policer(usual=max(p.usual, p.share))
     found = p.lost / (p.share * sent)
     if found < PROVEN:
         return p._replace(proven=True, since=t)
     if found > REFUTED and p.lost < RANDOM * sent:
-        return Policer(usual=max(p.usual, p.lost / sent))
+        # Where a rate was proven before, that it is still too much is as likely: no loss is usual yet.
+        return Policer(usual=p.usual if p.wait == TRIAL_S else max(p.usual, p.lost / sent))
     kbps = min(p.kbps, seen.kbps or p.kbps)  # still too much
-    return Policer(kbps, since=t, share=p.lost / sent, usual=p.usual, step=p.step)
+    return p._replace(kbps=kbps, since=t, share=p.lost / sent, kbit=0.0, lost=0.0)
