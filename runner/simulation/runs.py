@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from runner.configuration.config import Configuration, configuration
 from runner.configuration.files import conf_directories
@@ -98,6 +98,9 @@ class Result(NamedTuple):
     figures: Figures
     took_s: float
     drive: Drive | None
+
+    def to_json(self) -> dict[str, Any]:
+        return {**self.job._asdict(), "took_s": round(self.took_s, 3), **self.figures}
 
 
 def jobs(
