@@ -7,6 +7,7 @@ import random
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -27,7 +28,7 @@ from runner.simulation.families import FAMILIES, LEFT_OUT, generate
 from runner.simulation.figures import cuts, percentile
 from runner.simulation.predictions import prediction
 from runner.simulation.queues import CreditQueue, OpportunityQueue, RateQueue
-from runner.simulation.runs import Job, Setup, run_job
+from runner.simulation.runs import Job, Setup, jobs, run_job
 from runner.simulation.steps import Steps
 
 SHORT = Setup(("vehicle=delivery_robot", "fps_max=15"), None)
@@ -210,3 +211,17 @@ def test_a_simulated_drive_is_a_drive(tod: Command, tmp_path: Path) -> None:
 def _decisions(directory: Path) -> list[str]:
     lines = (directory / "drive.jsonl").read_text().splitlines()
     return [line for line in lines if json.loads(line).get("log") == "decision"]
+
+
+def test_the_link_of_a_drive_is_driven_again(tod: Command, tmp_path: Path) -> None:
+    job = Job("saw", 0.0, "absent", 1, 6.0)
+    run_job(SHORT, job, log=(tmp_path / "drive", 0.0))
+    again = jobs(replace(SHORT, duration_s=5.0), [str(tmp_path / "drive")], ["right"], [1], 6)
+    assert [one.link_name for one in again] == ["drive"]
+    driven, link = run_job(SHORT, again[0], keep=True).drive, generate("saw", 1, 10)
+    assert driven and all(driven.capacity.at(t) == link.at(t + 0.1) for t in (0, 1.1, 3.9, 4.5))  # logged from 0.1 s on
+    other = (tmp_path / "drive").rename(tmp_path / "other")
+    (other / "link.jsonl").unlink()
+    result = tod("simulate", f"links={other}")
+    expected = "has no rates in link.jsonl: must be a drive over a limited link, which link= sets"
+    assert (result.status, result.err) == (2, f"{other}: {expected}\n")

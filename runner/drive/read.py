@@ -25,6 +25,7 @@ from runner.records import (
     Ended,
     Json,
     LinesDropped,
+    LinkSample,
     ReceptionReported,
     Record,
     Sample,
@@ -146,6 +147,19 @@ def read_drive(directory: Path) -> Drive:
     if sides.keys() >= DRIVEN:
         sides["operator"] = _by_clock_of(sides["vehicle"], sides["operator"])
     return Drive(directory, sides, warnings)
+
+
+def read_link(directory: Path) -> list[LinkSample]:
+    """What the limited link of a drive logged: at each change of its rate, and ten times a second.
+
+    raises  UserError with file and line of the first error, or if the drive had no limited link
+    """
+    path = directory / FILES["link"]
+    samples = list(_side("link", path, []).of(LinkSample)) if path.is_file() else []
+    if not samples:
+        rule = f"has no rates in {FILES['link']}: must be a drive over a limited link, which link= sets"
+        raise UserError(str(directory), "", None, rule)
+    return samples
 
 
 def _check_one_vehicle(where: str, sides: Mapping[str, Side]) -> None:

@@ -17,9 +17,9 @@ from runner.errors import ArgumentError
 from runner.link.limit import Limit, OneWay
 from runner.link.losses import LossModel
 from runner.link.policer import Policer
-from runner.pqos.settings import find_file
+from runner.pqos.settings import find_file, find_path
 from runner.simulation.drive import Conditions, Drive, Link, Recorder, Simulation
-from runner.simulation.families import FAMILIES, generate, is_family
+from runner.simulation.families import FAMILIES, LEFT_OUT, generate, is_family
 from runner.simulation.figures import Figures, figures
 from runner.simulation.predictions import KINDS, prediction
 from runner.simulation.queues import KBIT, OPPORTUNITY_BYTES, CreditQueue, OpportunityQueue, Queue, RateQueue
@@ -67,7 +67,7 @@ class Setup:
 class Job(NamedTuple):
     """One drive.
 
-    link        a family, a file, or CONFIGURED
+    link        a family, a file, the directory of a drive, or CONFIGURED
     begin_s     of the link's window
     prediction  one of KINDS, or CONFIGURED
     run, words  name of the experiment's run, and the overrides that it adds
@@ -149,21 +149,36 @@ def _windows(setup: Setup, job: Job, most: int) -> list[float]:
 
 @lru_cache(maxsize=16)
 def _file(name: str, conf: Path | None) -> tuple[Steps, tuple[float, ...]]:
-    """The rates of a file, as long as it lasts, and its opportunities to send, s, if it has such.
+    """The rates of a file or a drive, as long as it lasts, and its opportunities to send, s, if it has such.
 
-    raises  ArgumentError
+    raises  UserError
     """
+    named, bases = {"file": name}, [*conf_directories(conf), Path.cwd()]
     try:
-        path = find_file({"file": name}, "file", [*conf_directories(conf), Path.cwd()])
+        if find_path(named, "file", bases).is_dir():
+            return _driven(find_path(named, "file", bases)), ()
+        path = find_file(named, "file", bases)
         if path.suffix in OPPORTUNITIES:
             return _opportunities(path)
         from runner.pqos.table import RATE, TIME, read_table
 
         times, rates = read_table(path, (TIME, RATE)).T.tolist()
     except ModelError as error:
-        hint = f"; or a family: {', '.join(FAMILIES)}" if "no such" in error.rule else ""
+        hint = f"; or a family: {', '.join((*FAMILIES, *LEFT_OUT))}" if "no such" in error.rule else ""
         raise ArgumentError("links", error.found or name, error.rule + hint) from None
-    return Steps([t - times[0] for t in times], rates), ()
+    return _from_zero(times, rates), ()
+
+
+def _driven(directory: Path) -> Steps:
+    """The rates of the limited link of a drive."""
+    from runner.drive.read import read_link
+
+    samples = read_link(directory)
+    return _from_zero([sample.t for sample in samples], [sample.kbps for sample in samples])
+
+
+def _from_zero(times: Sequence[float], rates: Sequence[float]) -> Steps:
+    return Steps([t - times[0] for t in times], rates)
 
 
 def _opportunities(path: Path) -> tuple[Steps, tuple[float, ...]]:

@@ -10,8 +10,8 @@ is encoded and nobody waits: one core simulates a minute with eight cameras in a
 links= names the links: synthetic (all that are generated: gauss_0.2_5, gauss_0.5_5, gauss_0.5_1, gauss_0.3_0.3, markov,
 step, ramp, outage, saw), left_out (handover, shared: no number of any rule was chosen by them), a CSV file as
 link.file, a file of mahimahi with opportunities to send (.up, .pps), the directory of a drive over a limited link, or
-configured: the link of the configuration, and the runs of its experiment. Of a file or a drive at most windows= parts of
-duration_s are driven. seeds= is their number, or FIRST-LAST.
+configured: the link of the configuration, and the runs of its experiment. Of a file or a drive at most windows= parts
+of duration_s are driven. seeds= is their number, or FIRST-LAST.
 Everything else about the link is that of link=: link.queue_ms, link.delay_ms, link.delay_file, link.loss,
 link.loss_burst, link.policer, link.tcp, link.reverse, link.share. Without link= it has a queue of 300 ms and 15 ms each
 way.
