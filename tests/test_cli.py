@@ -70,7 +70,7 @@ def test_invalid_commands(tod: Command, words: list[str], expected: str) -> None
     [
         (
             ["print", "duration_s=3"],
-            "duration_s: is an argument of simulate, vehicle, operator, latency, ros, demo, record; print has ",
+            "duration_s: is an argument of simulate, tune, vehicle, operator, latency, ros, demo, record; print has ",
         ),
         (["print", "input=a.jsonl"], "input: is an argument of replay; print has total_kbps, format, conf"),
         (["print", "vehcle=mine"], "vehcle: unknown name, did you mean vehicle?"),

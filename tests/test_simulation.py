@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from helpers import Command
 
-from rig import until
+from rig import children_named, until
 from runner.configuration.config import configuration
 from runner.core import commands as knobs
 from runner.core.events import ClockAdvanced
@@ -152,15 +152,11 @@ def test_ctrl_c_ends_every_process() -> None:
     words = (sys.executable, "-m", "runner", "simulate", *SHORT.overrides, "seeds=50", "workers=2")
     with subprocess.Popen(words, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as child:
         assert child.stderr and "simulated: 0%" in child.stderr.readline()
-        until(lambda: len(_children(child.pid)) > 2)  # beside the workers, one that tracks their resources
-        started = _children(child.pid)
+        until(lambda: len(children_named(child.pid, "python")) > 2)  # workers, and one that tracks their resources
+        started = children_named(child.pid, "python")
         child.send_signal(signal.SIGINT)
         assert child.wait(timeout=20) == 130
     until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in started))
-
-
-def _children(pid: int) -> list[str]:
-    return [pid for task in Path(f"/proc/{pid}/task").iterdir() for pid in (task / "children").read_text().split()]
 
 
 def test_a_policer_drops_what_exceeds_its_rate() -> None:

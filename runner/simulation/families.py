@@ -20,8 +20,8 @@ FADING = (0.1, 1.0)  # deviation and correlation time within a cell
 SHARED_KBPS, OTHERS, OTHER_S = 12000.0, 2.0, 3.0  # of a cell that others use too: their mean number, and stay
 
 FAMILIES = ("gauss_0.2_5", "gauss_0.5_5", "gauss_0.5_1", "gauss_0.3_0.3", "markov", "step", "ramp", "outage", "saw")
-# No number of any rule is chosen by what it does on these links, with any seed of 100 and more.
-LEFT_OUT = ("handover", "shared")
+# No number of any rule is chosen by what it does on these links, with any seed from this one on.
+LEFT_OUT, LEFT_OUT_SEED = ("handover", "shared"), 100
 
 # Repeated functions of time, s, in kbit/s.
 _SHAPES: dict[str, Callable[[float], float]] = {

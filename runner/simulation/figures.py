@@ -12,7 +12,7 @@ from statistics import fmean
 
 from runner.simulation.drive import Drive
 
-SETTLED_S = 3.0  # a drive counts from here on
+SETTLED_S = 3.0  # unless it is to be judged by its start, too, a drive counts from here on
 FROZEN_S = 0.3  # between two frames of any camera
 CUT, CUT_S = 0.15, 0.2  # a cut: the total falls by more than this share within this time
 FIGURES = {  # by name: what the column says, and its digits
@@ -30,7 +30,7 @@ FIGURES = {  # by name: what the column says, and its digits
 Figures = dict[str, float]
 
 
-def figures(drive: Drive, since_s: float = SETTLED_S) -> Figures:
+def figures(drive: Drive, since_s: float) -> Figures:
     """use: bytes of cameras, repeated packets and control link that arrived over those that the link could carry
 
     p50, p95, p99  of each frame's wait in the queue with its own service, ms

@@ -19,7 +19,7 @@ WIDTH, HEIGHT = 12, 2.4  # inches of a row
 
 
 def draw(results: Sequence[Result], path: Path) -> None:
-    """Write the first MOST drives, one below the other; the ending of the path names the format."""
+    """Write the first MOST drives, one below the other; see `write_figure`."""
     kept = [(result, result.drive) for result in results if result.drive][:MOST]
     figure = Figure(figsize=(WIDTH, HEIGHT * len(kept)), layout="constrained")
     for (rates, waits), (result, drive) in zip(figure.subplots(len(kept), 2, squeeze=False), kept, strict=True):
@@ -31,6 +31,11 @@ def draw(results: Sequence[Result], path: Path) -> None:
         waits.set(title="wait of each frame in the queue", ylabel="ms")
         for axes in (rates, waits):
             axes.set(xlabel="s", ylim=(0, None), xlim=(0, drive.duration_s))
+    write_figure(figure, path)
+
+
+def write_figure(figure: Figure, path: Path) -> None:
+    """The ending of the path names the format."""
     data = io.BytesIO()
     figure.savefig(data, format=path.suffix[1:], dpi=110)
     write_whole(path, data.getvalue())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from runner.configuration.config import Configuration, configuration
 from runner.configuration.files import conf_directories
-from runner.core.model import Kbps, ModelError, Vehicle, suggest
+from runner.core.model import Kbps, Mode, ModelError, Vehicle, suggest
 from runner.errors import ArgumentError
 from runner.link.limit import Limit, OneWay
 from runner.link.losses import LossModel
@@ -20,7 +20,7 @@ from runner.link.policer import Policer
 from runner.pqos.settings import find_file, find_path
 from runner.simulation.drive import Conditions, Drive, Link, Recorder, Simulation
 from runner.simulation.families import FAMILIES, LEFT_OUT, generate, is_family
-from runner.simulation.figures import Figures, figures
+from runner.simulation.figures import SETTLED_S, Figures, figures
 from runner.simulation.predictions import KINDS, prediction
 from runner.simulation.queues import KBIT, OPPORTUNITY_BYTES, CreditQueue, OpportunityQueue, Queue, RateQueue
 from runner.simulation.steps import Steps
@@ -53,6 +53,7 @@ class Setup:
     duration_s       of each drive; None: as its experiment says, or DURATION_S
     slot_ms, bursts  see `runner.simulation.queues.RateQueue`
     scheduler        in place of that; None: none
+    since_s          from when on a drive counts
     """
 
     overrides: tuple[str, ...]
@@ -62,6 +63,7 @@ class Setup:
     slot_ms: float = 0.0
     bursts: bool = True
     scheduler: Scheduler | None = None
+    since_s: float = SETTLED_S
 
 
 class Job(NamedTuple):
@@ -226,6 +228,21 @@ def check(setup: Setup, wanted: Iterable[Job]) -> None:
         config.experiment()
 
 
+def rules_in_force(setup: Setup, wanted: Iterable[Job]) -> tuple[Mapping[str, Any], list[Mode]]:
+    """The modes file of all drives, and the modes that they are in: as configured, and as an experiment selects.
+
+    raises  ArgumentError if runs of an experiment follow different rules
+    """
+    configs = [_composed(setup, job)[0] for job in wanted]
+    files = [config.document["modes"] for config in configs]
+    if any(file != files[0] for file in files):
+        raise ArgumentError("experiment", None, "its runs follow different rules; name the rules and the links instead")
+    requests = [request.event for config in configs for request in config.experiment().requests]
+    selected = {config.document["mode"] for config in configs}
+    selected |= {event["mode"] for event in requests if event["event"] == "mode_selected"}
+    return files[0], [mode for mode in Mode if mode in selected]
+
+
 def run_job(setup: Setup, job: Job, keep: bool = False, log: tuple[Path, float] | None = None) -> Result:
     """Simulate one drive.
 
@@ -242,7 +259,7 @@ def run_job(setup: Setup, job: Job, keep: bool = False, log: tuple[Path, float] 
     link, requests = _link(setup, job, limit, capacity), config.experiment().requests
     with _recorder(setup, job, log) as recorder:
         drive = Simulation(vehicle, link, seen, job.duration_s, setup.conditions, job.seed, recorder, requests).run()
-    return Result(job, figures(drive), time.process_time() - began, drive if keep else None)
+    return Result(job, figures(drive, setup.since_s), time.process_time() - began, drive if keep else None)
 
 
 @contextmanager

@@ -37,20 +37,11 @@ class Verb(NamedTuple):
 NO_YES = ("false", "true")
 CONVERSION = ("output", "vehicle", "bag", "width_px", "height_px", "fps", "overwrite")
 SIMULATED = (
-    *("links", "predictions", "seeds", "windows", "duration_s", "workers", "output", "figure", "log"),
-    *(
-        "control",
-        "encoder_error",
-        "late_ms",
-        "report_jitter_ms",
-        "report_loss",
-        "bursts",
-        "slot_ms",
-        "credit_ms",
-        "peak",
-        "grant_ms",
-    ),
+    *("links", "predictions", "seeds", "windows", "duration_s", "since_s", "workers", "output", "figure"),
+    *("control", "encoder_error", "late_ms", "report_jitter_ms", "report_loss", "bursts", "slot_ms", "credit_ms"),
+    *("peak", "grant_ms"),
 )
+OF_SIMULATED = {"bursts": ("true", "false"), "control": ("true", "false")}
 KEYS = ("output", "vehicle", "controller", "watcher", "predictor", "positioner", "broker", "host", "rotate", "revoke")
 VERBS = {
     "print": Verb(
@@ -85,8 +76,14 @@ VERBS = {
     "simulate": Verb(
         "drives over simulated links: a table for each prediction",
         "runner.verbs.simulate",
-        SIMULATED,
-        choices={"bursts": ("true", "false"), "control": ("true", "false")},
+        (*SIMULATED, "log"),
+        choices=OF_SIMULATED,
+    ),
+    "tune": Verb(
+        "other numbers of the rules, compared by simulation",
+        "runner.verbs.tune",
+        ("vary", "left_out", *SIMULATED),
+        choices=OF_SIMULATED,
     ),
     "vehicle": Verb(
         "the vehicle's side: cameras, RTSP server, rules", "runner.verbs.vehicle", ("log", "drives", "duration_s")

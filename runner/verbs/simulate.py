@@ -1,7 +1,7 @@
 """usage: tod-runner simulate [OVERRIDE ...] [links=LINK,...] [predictions=KIND,...] [seeds=1] [windows=6]
-                           [duration_s=60] [output=FILE.json] [figure=FILE.png] [log=DIR] [workers=N] [control=true]
-                           [encoder_error=0.03] [late_ms=2] [report_jitter_ms=0] [report_loss=0] [bursts=true]
-                           [slot_ms=0] [credit_ms=0] [peak=3] [grant_ms=0]
+                           [duration_s=60] [since_s=3] [output=FILE.json] [figure=FILE.png] [log=DIR] [workers=N]
+                           [control=true] [encoder_error=0.03] [late_ms=2] [report_jitter_ms=0] [report_loss=0]
+                           [bursts=true] [slot_ms=0] [credit_ms=0] [peak=3] [grant_ms=0]
 
 Simulates drives over links, under predictions that are right or wrong, and prints a table of what they show. Cameras,
 encoders, link, repair and reports are models; the rules are those of the vehicle, with the modes file in force. Nothing
@@ -11,7 +11,7 @@ links= names the links: synthetic (all that are generated: gauss_0.2_5, gauss_0.
 step, ramp, outage, saw), left_out (handover, shared: no number of any rule was chosen by them), a CSV file as
 link.file, a file of mahimahi with opportunities to send (.up, .pps), the directory of a drive over a limited link, or
 configured: the link of the configuration, and the runs of its experiment. Of a file or a drive at most windows= parts
-of duration_s are driven. seeds= is their number, or FIRST-LAST.
+of duration_s are driven; each drive counts from since_s on. seeds= is their number, or FIRST-LAST.
 Everything else about the link is that of link=: link.queue_ms, link.delay_ms, link.delay_file, link.loss,
 link.loss_burst, link.policer, link.tcp, link.reverse, link.share. Without link= it has a queue of 300 ms and 15 ms each
 way.

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from runner.simulation.runs import Job, Result, Setup
 
 ALL, SYNTHETIC = "all", "synthetic"
-SHORTEST_S = 4.0
+SHORTEST_S = 1.0  # that counts
 FORMATS = (".png", ".pdf", ".svg")  # of the figure
 Place = tuple[Path, float]  # directory of a drive, and when it began, s since 1970
 
@@ -30,11 +30,10 @@ def setup(arguments: Arguments) -> Setup:
         value = arguments.number(key)
         return default if value is None else value
 
-    duration_s = arguments.number("duration_s")
-    if duration_s is not None and duration_s < SHORTEST_S:
-        raise ArgumentError(
-            "duration_s", f"{duration_s:g}", f"must be at least {SHORTEST_S:g}: the first 3 s do not count"
-        )
+    duration_s, since_s = arguments.number("duration_s"), number("since_s", Setup.since_s)
+    if duration_s is not None and duration_s < since_s + SHORTEST_S:
+        rule = f"must be at least {since_s + SHORTEST_S:g}: the first {since_s:g} s do not count"
+        raise ArgumentError("duration_s", f"{duration_s:g}", rule)
     if (lost := number("report_loss")) > 1:
         raise ArgumentError("report_loss", f"{lost:g}", "must be a share from 0 to 1")
     credit_ms, grant_ms = number("credit_ms"), number("grant_ms")
@@ -52,6 +51,7 @@ def setup(arguments: Arguments) -> Setup:
         number("slot_ms"),
         arguments.choice("bursts") == "true",
         Scheduler(number("peak", 3), credit_ms, grant_ms) if credit_ms or grant_ms else None,
+        since_s,
     )
 
 

@@ -37,6 +37,7 @@ SHORT = {  # by verb: words that make it shorter
     "operator": ["fps_max=5", "page.serve=false"],
     "record": ["duration_s=1.2", "fps_max=5"],
     "simulate": ["duration_s=5"],
+    "tune": ["duration_s=5", "seeds=2", "left_out=shared", "predictions=absent"],
     "model": ["scalings=[1.0]", "bitrates_kbps=[100,400]", "plan=full"],
 }
 STANDS_FOR = {

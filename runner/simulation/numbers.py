@@ -1,0 +1,189 @@
+"""The numbers of the rules of a modes file: how they are named, and values to try in place of those in force."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from enum import StrEnum
+from fractions import Fraction
+from typing import Any, NamedTuple
+
+from runner.configuration.overrides import parse_overrides, sweep
+from runner.configuration.rule_lists import call_rule, find_rule
+from runner.core.model import Mode, ModelError, exact, plain, suggest
+from runner.errors import COMMAND_LINE, ConfigError, Problem
+
+Modes = Mapping[str, Sequence[Mapping[str, Mapping[str, Any]]]]  # as in a modes file: by mode, rules with parameters
+BETWEEN = re.compile(r"\s+(?=[A-Za-z])")  # two words: a list of values may contain blanks
+UNIT = re.compile(r"(?:^|_)(?:s|ms|kbps|m|px)$")  # at the end of a name; a number without one is a share, at most 1
+
+
+class Number(NamedTuple):
+    """A number of the rule at a place of a mode's list.
+
+    given  the rule's parameters in the modes file
+    value  in force; None: the rule has no number here unless one is given
+    """
+
+    mode: str
+    place: int  # in the list, from 0
+    rule: str
+    key: str
+    given: Mapping[str, Any]
+    value: Any
+
+    @property
+    def name(self) -> str:
+        return f"{self.mode}.{self.rule}.{self.key}"
+
+    @property
+    def is_written(self) -> bool:
+        """Whether the modes file states it; otherwise it is the rule's default."""
+        return self.key in self.given
+
+    def check(self, value: Any) -> None:
+        """raises ModelError if the rule does not take the value"""
+        call_rule(self.rule, {**self.given, self.key: value})
+
+    def is_named(self, words: Sequence[str]) -> bool:
+        """Whether it is what the words name, or part of that; the place in the list may be left out."""
+        return any(
+            tuple(words) == path[: len(words)]
+            for path in ((self.mode, self.rule, self.key), (self.mode, str(self.place), self.rule, self.key))
+        )
+
+
+class Trial(NamedTuple):
+    """Another value of a number."""
+
+    number: Number
+    value: Any
+
+    @property
+    def override(self) -> str:
+        """The word of the command line that sets it: rules are addressed by their place in the list, from 0."""
+        number = self.number
+        return f"modes.{number.mode}.{number.place}.{number.rule}.{number.key}={self.value}"
+
+
+def numbers(modes: Modes, driven: Iterable[str]) -> list[Number]:
+    """All numbers of the rules of the modes that are driven."""
+    found = []
+    for mode in driven:
+        for place, entry in enumerate(modes[mode]):
+            ((rule, given),) = entry.items()
+            for key, parameter in find_rule(rule).parameters.items():
+                if not isinstance(parameter.default, StrEnum):
+                    found.append(Number(mode, place, rule, key, given, given.get(key, _default(parameter))))
+    return found
+
+
+def _default(parameter: inspect.Parameter) -> Any:
+    default = parameter.default
+    return plain(default) if isinstance(default, Fraction) else None
+
+
+def trials(vary: str | None, modes: Modes, driven: Sequence[str]) -> tuple[list[Trial], list[str]]:
+    """The values to try, one at a time, and what is not tried, in words.
+
+    vary    words as in `automatic.follow_link.start=[0.25, 1] automatic.hold_while_capped`: a number with its values in
+            Hydra's grammar (also 0.25,1 or range(1,4)); or a number, or all those of a rule or a mode, halved and
+            doubled. None: each number that the modes file states, halved and doubled
+    driven  modes that the drives are in
+    raises  ConfigError with all problems
+    """
+    known = numbers(modes, driven)
+    if vary is None:
+        return _scaled(number for number in known if number.is_written)
+    found: dict[str, Trial] = {}
+    skipped, problems = [], []
+    for word in BETWEEN.split(vary.strip()):
+        try:
+            tried, not_tried = _of_word(word, known, modes, driven)
+        except ConfigError as error:
+            problems += error.problems
+            continue
+        found |= {trial.override: trial for trial in tried if trial.value != trial.number.value}
+        skipped += not_tried
+    if problems:
+        raise ConfigError(problems)
+    return list(found.values()), skipped
+
+
+def _scaled(some: Iterable[Number]) -> tuple[list[Trial], list[str]]:
+    """Half and twice the value in force, where the rule takes it."""
+    found, skipped = [], []
+    for number in some:
+        if number.value:
+            halved, doubled = (plain(exact(number.value) * factor) for factor in (Fraction(1, 2), Fraction(2)))
+            found += [Trial(number, value) for value in (halved, doubled) if _is_allowed(number, value)]
+        else:
+            value = "none" if number.value is None else number.value
+            skipped.append(f"{number.name} is {value}, which cannot be halved and doubled: vary= can give it values")
+    return found, skipped
+
+
+def _is_allowed(number: Number, value: int | float) -> bool:
+    try:
+        number.check(value)
+    except ModelError:
+        return False
+    return value <= 1 or bool(UNIT.search(number.key))
+
+
+def _of_word(word: str, known: Sequence[Number], modes: Modes, driven: Sequence[str]) -> tuple[list[Trial], list[str]]:
+    name, equals, _ = word.partition("=")
+    named = name.removeprefix("modes.").split(".")
+    some = [number for number in known if number.is_named(named)]
+    if not some:
+        raise ConfigError([_problem(name, None, _why_unknown(named, known, modes, driven))])
+    if not equals:
+        return _scaled(some)
+    if named[-1] != some[0].key:
+        raise ConfigError([_problem(name, None, f"names several numbers{suggest('', [one.name for one in some])}")])
+    values = list(_values(word))
+    problems = [problem for number in some for value in values for problem in _wrong(number, value)]
+    if problems:
+        raise ConfigError(problems)
+    return [Trial(number, value) for number in some for value in values], []
+
+
+def _values(word: str) -> Iterator[Any]:
+    """raises ConfigError"""
+    for override in parse_overrides([each for (each,) in sweep([word])]):
+        yield from override.value if isinstance(override.value, list) else [override.value]
+
+
+def _wrong(number: Number, value: Any) -> Iterator[Problem]:
+    try:
+        number.check(value)
+    except ModelError as error:
+        yield _problem(number.name, str(error.found), error.rule)
+
+
+def _problem(name: str, found: str | None, rule: str) -> Problem:
+    return Problem(COMMAND_LINE, f"vary: {name}", found, rule)
+
+
+def _why_unknown(named: Sequence[str], known: Sequence[Number], modes: Modes, driven: Sequence[str]) -> str:
+    """Why words name no number of a rule in force."""
+    mode, *rest = named
+    if mode in driven:
+        return _why_no_number(mode, rest, known, [rule for entry in modes[mode] for rule in entry])
+    if mode in list(Mode):
+        return f"no drive is in mode {mode}: choose it with mode={mode}"
+    return f"must begin with the mode, MODE.RULE.NUMBER{suggest('.'.join(named), [one.name for one in known])}"
+
+
+def _why_no_number(mode: str, named: Sequence[str], known: Sequence[Number], rules: Sequence[str]) -> str:
+    place, *rest = named if named and named[0].isdecimal() else ("", *named)
+    rule, key = (*rest, "", "")[:2]
+    if rule not in rules:
+        return f"mode {mode} has no such rule{suggest(rule, rules)}"
+    if place and rules[int(place) : int(place) + 1] != [rule]:
+        return f"{rule} is entry {rules.index(rule)} of mode {mode}"
+    if key in find_rule(rule).parameters:
+        return "is a word, not a number" if len(rest) == 2 else f"must end with {key}"
+    own = [one.key for one in known if one.rule == rule]
+    return f"{rule} has no such number{suggest(key, own)}" if own else f"{rule} has no numbers"
