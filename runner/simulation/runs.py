@@ -229,13 +229,14 @@ def check(setup: Setup, wanted: Iterable[Job]) -> None:
 
 
 def rules_in_force(setup: Setup, wanted: Iterable[Job]) -> tuple[Mapping[str, Any], list[Mode]]:
-    """The modes file of all drives, and the modes that they are in: as configured, and as an experiment selects.
+    """The modes file of the first drive, and the modes that drives are in: as configured, and as an experiment selects.
 
-    raises  ArgumentError if runs of an experiment follow different rules
+    raises  ArgumentError if runs of an experiment have other rules, not only other numbers
     """
     configs = [_composed(setup, job)[0] for job in wanted]
     files = [config.document["modes"] for config in configs]
-    if any(file != files[0] for file in files):
+    names = [{mode: [list(entry) for entry in file[mode]] for mode in Mode} for file in files]
+    if any(rules != names[0] for rules in names):
         raise ArgumentError("experiment", None, "its runs follow different rules; name the rules and the links instead")
     requests = [request.event for config in configs for request in config.experiment().requests]
     selected = {config.document["mode"] for config in configs}

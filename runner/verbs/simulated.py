@@ -24,16 +24,16 @@ def setup(arguments: Arguments) -> Setup:
     """What all drives have in common."""
     from runner.simulation.drive import Conditions
     from runner.simulation.encoder import EncoderModel
-    from runner.simulation.runs import Scheduler, Setup
+    from runner.simulation.runs import DURATION_S, Scheduler, Setup
 
     def number(key: str, default: float = 0.0) -> float:
         value = arguments.number(key)
         return default if value is None else value
 
     duration_s, since_s = arguments.number("duration_s"), number("since_s", Setup.since_s)
-    if duration_s is not None and duration_s < since_s + SHORTEST_S:
+    if (shown_s := DURATION_S if duration_s is None else duration_s) < since_s + SHORTEST_S:
         rule = f"must be at least {since_s + SHORTEST_S:g}: the first {since_s:g} s do not count"
-        raise ArgumentError("duration_s", f"{duration_s:g}", rule)
+        raise ArgumentError("duration_s", f"{shown_s:g}", rule)
     if (lost := number("report_loss")) > 1:
         raise ArgumentError("report_loss", f"{lost:g}", "must be a share from 0 to 1")
     credit_ms, grant_ms = number("credit_ms"), number("grant_ms")
