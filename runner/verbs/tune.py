@@ -120,7 +120,7 @@ def _table(in_force: Sequence[Means], values: Sequence[Compared]) -> Iterator[st
     for one in values:
         both = zip(one.means, one.differences, strict=True)
         cells = (
-            f"{_number(key, some[key])} {_number(key, changes[key].difference, "+z")}"
+            f"{_number(key, some[key])} {_number(key, changes[key].difference, '+z')}"
             for some, changes in both
             for key in SHOWN
         )
