@@ -160,6 +160,7 @@ def test_the_figure_is_drawn(tmp_path: Path) -> None:
     [
         (["links=saw,handover"], "links: handover: left out: a number that is chosen there cannot be checked there"),
         (["links=step"], "links: step: left out: a number that is chosen there cannot be checked there"),
+        (["left_out=,"], "left_out: ',': must have one name at least"),
         (["seeds=1"], "seeds: 1: must be 2 or more: a difference has to exceed what they spread"),
         (
             ["vary=automatic.total_from_prediction.start_kbps=3000"],

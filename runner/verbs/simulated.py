@@ -105,7 +105,10 @@ def _count(arguments: Arguments, key: str, default: int) -> int:
 
 
 def _list(arguments: Arguments, key: str, default: str) -> list[str]:
-    return [word for word in arguments.values.get(key, default).split(",") if word]
+    found = [word for word in arguments.values.get(key, default).split(",") if word]
+    if not found:
+        raise ArgumentError(key, repr(arguments.values[key]), "must have one name at least")
+    return found
 
 
 def figure(arguments: Arguments) -> Path | None:
