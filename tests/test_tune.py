@@ -6,7 +6,7 @@ import json
 import signal
 import subprocess
 import sys
-from math import nan
+from math import inf, nan
 from pathlib import Path
 
 import pytest
@@ -96,6 +96,8 @@ def test_a_difference_is_that_of_the_same_drives_and_its_spread_that_over_seeds(
     found = differences(results(10, 100, 20, 200, 30, 300), results(13, 99, 22, 202, 32, 304))
     assert found["p95"] == pytest.approx((2.0, 3 / 3**0.5))  # of the seeds: 1, 2, 3
     assert found["use"] == NOTHING
+    unknown = differences(results(10, 100, 20, 200, 30, 300), results(nan, 99, nan, nan, nan, nan))["p95"]
+    assert unknown == (-1.0, inf)  # one seed has a frame to measure
 
 
 @pytest.mark.parametrize(

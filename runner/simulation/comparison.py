@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from math import isfinite, nan, sqrt
+from math import inf, isfinite, nan, sqrt
 from statistics import fmean, stdev
 from typing import Any, NamedTuple
 
@@ -26,7 +26,7 @@ class Difference(NamedTuple):
     """From the value in force to another one, in the unit of a figure.
 
     difference  over all drives, each compared with the same one under the value in force
-    spread      ERRORS standard errors of that, from the means of each seed
+    spread      ERRORS standard errors of that, from the means of each seed; inf: fewer than two have the figure
     """
 
     difference: float
@@ -76,8 +76,8 @@ def _difference(key: str, in_force: Sequence[Result], other: Sequence[Result]) -
     of_seeds: dict[int, list[float]] = {}
     for before, after in zip(in_force, other, strict=True):
         of_seeds.setdefault(after.job.seed, []).append(after.figures[key] - before.figures[key])
-    each = [_mean(values) for values in of_seeds.values()]
-    return Difference(_mean(each), ERRORS * stdev(each) / sqrt(len(each)))
+    each = [mean for values in of_seeds.values() if isfinite(mean := _mean(values))]
+    return Difference(_mean(each), ERRORS * stdev(each) / sqrt(len(each)) if len(each) > 1 else inf)
 
 
 def _mean(values: Sequence[float]) -> float:
