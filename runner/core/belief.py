@@ -175,6 +175,8 @@ def _measure_queue(b: Belief, seen: Evidence) -> Belief:
     lost = sum(of.lost for of in recent)
     # Losses of a queue that was full when its path was first measured look like a policer's, until it drains.
     policer = Policer(usual=b.policer.usual) if seen.shorter_s > GOAL_S else b.policer
+    if seen.backlog and policer.kbps == inf:  # nor does what a stalled link loses count
+        policer = policer._replace(since=b.t)
     b = b._replace(
         policer=policer,
         longer=longer,
