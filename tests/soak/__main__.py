@@ -1,5 +1,5 @@
 """Long repetitions of faults that a drive must survive: signals, stalls, openings, kills, frozen cameras, slow readers,
-new sizes, garbage, reports of any kind, clocks that drift apart, outages with keys, addresses that change, variants of
+new sizes, garbage, reports and links of any kind, clocks that drift apart, outages with keys, addresses that change, variants of
 cameras, bags and players as people own them, and thousands of changes that must leak nothing.
 
     make soak                           everything, about 80 minutes on two cores
@@ -29,6 +29,7 @@ import clocks
 import hostile
 import ip_camera
 import kills
+import links
 import openings
 import outages
 import readers
@@ -84,6 +85,7 @@ PARTS: dict[str, Part] = {
     "sizes": sizes.soak,
     "hostile": hostile.soak,
     "reports": reports.soak,
+    "links": links.soak,
     "clocks": clocks.soak,
     "roaming": roaming.soak,
     "outages": outages.soak,
@@ -92,10 +94,10 @@ PARTS: dict[str, Part] = {
 
 
 ALONE = ("tests",)  # they measure how soon a driver sees something
-# One after the other: reports would leave churn no processor time, and its sides would end as hung.
-SECOND_LANE = ("reports", "clocks", "churn")
+# One after the other: reports and links would leave churn no processor time, and its sides would end as hung.
+SECOND_LANE = ("reports", "links", "clocks", "churn")
 BACKGROUND = str(CHECKOUT / "scripts" / "background")
-BEFORE = {name: [BACKGROUND] for name in ("reports", "churn")}  # they use all the processor time that they get
+BEFORE = {name: [BACKGROUND] for name in ("reports", "links", "churn")}  # they use all the processor time that they get
 
 
 def main(chosen: Sequence[str]) -> int:

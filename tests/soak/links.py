@@ -22,7 +22,7 @@ from runner.simulation.queues import RateQueue
 from runner.simulation.steps import Steps
 
 LINKS, BATCH = 10_000, 100
-STEADY_S, LOSSY_S, AT_LEAST = 10.0, 20.0, 0.8  # from a steady rate on, until the total is at this share of it
+STEADY_S, LOSSY_S, AT_LEAST = 10.0, 25.0, 0.8  # from a steady rate on, until the total is at this share of it
 MEAN_S = 2.0  # over which the total is averaged then
 NARROWEST_KBPS, MOST_KBPS = 200.0, 33_000.0
 PACKET = 1200
@@ -67,7 +67,7 @@ class Drive:
         self.cameras, self.fps = rng.randrange(1, 9), rng.choice((10, 15, 30))
         self.well_s = rng.uniform(2, 20)
         self.lossy = rng.choice((0.0, 0.0, rng.uniform(0, 0.1)))
-        self.end_s = self.well_s + (LOSSY_S if self.lossy else STEADY_S)
+        self.end_s = self.well_s + STEADY_S
         self.kbps = math.exp(rng.uniform(math.log(NARROWEST_KBPS), math.log(12_000)))
         times = [0.0, *sorted(rng.uniform(0, self.well_s) for _ in range(rng.randrange(12))), self.well_s]
         rates = [rng.choice((0.0, math.exp(rng.uniform(2, 10)))) for _ in times[:-1]] + [self.kbps]
@@ -115,6 +115,8 @@ class Drive:
             known = belief.decide(known, t, seen.silent_s if seen else 0.0)
             total = known.total
             self.decided.append((t, total))
+            if known.policer.kbps < math.inf and t > self.well_s:
+                self.end_s = self.well_s + LOSSY_S
             yield t, total
             report_at += belief.REPORT_S
 
