@@ -17,7 +17,7 @@ import msgspec
 from msgspec import UNSET, UnsetType
 
 from runner.core.commands import Command, KnobValues
-from runner.core.decision import Decision, Setting
+from runner.core.decision import Believed, Decision, Setting
 from runner.core.events import Attention, PositionReported
 from runner.core.model import Mode, Roi, plain
 
@@ -67,7 +67,10 @@ class CameraDecision:
 
 @dataclass(frozen=True, slots=True)
 class DecisionMade:
-    """Log line: a decision, its cause, and the resulting commands."""
+    """Log line: a decision, its cause, and the resulting commands.
+
+    believed  absent: no rule believes anything of the uplink
+    """
 
     t: float
     cause: str
@@ -75,12 +78,14 @@ class DecisionMade:
     total_kbps: Number
     cameras: Mapping[str, CameraDecision]
     commands: list[Json]
+    believed: Believed | UnsetType = UNSET
 
     @classmethod
     def of(cls, t: float, cause: str, decision: Decision, commands: tuple[Command, ...]) -> DecisionMade:
         cameras = {name: CameraDecision.of(setting) for name, setting in decision.settings.items()}
         turned = [command.to_json() for command in commands]
-        return cls(t, cause, decision.mode, plain(decision.total), cameras, turned)
+        believed = decision.believed or UNSET
+        return cls(t, cause, decision.mode, plain(decision.total), cameras, turned, believed)
 
 
 # --- from the vehicle -------------------------------------------------------------------------------------------------
@@ -131,6 +136,7 @@ class VehicleState:
     attention   of the driver; absent: the operator in control states none
     operator    id of the operator in control; absent: none
     certificate_ends  when the certificate of the vehicle expires, s since 1970; absent: it has none
+    believed    of the uplink; absent: nothing
     """
 
     t: float = field(compare=False)
@@ -144,6 +150,7 @@ class VehicleState:
     attention: Attention | UnsetType = UNSET
     operator: str | UnsetType = UNSET
     certificate_ends: float | UnsetType = UNSET
+    believed: Believed | UnsetType = UNSET
 
     @property
     def total_words(self) -> str:
@@ -640,7 +647,8 @@ _BY_KIND: dict[str, type[Any]] = {name: kind for kind, name in KINDS.items() if 
 def decision_to_json(decision: Decision) -> Json:
     """The JSON object of a decision; without an intermediate record, since a replay writes thousands per second."""
     cameras = {name: _decided(setting) | {"roi": setting.roi.to_json()} for name, setting in decision.settings.items()}
-    return {"mode": decision.mode, "total_kbps": plain(decision.total), "cameras": cameras}
+    document = {"mode": decision.mode, "total_kbps": plain(decision.total), "cameras": cameras}
+    return document if decision.believed is None else {**document, "believed": to_json(decision.believed)}
 
 
 def applied_to_json(camera: str, knobs: KnobValues) -> Applied:

@@ -40,11 +40,33 @@ class Setting:
 
 
 @dataclass(frozen=True, slots=True)
+class Believed:
+    """What is believed of the uplink, and what predictions of it have proved to be worth; see `runner.core.belief`.
+
+    kbps          capacity, kbit/s of video, as predictions are
+    deviation     of ln(kbps)
+    margin        ln, by which less is sent
+    bias, error   mean of ln(capacity / prediction) of the last seconds, and the deviation from it; None: not known yet
+    gain          share of a prediction's change that comes true, 0 to 1; None: it has not changed enough to know
+    policer_kbps  rate above which the link drops packets, kbit/s of video; None: none was found
+    """
+
+    kbps: int
+    deviation: float
+    margin: float
+    bias: float | None = None
+    error: float | None = None
+    gain: float | None = None
+    policer_kbps: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class Decision:
     """What is in force: the mode, its total before the cap at demand, and a setting for each camera.
 
     asked     kbit/s of the prediction or the operator, before later rules lowered it; ignored in comparisons
     uncapped  kbit/s, the total without the limit of the measured link; ignored in comparisons
+    believed  of the uplink; None: no rule believes anything, or no operator measures it; ignored in comparisons
     """
 
     mode: Mode
@@ -52,10 +74,12 @@ class Decision:
     settings: Mapping[str, Setting]
     asked: Kbps = field(default=Fraction(0), compare=False)
     uncapped: Kbps = field(default=Fraction(0), compare=False)
+    believed: Believed | None = field(default=None, compare=False)
 
     def equals_with_reasons(self, other: Decision) -> bool:
         """Whether it is equal and for the same reasons."""
-        return self == other and all(s.reason == other.settings[name].reason for name, s in self.settings.items())
+        is_same = self == other and self.believed == other.believed
+        return is_same and all(s.reason == other.settings[name].reason for name, s in self.settings.items())
 
 
 class Draft(NamedTuple):
@@ -69,6 +93,7 @@ class Draft(NamedTuple):
     uncapped   kbit/s, the total before the measured link lowered it; None: not lowered
     sized_for  total for which picture sizes are chosen, kbit/s; None: the actual total
     sending    False stops all cameras, whatever their bitrate
+    believed   of the uplink; None: nothing
     notes      reasons that concern all cameras
     reasons    reason by camera
     """
@@ -81,6 +106,7 @@ class Draft(NamedTuple):
     uncapped: Kbps | None = None
     sized_for: Kbps | None = None
     sending: bool = True
+    believed: Believed | None = None
     notes: tuple[str, ...] = ()
     reasons: Mapping[str, str] = NOTHING
 

@@ -22,6 +22,7 @@ class Learned(NamedTuple):
     bias, error    mean of x - ln and variance about it
     sxx, sxy       sums of the regression of the changes of x on those of ln
     past           earlier predictions
+    compared_s     for how long predictions have been compared with what came
     """
 
     ln: float | None = None
@@ -30,6 +31,17 @@ class Learned(NamedTuple):
     sxx: float = PRIOR
     sxy: float = PRIOR
     past: History[float | None] = ()
+    compared_s: float = 0.0
+
+    @property
+    def is_level_known(self) -> bool:
+        """Whether bias and error are those of predictions, more than what they were at first."""
+        return self.compared_s >= MEMORY_S
+
+    @property
+    def is_gain_known(self) -> bool:
+        """Whether changes that were compared weigh more than what was assumed of them."""
+        return self.sxx > 2 * PRIOR
 
     @property
     def gain(self) -> float:
@@ -64,4 +76,5 @@ class Learned(NamedTuple):
         seen = value_at(self.past, t - HORIZON_S / 2)  # what is measured now was served about then
         off = now - (p1 if seen is None else seen) - self.bias
         error = self.error + k * (min(1.0, off * off) - self.error)
-        return self._replace(sxx=sxx, sxy=sxy, bias=self.bias + k * off, error=error)
+        compared_s = self.compared_s + dt
+        return self._replace(sxx=sxx, sxy=sxy, bias=self.bias + k * off, error=error, compared_s=compared_s)

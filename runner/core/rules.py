@@ -13,14 +13,14 @@ from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 from fractions import Fraction
 from functools import cache
-from math import ceil, inf, isfinite
+from math import ceil, inf, isfinite, sqrt
 from typing import Any
 
 from runner.core import allocation, link_cap, scaling
 from runner.core import belief as uplink_belief
 from runner.core.belief import Belief
 from runner.core.budget import video_kbps, wire_kbps
-from runner.core.decision import Decision, Draft, Setting
+from runner.core.decision import Believed, Decision, Draft, Setting
 from runner.core.events import LinkMeasured
 from runner.core.evidence import Evidence
 from runner.core.link_memory import LEAST, UNCAPPED, LinkCap
@@ -496,10 +496,12 @@ def follow_link(
     carried = video_kbps(cameras, max(_least(cameras), exact(round(belief.total, 1)) - reserve_kbps))
     total = _tenths(min(carried, draft.total) if limit < inf else carried)
     memory = {**memory, "follow_link": belief}
-    if total == draft.total:
-        return draft.replaced(measured=True), memory
-    note = f"total {_short(draft.total)} -> {_short(total)}: {_why_believed(belief, evidence)}"
-    return draft.noted(note, total=total, measured=True, uncapped=max(draft.total, total)), memory
+    believed, before = _believed(belief, cameras), draft.total
+    draft = draft.replaced(measured=True, believed=believed)
+    if total == before:
+        return draft, memory
+    note = f"total {_short(before)} -> {_short(total)}: {_why_believed(believed, evidence)}"
+    return draft.noted(note, total=total, uncapped=max(before, total)), memory
 
 
 def _unmeasured(
@@ -531,10 +533,29 @@ def _unmeasured(
     return draft.noted(f"total {_short(before)} -> {_short(total)}: {why}", total=_tenths(total), uncapped=before)
 
 
-def _why_believed(belief: Belief, evidence: Evidence) -> str:
+def _believed(belief: Belief, cameras: tuple[Camera, ...]) -> Believed:
+    """As it is stated: for video, rounded."""
+    learned, policer = belief.learned, belief.policer
+
+    def video(wire: float) -> int:
+        return int(video_kbps(cameras, Fraction(int(wire))))
+
+    is_level_known = learned.ln is not None and learned.is_level_known
+    return Believed(
+        kbps=video(belief.kbps),
+        deviation=round(sqrt(belief.v), 2),
+        margin=round(belief.margin, 2),
+        bias=round(learned.bias, 2) if is_level_known else None,
+        error=round(sqrt(learned.error), 2) if is_level_known else None,
+        gain=round(learned.gain, 2) if learned.ln is not None and learned.is_gain_known else None,
+        policer_kbps=video(policer.kbps) if policer.proven else None,
+    )
+
+
+def _why_believed(believed: Believed, evidence: Evidence) -> str:
     if evidence.silent_s:
         return f"nothing has arrived for {evidence.silent_s:.1f} s"
-    return f"capacity of the link, believed to be {belief.kbps:.0f}"
+    return f"capacity of the link, believed to be {believed.kbps}"
 
 
 def _of_every_copy(state: State, evidence: Evidence) -> Evidence:
@@ -748,11 +769,15 @@ def decide(vehicle: Vehicle, state: State, memory: Memory) -> tuple[Decision, Me
         asked = draft.total if asked is None else asked
     assert draft.total is not None and asked is not None
     settings = _settings(
-        vehicle, state.on, state.lost, state.rois, draft._replace(total=None, uncapped=None, measured=False)
+        vehicle,
+        state.on,
+        state.lost,
+        state.rois,
+        draft._replace(total=None, uncapped=None, measured=False, believed=None),
     )
     # Without a prediction there is only the measurement, so the total without it is unknown.
     uncapped = draft.total if draft.uncapped is None or draft.measured else draft.uncapped
-    return Decision(state.mode, draft.total, settings, asked, uncapped), memory
+    return Decision(state.mode, draft.total, settings, asked, uncapped, draft.believed), memory
 
 
 def decide_without_link(vehicle: Vehicle, state: State, memory: Memory) -> Decision:

@@ -54,6 +54,11 @@ def _ms(value: float | None) -> float | None:
     return None if value is None else value / 1000
 
 
+def _believed(key: str) -> Reading:
+    """Of a vehicle's state, a value of what it believes of the uplink; None: nothing is believed, or it is not known."""
+    return lambda state: getattr(state.believed, key, None)
+
+
 # By record, metrics of the whole vehicle, and of each camera. A name that ends in _total is a counter.
 METRICS: dict[type, tuple[tuple[_Metric, ...], tuple[_Metric, ...]]] = {
     VehicleState: (
@@ -65,6 +70,12 @@ METRICS: dict[type, tuple[tuple[_Metric, ...], tuple[_Metric, ...]]] = {
                 lambda s: s.asked_kbps,
             ),
             _Metric("rules_failing", "1 while the rules cannot decide", lambda s: s.fault is not None),
+            _Metric("believed_kbps", "Capacity that the uplink is believed to have", _believed("kbps")),
+            _Metric("believed_margin", "By how much less is sent, as a difference of ln", _believed("margin")),
+            _Metric("policer_kbps", "Rate above which the uplink drops packets", _believed("policer_kbps")),
+            _Metric("prediction_bias", "Mean of ln(capacity / prediction) of the last seconds", _believed("bias")),
+            _Metric("prediction_error", "Standard deviation of ln(capacity / prediction)", _believed("error")),
+            _Metric("prediction_gain", "Share of a prediction's change that comes true", _believed("gain")),
         ),
         (
             _Metric("camera_decided_kbps", "Bitrate of the encoder", lambda c: c.kbps),

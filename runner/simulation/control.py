@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 
+from msgspec import UNSET
+
 from runner.core.decision import Decision
 from runner.core.model import Vehicle, plain
 from runner.core.step import Run
@@ -56,7 +58,8 @@ def vehicle_state(run: Run, t: float, cause: str) -> VehicleState:
         for name, setting in decision.settings.items()
     }
     total, asked = plain(decision.total), plain(decision.asked)
-    return VehicleState(t, cause, decision.mode, total, cameras, asked_kbps=asked)
+    believed = decision.believed or UNSET
+    return VehicleState(t, cause, decision.mode, total, cameras, asked_kbps=asked, believed=believed)
 
 
 def segments(size: int) -> Iterator[int]:

@@ -528,7 +528,7 @@ class ControlLoop:
         self._pending = [pending for pending in self._pending if not self._answered(pending, applied)]
 
     def _is_news(self, state: VehicleState) -> bool:
-        """Whether to publish a state. Changed reasons alone, such as one with a running time, are not urgent."""
+        """Whether to publish a state. Changed reasons or beliefs alone, which change all the time, are not urgent."""
         last = self._published
         if last is None or self._publish_again:
             return True
@@ -555,10 +555,15 @@ class ControlLoop:
         }
         fault = self._run.fault
         total, asked = plain(decision.total), plain(decision.asked)
-        attention, operator = self._run.state.attention or UNSET, self._in_control or UNSET
         decided = (decision.mode, total, cameras, fault)
         return VehicleState(
-            self._now(), self._cause, *decided, asked_kbps=asked, attention=attention, operator=operator
+            self._now(),
+            self._cause,
+            *decided,
+            asked_kbps=asked,
+            attention=self._run.state.attention or UNSET,
+            operator=self._in_control or UNSET,
+            believed=decision.believed or UNSET,
         )
 
     def _answered(self, pending: _PendingReply, applied: Mapping[str, KnobValues]) -> bool:
@@ -611,4 +616,5 @@ def _totals(report: ReceptionReport) -> ReceptionReport:
 
 
 def _without_reasons(state: VehicleState) -> VehicleState:
-    return replace(state, cameras={name: replace(camera, reason="") for name, camera in state.cameras.items()})
+    cameras = {name: replace(camera, reason="") for name, camera in state.cameras.items()}
+    return replace(state, cameras=cameras, believed=UNSET)

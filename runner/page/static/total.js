@@ -3,6 +3,7 @@
 import { inControl, listen, mode, store } from "./store.js";
 import { pending, request, showProblem, whyNoControl } from "./requests.js";
 import { makeSlider } from "./slider.js";
+import { believedWords } from "./believed.js";
 import { byId, make, setText, whole } from "./format.js";
 
 const WHY = {
@@ -14,6 +15,7 @@ const figure = make("b", { class: "large" });
 const requested = make("span", { class: "muted" }); // the total before rules lowered it
 const prediction = make("b", { class: "large" });
 const why = make("p", { class: "why" });
+const believed = make("p", { class: "why", id: "believed" });
 const slider = makeSlider({
   label: "total bitrate",
   data: "total",
@@ -53,6 +55,9 @@ function refresh() {
   setText(requested, isLimited ? ` of ${whole(wanted)}` : "");
   setText(prediction, whole(store.sample?.predicted_kbps));
   setText(why, isLimited ? limitReasons().join("; ") || "limited by a rule" : reason ?? "shared among the cameras by demand and weight");
+  const words = believedWords(mode() ? store.state?.believed : undefined);
+  setText(believed, words);
+  believed.hidden = !words;
   slider.update({ value: wanted, max: maxTotal(), why: reason });
 }
 
@@ -70,7 +75,7 @@ function commonReasons(beginning) {
 export function startTotal() {
   const predicted = make("div", { class: "prediction" }, make("span", {}, "Prediction "), prediction, make("span", { class: "muted" }, " kbit/s"));
   const inForce = make("div", {}, make("span", {}, "Total "), figure, requested, make("span", { class: "muted" }, " kbit/s"));
-  byId("total-panel").append(make("div", { class: "figures" }, inForce, predicted), slider.element, why);
+  byId("total-panel").append(make("div", { class: "figures" }, inForce, predicted), slider.element, why, believed);
   listen("hello state sample control requests socket", refresh);
   refresh();
 }
