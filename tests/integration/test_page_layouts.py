@@ -35,6 +35,7 @@ from browser import (
 from rig import SMALL_ROBOT, WAIT_S, answers, free_port, needs_browser, passes, process
 from runner.configuration.config import configuration
 from runner.configuration.layout import HEADER, NOWHERE, Layouts
+from runner.core.decision import Believed
 from runner.core.events import parse
 from runner.core.model import plain
 from runner.core.step import start, step
@@ -60,6 +61,7 @@ image = pytest.importorskip("PIL.Image")
 WORDS = ("source=test", "modes=paper", "fps_max=1")  # as the page knows it; pictures are sent more often
 CAMERAS = ("front", "rear", "mast")
 EVERY_S = 0.3
+BELIEVED = Believed(31999, 0.1, 0.2, -0.44, 0.35, 0.31)  # in as many words as it gets
 
 
 class Station(SimpleNamespace):
@@ -71,7 +73,7 @@ class Station(SimpleNamespace):
             name: CameraState.at(setting, 1, applied_to_json(name, run.commanded[name]), None)
             for name, setting in run.decision.settings.items()
         }
-        state = VehicleState(1.0, "", run.decision.mode, plain(run.decision.total), cameras)
+        state = VehicleState(1.0, "", run.decision.mode, plain(run.decision.total), cameras, believed=BELIEVED)
         own = {"user": "anna", "answer_s": 1.0, "link_state": LinkState()}
         super().__init__(state=state, note=print, attention=None, requests=[], seen=[], **own)
 

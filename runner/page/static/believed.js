@@ -12,28 +12,26 @@ const rounded = (share, step = STEP) => step * Math.round((100 * share) / step);
 const about = (kbps) => Number(kbps.toPrecision(2));
 
 /**
- * The link carries about 2400 kbit/s, 10 % of it kept free. Predictions here are 20 % too high.
+ * Link: about 2400 kbit/s, 10 % kept free. Predictions here are 20 % too high.
  * @param {import("./store.js").Believed|undefined} believed
  * @returns {string} "" while too little is known
  */
 export function believedWords(believed) {
-  return believed ? [linkWords(believed), policerWords(believed), predictionWords(believed)].filter(Boolean).join(" ") : "";
+  return believed ? [linkWords(believed), predictionWords(believed)].filter(Boolean).join(" ") : "";
 }
 
-function linkWords({ kbps, deviation, margin }) {
-  if (deviation > SURE) return "";
-  return `The link carries about ${about(kbps)} kbit/s, ${rounded(1 - Math.exp(-margin))} % of it kept free.`;
+function linkWords({ kbps, deviation, margin, policer_kbps }) {
+  if (policer_kbps !== null) return `Link: drops what exceeds ${about(policer_kbps)} kbit/s.`;
+  return deviation > SURE ? "" : `Link: about ${about(kbps)} kbit/s, ${rounded(1 - Math.exp(-margin))} % kept free.`;
 }
-
-const policerWords = ({ policer_kbps }) => (policer_kbps === null ? "" : `The network drops what exceeds ${about(policer_kbps)} kbit/s.`);
 
 function predictionWords({ bias, error, gain }) {
   if (bias === null) return "";
   const off = rounded(Math.exp(-bias) - 1);
   const scatter = rounded(error);
-  const give = scatter >= SCATTER ? `, give or take ${scatter} %` : "";
-  const level = off ? `${Math.abs(off)} % too ${off > 0 ? "high" : "low"}` : give ? "right on average" : "right";
-  return `Predictions here are ${level}${give}${gain === null ? "" : `; their changes ${changeWords(rounded(gain))}`}.`;
+  const give = scatter >= SCATTER ? ` ± ${scatter} %` : "";
+  const level = off ? `${Math.abs(off)} % too ${off > 0 ? "high" : "low"}` : "right";
+  return `Predictions here are ${level}${give}${gain === null ? "" : `, changes ${changeWords(rounded(gain))}`}.`;
 }
 
 const changeWords = (share) => (share >= TRUE ? "come true" : share <= UNTRUE ? "do not come true" : `come true to ${share} %`);

@@ -54,11 +54,16 @@ function refresh() {
   setText(figure, whole(total));
   setText(requested, isLimited ? ` of ${whole(wanted)}` : "");
   setText(prediction, whole(store.sample?.predicted_kbps));
-  setText(why, isLimited ? limitReasons().join("; ") || "limited by a rule" : reason ?? "shared among the cameras by demand and weight");
   const words = believedWords(mode() ? store.state?.believed : undefined);
-  setText(believed, words);
-  believed.hidden = !words;
+  const unlimited = mode() === "automatic" && words ? "" : reason ?? "shared among the cameras by demand and weight";
+  show(why, isLimited ? limitReasons().join("; ") || "limited by a rule" : unlimited);
+  show(believed, words);
   slider.update({ value: wanted, max: maxTotal(), why: reason });
+}
+
+function show(line, text) {
+  setText(line, text);
+  line.hidden = !text;
 }
 
 /** Why the total is limited. */
