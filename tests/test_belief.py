@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import inf, isfinite
+from math import exp, inf, isfinite
 from pathlib import Path
 
 import pytest
@@ -108,6 +108,17 @@ def test_a_level_that_is_wrong_is_corrected() -> None:
     m, v = known.followed(8.7, 0.01, 8.1)
     assert m == pytest.approx(8.8, abs=0.03)
     assert v < 0.02  # how far it moved is uncertain
+
+
+def test_what_a_source_states_of_its_predictions_holds_until_they_have_been_compared() -> None:
+    b = belief.begin(0.0, 1500, 30_000, 3000, bias=0.2, error=0.1)
+    assert (b.kbps, b.v) == (pytest.approx(3000 * exp(0.2)), pytest.approx(0.01))
+    later = belief.predict(belief.begin(0.0, 1500, 30_000, None), 1.0, 3000, bias=0.2, error=0.1)
+    assert (later.learned.bias, later.learned.error) == (0.2, pytest.approx(0.01))
+    known = learn([(0.0, 0.0)] * 40, level=0.7)
+    assert known.starting(0.2, 0.1) == known
+    assert known.is_level_known
+    assert not known.is_gain_known, "no prediction has changed"
 
 
 # --- policers ---------------------------------------------------------------------------------------------------------

@@ -30,6 +30,32 @@ def test_a_square_holds_the_percentile_of_its_samples() -> None:
     assert cells([*here], 0, 10)[0].kbps == 1000 and cells([*here], 100, 10)[0].kbps == 1099
 
 
+def test_a_square_states_how_far_its_rate_is_from_the_truth() -> None:
+    """One pass says little: the error of what nobody has checked counts as another. Each later pass says as much."""
+    once = [CapacitySample(52.0, 11.0, 1000 * np.exp(off), t) for t, off in enumerate((-0.1, 0.1))]
+    (cell,) = cells(once, 0, 10)
+    assert (cell.bias, cell.error) == (pytest.approx(0.1), pytest.approx(np.sqrt((0.35**2 + 0.1**2) / 2)))
+    often = [sample._replace(t=sample.t + 60 * n) for n in range(9) for sample in once]
+    (cell,) = cells(often, 0, 10)
+    assert (cell.bias, cell.error) == (pytest.approx(0.1), pytest.approx(np.sqrt((0.35**2 + 9 * 0.1**2) / 10)))
+
+
+def test_what_was_believed_counts_while_it_was_sure_and_below_what_cameras_can_use(tmp_path: Path) -> None:
+    def change(side: str, lines: Lines) -> Lines:
+        for line in (each for each in lines if each.get("log") == "decision"):
+            t = line["t"]
+            kbps, deviation = (90_000 if t < 5 else 2000), (0.5 if 8 <= t < 10 else 0.1)
+            line["believed"] = {"kbps": kbps, "deviation": deviation, "margin": 0.05, "bias": None, "error": None}
+            line["believed"] |= {"gain": None, "policer_kbps": None}
+        return lines
+
+    drive = series(read_drive(write_drive(tmp_path / "drive", ["vehicle"], seconds=20, change=change)))
+    found = limited_samples(drive)
+    assert {sample.kbps for sample in found} == {2000}
+    assert len(found) > 40
+    assert not any(sample.t < 5 or 8.5 < sample.t < 9.9 for sample in found)
+
+
 def test_squares_are_square_at_every_latitude_and_across_the_180th_meridian() -> None:
     for lat in (0.0, 60.0, -75.0):
         east = np.degrees(100 / 6378137.0) / np.cos(np.radians(lat))

@@ -17,6 +17,7 @@ EXAMPLES: list[dict[str, Any]] = [
     {"t": 0.0, "event": "mode_selected", "mode": "automatic"},
     {"t": 0.1, "event": "bitrate_predicted", "kbps": 3000},
     {"t": 0.1, "event": "bitrate_predicted", "kbps": 3000.5, "lower_kbps": 100, "valid_s": 2},
+    {"t": 0.1, "event": "bitrate_predicted", "kbps": 3000, "bias": 0.2, "error": 0.1},
     {"t": 0.2, "event": "position_reported", "lat": 48.26, "lon": 11.66, "speed_mps": 8.3, "heading_deg": 90},
     {"t": 0.2, "event": "position_reported", "lat": -90, "lon": -180},
     {"t": 0.2, "event": "steering_reported", "rad": -0.35},

@@ -100,6 +100,17 @@ def test_grid_equals_brute_force(seed: int, count: int, centre: Any, sizes_m: An
         assert points.lowest(way) == brute_force(np.column_stack([lat, lon]), rates, radius_m, way)
 
 
+def test_a_map_states_how_far_its_lowest_point_is_from_the_truth(tmp_path: Path) -> None:
+    (tmp_path / "map.csv").write_text(
+        "lon,lat,kbps,bias,error\n11,48,900,0.3,0.2\n11,48,3000,0,0.1\n12,48,5000,0,0.1\n"
+    )
+    settings = {"kind": "map", "file": "map.csv", "radius_m": 10, "look_ahead_s": 0, "off_map_kbps": 500}
+    pqos = build_pqos(settings, [tmp_path])
+    here, elsewhere = (pqos.observe(PositionReported(t=0, lat=48, lon=lon)) for lon in (11, 13))
+    assert here and (here.kbps, here.bias, here.error) == (900, 0.3, 0.2)
+    assert elsewhere and (elsewhere.kbps, elsewhere.bias, elsewhere.error) == (500, None, None)
+
+
 def test_map_over_degrees_keeps_its_radius() -> None:
     """A point 9.9 m east is near and one 10.1 m east is not, at every latitude of one map."""
     lats = np.arange(-80.0, 81.0, 10.0)

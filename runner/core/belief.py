@@ -106,21 +106,24 @@ class Belief(NamedTuple):
         return exp(self.m)
 
 
-def begin(t: float, start: float, most: float, prediction: float | None) -> Belief:
+def begin(
+    t: float, start: float, most: float, prediction: float | None, bias: float = 0.0, error: float = WRONG
+) -> Belief:
     """Before the first report.
 
-    start       kbit/s that are sent until then
-    prediction  kbit/s; None: there is none
+    start        kbit/s that are sent until then
+    prediction   kbit/s; None: there is none
+    bias, error  of predictions, as their source states them: mean and deviation of ln(capacity / prediction)
     """
     ln = None if prediction is None else _ln(prediction, most)
-    m, v = (log(max(LOWEST, start)), 1.0) if ln is None else (ln, WRONG**2)
-    learned = Learned(ln).stated(t, ln)
+    m, v = (log(max(LOWEST, start)), 1.0) if ln is None else (min(log(most), ln + bias), error * error)
+    learned = Learned(ln).starting(bias, error).stated(t, ln)
     return Belief(t, t, m, v, most, start, learned, best=m, reported=t, observed=t, waited=t)
 
 
-def predict(b: Belief, t: float, prediction: float | None) -> Belief:
-    """After a prediction for t, kbit/s; None: there is none, or it is too old."""
-    ln, known = None if prediction is None else _ln(prediction, b.most), b.learned
+def predict(b: Belief, t: float, prediction: float | None, bias: float = 0.0, error: float = WRONG) -> Belief:
+    """After a prediction for t, kbit/s; None: there is none, or it is too old. Others as for `begin`."""
+    ln, known = None if prediction is None else _ln(prediction, b.most), b.learned.starting(bias, error)
     if ln is not None and known.ln is not None and ln != known.ln:
         m, v = known.followed(b.m, b.v, ln)
         step = min(log(b.most), m) - b.m

@@ -35,11 +35,14 @@ class BitratePredicted(_Event):
     kbps        the prediction
     lower_kbps  likely lower bound, if the source knows it
     valid_s     how long it may be used, if the source knows it
+    bias, error mean of ln(capacity / kbps), and the deviation from it, if the source knows them
     """
 
     kbps: Kbps
     lower_kbps: Kbps | None = None
     valid_s: float | None = None
+    bias: float | None = None
+    error: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

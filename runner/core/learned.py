@@ -48,6 +48,10 @@ class Learned(NamedTuple):
         """Share of a change that comes true, 0 to 1."""
         return min(1.0, max(0.0, self.sxy / self.sxx))
 
+    def starting(self, bias: float, error: float) -> Learned:
+        """With what the source of predictions states of them, until they have been compared with what came."""
+        return self if self.compared_s else self._replace(bias=bias, error=error * error)
+
     def followed(self, m: float, v: float, ln: float) -> tuple[float, float]:
         """A belief's mean and variance after the prediction has changed to `ln`: news of a change, and of a level.
 

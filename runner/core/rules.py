@@ -23,6 +23,7 @@ from runner.core.budget import video_kbps, wire_kbps
 from runner.core.decision import Believed, Decision, Draft, Setting
 from runner.core.events import LinkMeasured
 from runner.core.evidence import Evidence
+from runner.core.learned import WRONG
 from runner.core.link_memory import LEAST, UNCAPPED, LinkCap
 from runner.core.model import Camera, Kbps, Mode, Roi, Vehicle, exact, least_float, plain
 from runner.core.state import State
@@ -478,14 +479,16 @@ def follow_link(
     is_measured = link is not None and state.t - link.t < link_cap.START_S
     if not cameras or state.operator_since is None or link is None or evidence is None or not is_measured:
         return _unmeasured(state, draft, start, after_s, halve_every_s, floor_kbps), memory
-    predicted = None
+    predicted, bias, error = None, 0.0, WRONG
     most = float(wire_kbps(cameras, _of_all(state, _wanted(vehicle, state, draft))))
     if state.mode is Mode.AUTOMATIC and state.prediction is not None and not _is_stale(state, after_s):
         predicted = float(wire_kbps(cameras, state.prediction.kbps))
+        bias = state.prediction.bias or 0.0
+        error = WRONG if state.prediction.error is None else state.prediction.error
     if belief is None or belief.since != state.operator_since:
         first = float(wire_kbps(cameras, draft.total))
-        belief = uplink_belief.begin(state.operator_since, first * float(start), most, predicted)
-    belief = uplink_belief.predict(belief._replace(most=most), state.t, predicted)
+        belief = uplink_belief.begin(state.operator_since, first * float(start), most, predicted, bias, error)
+    belief = uplink_belief.predict(belief._replace(most=most), state.t, predicted, bias, error)
     if link.t > belief.reported:
         belief = uplink_belief.observe(belief, link.t, _of_every_copy(state, evidence), (link.rtt_ms or 0.0) / 1000)
     limit = inf

@@ -1,8 +1,9 @@
-"""A bandwidth map from drives: the received rate wherever the link was the bottleneck. Pure.
+"""A bandwidth map from drives: what the link was believed to carry, and how far that varied. Pure.
 
-The received rate shows the capacity of a link only while more than that is sent; at all other times it shows how much
-was sent. A sample counts if packets were lost or frames queued during its second, the measured link limited the total,
-and neither machine was held up, which delays frames as a link does: its rate is then the capacity.
+In drives without a belief about the link, the received rate wherever the link was the bottleneck: it shows the
+capacity only while more than that is sent; at all other times it shows how much was sent. A sample counts if packets
+were lost or frames queued during its second, the measured link limited the total, and neither machine was held up,
+which delays frames as a link does: its rate is then the capacity.
 """
 
 from __future__ import annotations
@@ -12,34 +13,47 @@ from typing import NamedTuple
 
 import numpy as np
 
-from runner.drive.series import Flags, FloatSeries, Positions, Series, held
+from runner.core.learned import WRONG
+from runner.drive.series import BelievedSeries, Flags, FloatSeries, Positions, Series, TimeSeries, held
 from runner.pqos.bandwidth_map import offset
 
 WINDOW_S = 1.0  # over which the rates of the samples are measured
 QUEUED_MS = 50.0  # above the lowest latency of the drive: the queue in front of the link was filling
 AFTER_S = 0.5  # after a side was held up: what had piled up is delivered
 GAP_S = 2.0  # positions further apart say nothing about the time between
+SURE = 0.2  # deviation, ln, of a belief that counts: there was evidence in the last second
+EVERY_S = 0.25  # between two samples of a belief
+AGAIN_S = 10.0  # a square that is entered again after this time has been passed twice
+LEAST_ERROR = 0.01  # as schemas/event.schema.json
 
 
 class CapacitySample(NamedTuple):
-    """Capacity of the link at a place: degrees, kbit/s of encoded video."""
+    """Capacity of the link at a place: degrees, kbit/s of encoded video, s since the drive began."""
 
     lat: float
     lon: float
     kbps: float
+    t: float = 0.0
 
 
 class Cell(NamedTuple):
-    """A square of the ground: mean position of its samples, a percentile of their rates (kbit/s), and their number."""
+    """A square of the ground: mean position of its samples, a percentile of their rates (kbit/s), and their number.
+
+    bias, error  mean of ln(rate / that percentile), and the deviation from it that is to be expected
+    """
 
     lat: float
     lon: float
     kbps: float
     samples: int
+    bias: float
+    error: float
 
 
 def capacity_problem(drive: Series) -> str | None:
     """Why a drive does not show the capacity of the link; None if it does."""
+    if drive.believed:
+        return None if drive.positions else "has no positions"
     if not any(camera.received for camera in drive.cameras.values()):
         return "has no operator's log"
     if not drive.measured_t.size:
@@ -47,19 +61,42 @@ def capacity_problem(drive: Series) -> str | None:
     return None if drive.positions else "has no positions"
 
 
+def sample_times(drive: Series) -> FloatSeries:
+    """When the capacity of the link may have been known, s."""
+    return np.arange(0.0, drive.end, EVERY_S) if drive.believed else drive.actual.t
+
+
 def limited_samples(drive: Series) -> list[CapacitySample]:
-    """The samples of a drive in which the link was the limit; none if they cannot be determined."""
+    """The samples of a drive in which the capacity of the link was known; none if they cannot be determined."""
     if capacity_problem(drive) or drive.positions is None:
         return []
+    if drive.believed:
+        return _believed_samples(drive, drive.believed, drive.positions)
     received = [camera.received for camera in drive.cameras.values() if camera.received]
-    t, kbps = drive.actual
+    t, kbps = sample_times(drive), drive.actual.y
     limited = np.zeros(t.shape, dtype=bool)
     for camera in received:
         limited |= _lost(t, camera.t, camera.lost) | _queued(t, camera.arrival_t, camera.clocks_ms)
     limited &= _measured_limit(drive, t) & ~_held_up(drive, t)
-    lat, lon = _positions_at(drive.positions, t)
-    known = limited & np.isfinite(kbps) & np.isfinite(lat)
-    return [CapacitySample(*map(float, row)) for row in zip(lat[known], lon[known], kbps[known], strict=True)]
+    return _samples(t, kbps, limited, _positions_at(drive.positions, t - WINDOW_S / 2))
+
+
+def _believed_samples(drive: Series, believed: BelievedSeries, positions: Positions) -> list[CapacitySample]:
+    """Where reports told the capacity: it is below what the cameras can use, of which more cannot be known."""
+    t = sample_times(drive)
+    kbps, deviation, usable = (
+        held(TimeSeries(believed.t, y), t) for y in (believed.kbps, believed.deviation, believed.usable)
+    )
+    known = (deviation <= SURE) & (kbps < 0.99 * usable) & ~_held_up(drive, t)
+    return _samples(t, kbps, known, _positions_at(positions, t))
+
+
+def _samples(
+    t: FloatSeries, kbps: FloatSeries, chosen: Flags, places: tuple[FloatSeries, FloatSeries]
+) -> list[CapacitySample]:
+    known = chosen & np.isfinite(kbps) & np.isfinite(places[0])
+    rows = zip(*(each[known].tolist() for each in (*places, kbps, t)), strict=True)
+    return [CapacitySample(*row) for row in rows]
 
 
 def cells(samples: Iterable[CapacitySample], percentile: float, cell_m: float) -> list[Cell]:
@@ -77,9 +114,14 @@ def cells(samples: Iterable[CapacitySample], percentile: float, cell_m: float) -
 
 
 def _cell(inside: list[CapacitySample], percentile: float) -> Cell:
-    lat, lon, kbps = np.array(inside).T
+    lat, lon, rates, t = np.array(inside).T
     # The lower of two neighbours, since nothing was measured between them.
-    return Cell(lat.mean(), lon.mean(), float(np.percentile(kbps, percentile, method="lower")), len(inside))
+    kbps = float(np.percentile(rates, percentile, method="lower"))
+    off = np.log(np.maximum(rates, 1.0) / max(kbps, 1.0))
+    # One pass says little about the next: as if there had been another, with the error of what nobody has checked.
+    passes = 1 + int(((np.diff(t) < 0) | (np.diff(t) > AGAIN_S)).sum())
+    error = float(np.sqrt((WRONG**2 + passes * off.var()) / (passes + 1)))
+    return Cell(lat.mean(), lon.mean(), kbps, len(inside), float(off.mean()), max(LEAST_ERROR, error))
 
 
 def _square(sample: CapacitySample, origin: CapacitySample, cell_m: float) -> tuple[int, int]:
@@ -123,10 +165,9 @@ def _held_up(drive: Series, at: FloatSeries) -> Flags:
 
 
 def _positions_at(positions: Positions, t: FloatSeries) -> tuple[FloatSeries, FloatSeries]:
-    """Degrees in the middle of the second before each time; nan if no position is near."""
-    middle = t - WINDOW_S / 2
-    after = np.searchsorted(positions.t, middle).clip(1, max(1, len(positions.t) - 1))
+    """Degrees at each time; nan if no position is near."""
+    after = np.searchsorted(positions.t, t).clip(1, max(1, len(positions.t) - 1))
     neighbours = positions.t[[after - 1, np.minimum(after, len(positions.t) - 1)]]
-    far = np.abs(neighbours - middle).min(axis=0) > GAP_S
-    lat, lon = (np.interp(middle, positions.t, values) for values in (positions.lat, positions.lon))
+    far = np.abs(neighbours - t).min(axis=0) > GAP_S
+    lat, lon = (np.interp(t, positions.t, values) for values in (positions.lat, positions.lon))
     return np.where(far, np.nan, lat), np.where(far, np.nan, lon)

@@ -18,6 +18,7 @@ from msgspec import UNSET
 from numpy.typing import NDArray
 
 from runner.core.events import BitratePredicted, Event, LinkMeasured, PositionReported
+from runner.core.model import Mode
 from runner.drive.log import FILES
 from runner.drive.read import SET_S, Drive, Side
 from runner.errors import UserError
@@ -49,6 +50,7 @@ LOOP_S, SAMPLE_S, REPORT_S = 0.1, 0.25, 0.04
 HELD_UP_S = 0.1
 LATE_S = 0.05  # that the vehicle was late to send a frame
 DOWN_DEG = 25.0  # a camera pitched down by this much is a top view, as on the operator's page
+BELIEVED = ("kbps", "deviation", "margin", "bias", "error", "gain")  # of `Believed`, over time
 PANEL_CAMERAS = 4  # number of curves distinguishable in one panel; more are split if the mounting gives no groups
 
 
@@ -162,6 +164,23 @@ class LinkSeries:
     dropped: FloatSeries
 
 
+@dataclass(frozen=True, slots=True)
+class BelievedSeries:
+    """What was believed of the uplink, see `runner.core.decision.Believed`, each in force until the next; nan: unknown.
+
+    usable  the most that the cameras can use, kbit/s; nan in mode single
+    """
+
+    t: FloatSeries
+    kbps: FloatSeries
+    deviation: FloatSeries
+    margin: FloatSeries
+    bias: FloatSeries
+    error: FloatSeries
+    gain: FloatSeries
+    usable: FloatSeries
+
+
 class Reason(NamedTuple):
     """Why something changed for a camera at a time."""
 
@@ -188,6 +207,7 @@ class Series:
     end        s; the last line of the side that gives the axis
     measured   "received" or "sent": what `actual` is; "" if neither was logged
     predicted, allocated  step functions: each value is in force until the next
+    believed   None: no rule believed anything of the uplink
     capped     whether rules lowered the total below what was asked for, a step function; empty if not logged
     measured_t when the vehicle measured the link, s
     held_up    (from s, to s), when a side's process was held up, or the vehicle sent frames late
@@ -208,6 +228,7 @@ class Series:
     predicted: TimeSeries
     allocated: TimeSeries
     actual: TimeSeries
+    believed: BelievedSeries | None
     measured: str
     capped: TimeSeries
     measured_t: FloatSeries
@@ -309,6 +330,7 @@ def _series(drive: Drive, label: str) -> Series:
         predicted=_predicted(vehicle, telemetry, samples),
         allocated=_line((t, sum(camera.kbps for camera in line.cameras.values())) for t, line in decisions),
         actual=_total(samples, cameras),
+        believed=_believed(decisions),
         measured="received" if samples else "sent" if telemetry else "",
         capped=_capped(operator),
         measured_t=np.array([t for t, event in vehicle.of(LinkMeasured) if event.kbps is not None], dtype=float),
@@ -378,6 +400,18 @@ def _total(samples: Sequence[Any], cameras: Mapping[str, CameraSeries]) -> TimeS
         return TimeSeries(t, _settled(t, y, np.asarray(np.sum([each.frames for each in received], axis=0))))
     sent = [camera.sent for camera in cameras.values() if camera.sent]
     return TimeSeries(sent[0].t, np.asarray(np.sum([each.kbps for each in sent], axis=0))) if sent else EMPTY
+
+
+def _believed(decisions: Sequence[tuple[float, DecisionMade | VehicleState]]) -> BelievedSeries | None:
+    if all(line.believed is UNSET for _, line in decisions):
+        return None
+
+    def row(t: float, line: DecisionMade | VehicleState) -> tuple[float | None, ...]:
+        known = (getattr(line.believed, key, None) for key in BELIEVED)
+        usable = sum(camera.demand_kbps for camera in line.cameras.values())
+        return t, *known, None if line.mode is Mode.SINGLE else usable
+
+    return BelievedSeries(*np.array([row(t, line) for t, line in decisions], dtype=float).T)
 
 
 def _capped(operator: _Shifted) -> TimeSeries:

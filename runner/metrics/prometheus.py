@@ -55,7 +55,7 @@ def _ms(value: float | None) -> float | None:
 
 
 def _believed(key: str) -> Reading:
-    """Of a vehicle's state, a value of what it believes of the uplink; None: nothing is believed, or it is not known."""
+    """Of a vehicle's state, a value of what it believes of the uplink; None: nothing is believed, or it is unknown."""
     return lambda state: getattr(state.believed, key, None)
 
 

@@ -133,10 +133,11 @@ def _source(settings: Mapping[str, Any], bases: Sequence[Path]) -> Pqos:
         case "map":
             from runner.pqos.bandwidth_map import BandwidthMap
             from runner.pqos.on_map import MapPqos
-            from runner.pqos.table import read_map
+            from runner.pqos.table import read_errors, read_map
 
-            lon, lat, kbps = read_map(find_file(settings, "file", bases)).T
-            points = BandwidthMap(lat, lon, kbps, number(settings, "radius_m", positive=True))
+            path = find_file(settings, "file", bases)
+            lon, lat, kbps = read_map(path).T
+            points = BandwidthMap(lat, lon, kbps, number(settings, "radius_m", positive=True), read_errors(path))
             look_ahead_s, off_map = number(settings, "look_ahead_s"), exact(number(settings, "off_map_kbps"))
             valid_s = None if settings.get("valid_s") is None else number(settings, "valid_s", positive=True)
             return MapPqos(points, look_ahead_s, off_map, valid_s)

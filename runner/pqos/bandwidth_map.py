@@ -30,38 +30,58 @@ class Way(NamedTuple):
     north: float = 0.0
 
 
+class Point(NamedTuple):
+    """Of a map: kbit/s; and mean and deviation of ln(capacity / kbps), None if they are not stated."""
+
+    kbps: float
+    bias: float | None = None
+    error: float | None = None
+
+
 class BandwidthMap:
     """Rates by position, looked up in a sorted grid.
 
-    lat, lon, kbps  one value per point: degrees, degrees, kbit/s; radius_m: how far from a path a point still counts
+    lat, lon, kbps  one value per point: degrees, degrees, kbit/s
+    radius_m        how far from a path a point still counts
+    errors          bias and error of each point; None: they are not stated
 
     The rows of the grid are bands of latitude, each divided into its own columns, so that cells have the same size
     at every latitude. Points are sorted by cell, then by rate: a dense map answers from the first point of most cells.
     """
 
-    def __init__(self, lat: Floats, lon: Floats, kbps: Floats, radius_m: float) -> None:
+    def __init__(self, lat: Floats, lon: Floats, kbps: Floats, radius_m: float, errors: Floats | None = None) -> None:
         self._radius = radius_m
         self._cell = max(radius_m / 4, 1.0)  # many cells are fully inside the radius; few are cut by its edge
         row = np.floor(np.radians(lat) * EARTH_M / self._cell).astype(np.int64)
         key = self._key(row, lon)
         order = np.lexsort((kbps, key))
         self._lat, self._lon, self._kbps = lat[order], lon[order], kbps[order]
+        self._errors = None if errors is None else errors[order]
         self._keys, first = np.unique(key[order], return_index=True)
         self._first = np.append(first, len(order)).astype(np.int64)
         self._rows = int(row.min()), int(row.max())
 
     def lowest(self, way: Way) -> float | None:
         """Lowest rate, in kbit/s, of the points within the radius of a path; None: the path is off the map."""
+        point = self.lowest_point(way)
+        return None if point is None else point.kbps
+
+    def lowest_point(self, way: Way) -> Point | None:
+        """The point within the radius of a path whose rate is lowest; None: the path is off the map."""
         cells = self._cells(way)
         first = self._first[cells]
         inside = self._inside(first, way)
-        best = self._kbps[first[inside]].min(initial=np.inf)
+        found = first[inside]
+        best = self._kbps[found].min(initial=np.inf)
         # The first point of a cell is its lowest: only if it is outside can a later one be inside and lower.
         cells = cells[~inside & (self._kbps[first] < best)]
         rest = _spans(self._first[cells] + 1, self._first[cells + 1])
         rest = rest[self._kbps[rest] < best]
-        best = min(best, self._kbps[rest[self._inside(rest, way)]].min(initial=np.inf))
-        return None if best == np.inf else float(best)
+        found = np.concatenate([found, rest[self._inside(rest, way)]])
+        if not found.size:
+            return None
+        at = found[self._kbps[found].argmin()]
+        return Point(float(self._kbps[at]), *(() if self._errors is None else self._errors[at].tolist()))
 
     def _key(self, row: Ints, lon: Floats) -> Ints:
         """Number of the cell at a longitude of a row; increasing with the longitude within a row."""

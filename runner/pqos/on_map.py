@@ -58,11 +58,12 @@ class MapPqos:
     def observe(self, event: Event) -> BitratePredicted | None:
         if not isinstance(event, PositionReported):
             return None
-        lowest = self._points.lowest(self._motion.way(event, self._look_ahead_s))
+        lowest = self._points.lowest_point(self._motion.way(event, self._look_ahead_s))
         if lowest is None:
             self.warnings = self.warnings or self._swap_warning(event)
-        kbps = self._off_map if lowest is None else exact(lowest)
-        return BitratePredicted(t=event.t, kbps=kbps, valid_s=self._valid_s)
+            return BitratePredicted(t=event.t, kbps=self._off_map, valid_s=self._valid_s)
+        kbps, bias, error = lowest
+        return BitratePredicted(t=event.t, kbps=exact(kbps), valid_s=self._valid_s, bias=bias, error=error)
 
     def _swap_warning(self, event: PositionReported) -> tuple[str, ...]:
         """A warning if lon and lat seem swapped in map or positions, which otherwise looks like a dead spot."""

@@ -38,6 +38,8 @@ TIME = Column(
     ("t_s",), -FINITE, FINITE, "must be a finite number of seconds, not below that of the row before", time=True
 )
 DELAY = Column(("delay_ms", "rtt_ms"), 0, 60_000, "must be a number of ms from 0 to 60000")
+BIAS = Column(("bias",), -10, 10, "must be a number from -10 to 10: mean of ln(capacity / kbps)")
+ERROR = Column(("error",), 0.01, 10, "must be a number from 0.01 to 10: deviation of ln(capacity / kbps)")
 SPEED = Column(("speed_mps",), 0, FINITE, "must be a finite number of m/s, 0 or more")
 
 
@@ -70,6 +72,16 @@ def read_map(path: Path) -> NDArray[np.float64]:
     columns = (LON, LAT, RATE)
     text = _matrix(path) if path.suffix.lower() in {".yaml", ".yml"} else _csv(path, columns)
     return _checked(path, columns, text)
+
+
+def read_errors(path: Path) -> NDArray[np.float64] | None:
+    """Bias and error of each point of a bandwidth map, ln, in the order of `read_map`; None: it does not state them.
+
+    raises  ModelError as there
+    """
+    columns = (BIAS, ERROR)
+    is_stated = all(column.names[0] in header(path) for column in columns)
+    return read_table(path, columns) if is_stated else None
 
 
 def header(path: Path) -> list[str]:

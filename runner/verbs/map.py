@@ -1,10 +1,16 @@
 """usage: tod-runner map DRIVE [DRIVE ...] output=FILE.csv [percentile=10] [cell_m=10] [positions=BAG [topic=NAME]]
 
-Makes a bandwidth map from drives, for pqos=map: per square of the ground, a percentile of the received rate, in kbit/s
-of video. Only samples in which the link was the bottleneck count: over the second before, packets were lost, or half of
-the frames of a camera arrived 50 ms later than its fastest; the measured link limited the total; and neither machine
-was held up. All others show how much was sent, or how busy a machine was, not what the link can carry. Both logs are
-needed (log=DIR), of a drive with rules that measure the link (modes=safe).
+Makes a bandwidth map from drives, for pqos=map: per square of the ground, a percentile of what the link could carry, in
+kbit/s of video, and how far that varied: mean (bias) and deviation (error) of ln(capacity / kbps). A vehicle that
+drives by such a map knows from its start what the predictions are worth.
+
+Where rules believe something about the link (modes=belief), the capacity is what they believed, four times a second,
+while reports told it to within 20 % and it was less than the cameras can use; the vehicle's log is enough.
+
+In other drives it is the received rate, which needs both logs (log=DIR) and rules that measure the link (modes=safe).
+Only samples in which the link was the bottleneck count: over the second before, packets were lost, or half of the
+frames of a camera arrived 50 ms later than its fastest; the measured link limited the total; and neither machine was
+held up. All others show how much was sent, or how busy a machine was, not what the link can carry.
 
 positions= is a ROS bag with the vehicle's positions during the drives (sensor_msgs/NavSatFix), which replace those in
 their logs; topic= is needed if it has several such topics.
@@ -19,7 +25,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from runner.drive.capacity import CapacitySample, Cell, capacity_problem, cells, limited_samples
+from runner.drive.capacity import CapacitySample, Cell, capacity_problem, cells, limited_samples, sample_times
 from runner.drive.positions import reader
 from runner.drive.series import series
 from runner.errors import ArgumentError, RunError
@@ -41,9 +47,9 @@ def run(arguments: Arguments) -> int:
             unusable.append(f"{word} {why}")
             continue
         samples += limited_samples(drive)
-        seen += len(drive.actual.t)
+        seen += len(sample_times(drive))
     if not samples:
-        rule = "packets lost or frames late, the measured link limiting the total, and no machine held up"
+        rule = "less carried than the cameras can use, as the link was measured, and no machine held up"
         reasons = [f"in none of {seen} samples was the link the limit: {rule}"] if seen else []
         raise RunError(f"no map: {'; '.join([*unusable, *reasons])}")
     squares = cells(samples, percentile, cell_m)
@@ -66,6 +72,9 @@ def _checked_arguments(arguments: Arguments) -> tuple[Path, float, float]:
 
 
 def _write(path: Path, squares: list[Cell]) -> None:
-    rows = (f"{cell.lon:.6f},{cell.lat:.6f},{cell.kbps:.0f},{cell.samples}\n" for cell in squares)
+    rows = (
+        f"{cell.lon:.6f},{cell.lat:.6f},{cell.kbps:.0f},{cell.samples},{cell.bias:.3f},{cell.error:.3f}\n"
+        for cell in squares
+    )
     with whole_file(path) as file:
-        file.writelines(["lon,lat,kbps,samples\n", *rows])
+        file.writelines(["lon,lat,kbps,samples,bias,error\n", *rows])
