@@ -255,6 +255,22 @@ def measured(side: str, lines: Lines) -> Lines:
     return [each for line in lines for each in (line, {"t": line["t"], **next(events)})]
 
 
+def believing(
+    kbps: Callable[[float], float], deviation: Callable[[float], float] = lambda _: 0.1
+) -> Callable[[str, Lines], Lines]:
+    """A change of lines: as if a rule had believed so much of the link, at a time."""
+
+    def change(_: str, lines: Lines) -> Lines:
+        for line in lines:
+            if line.get("log") in ("decision", "state"):
+                t = line["t"]
+                known = {"kbps": round(kbps(t)), "deviation": deviation(t), "margin": 0.1, "bias": -0.2, "error": 0.1}
+                line["believed"] = {**known, "gain": 0.5, "policer_kbps": None}
+        return lines
+
+    return change
+
+
 def write_model(path: Path, name: str, factors: Sequence[float], full_kbps: float) -> Path:
     """A rate-quality model whose curves cross as measured ones do: quality saturates earlier for smaller factors."""
     points = []

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from drives import Lines, measured, write_drive
+from drives import Lines, believing, measured, write_drive
 from helpers import Command
 
 from runner.drive.capacity import CapacitySample, cells, limited_samples
@@ -41,14 +41,7 @@ def test_a_square_states_how_far_its_rate_is_from_the_truth() -> None:
 
 
 def test_what_was_believed_counts_while_it_was_sure_and_below_what_cameras_can_use(tmp_path: Path) -> None:
-    def change(side: str, lines: Lines) -> Lines:
-        for line in (each for each in lines if each.get("log") == "decision"):
-            t = line["t"]
-            kbps, deviation = (90_000 if t < 5 else 2000), (0.5 if 8 <= t < 10 else 0.1)
-            line["believed"] = {"kbps": kbps, "deviation": deviation, "margin": 0.05, "bias": None, "error": None}
-            line["believed"] |= {"gain": None, "policer_kbps": None}
-        return lines
-
+    change = believing(lambda t: 90_000 if t < 5 else 2000, lambda t: 0.5 if 8 <= t < 10 else 0.1)
     drive = series(read_drive(write_drive(tmp_path / "drive", ["vehicle"], seconds=20, change=change)))
     found = limited_samples(drive)
     assert {sample.kbps for sample in found} == {2000}

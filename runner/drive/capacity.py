@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from runner.core.learned import WRONG
-from runner.drive.series import BelievedSeries, Flags, FloatSeries, Positions, Series, TimeSeries, held
+from runner.drive.series import Flags, FloatSeries, Positions, Series, TimeSeries, held
 from runner.pqos.bandwidth_map import offset
 
 WINDOW_S = 1.0  # over which the rates of the samples are measured
@@ -22,6 +22,7 @@ QUEUED_MS = 50.0  # above the lowest latency of the drive: the queue in front of
 AFTER_S = 0.5  # after a side was held up: what had piled up is delivered
 GAP_S = 2.0  # positions further apart say nothing about the time between
 SURE = 0.2  # deviation, ln, of a belief that counts: there was evidence in the last second
+USED = 0.99  # share of what the cameras can use: rounded, it is all
 EVERY_S = 0.25  # between two samples of a belief
 AGAIN_S = 10.0  # a square that is entered again after this time has been passed twice
 LEAST_ERROR = 0.01  # as schemas/event.schema.json
@@ -71,30 +72,34 @@ def limited_samples(drive: Series) -> list[CapacitySample]:
     if capacity_problem(drive) or drive.positions is None:
         return []
     if drive.believed:
-        return _believed_samples(drive, drive.believed, drive.positions)
+        t = sample_times(drive)
+        return _samples(t, carried(drive, t), _positions_at(drive.positions, t))
     received = [camera.received for camera in drive.cameras.values() if camera.received]
     t, kbps = sample_times(drive), drive.actual.y
     limited = np.zeros(t.shape, dtype=bool)
     for camera in received:
         limited |= _lost(t, camera.t, camera.lost) | _queued(t, camera.arrival_t, camera.clocks_ms)
     limited &= _measured_limit(drive, t) & ~_held_up(drive, t)
-    return _samples(t, kbps, limited, _positions_at(drive.positions, t - WINDOW_S / 2))
+    return _samples(t, np.where(limited, kbps, np.nan), _positions_at(drive.positions, t - WINDOW_S / 2))
 
 
-def _believed_samples(drive: Series, believed: BelievedSeries, positions: Positions) -> list[CapacitySample]:
-    """Where reports told the capacity: it is below what the cameras can use, of which more cannot be known."""
-    t = sample_times(drive)
+def carried(drive: Series, t: FloatSeries) -> FloatSeries:
+    """What the link was believed to carry at some times, kbit/s of video; nan where reports did not tell it.
+
+    Where it carries all that the cameras can use, more cannot be known.
+    """
+    believed = drive.believed
+    if believed is None:
+        return np.full(t.shape, np.nan)
     kbps, deviation, usable = (
         held(TimeSeries(believed.t, y), t) for y in (believed.kbps, believed.deviation, believed.usable)
     )
-    known = (deviation <= SURE) & (kbps < 0.99 * usable) & ~_held_up(drive, t)
-    return _samples(t, kbps, known, _positions_at(positions, t))
+    known = (deviation <= SURE) & (kbps < USED * usable) & ~_held_up(drive, t)
+    return np.where(known, kbps, np.nan)
 
 
-def _samples(
-    t: FloatSeries, kbps: FloatSeries, chosen: Flags, places: tuple[FloatSeries, FloatSeries]
-) -> list[CapacitySample]:
-    known = chosen & np.isfinite(kbps) & np.isfinite(places[0])
+def _samples(t: FloatSeries, kbps: FloatSeries, places: tuple[FloatSeries, FloatSeries]) -> list[CapacitySample]:
+    known = np.isfinite(kbps) & np.isfinite(places[0])
     rows = zip(*(each[known].tolist() for each in (*places, kbps, t)), strict=True)
     return [CapacitySample(*row) for row in rows]
 

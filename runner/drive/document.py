@@ -71,6 +71,8 @@ def _drive(drive: DriveStatistics, checks: Sequence[ClaimCheck]) -> dict[str, An
         "share": number(drive.share),
         "predicted_min_kbps": number(drive.predicted_min, 1),
         "predicted_max_kbps": number(drive.predicted_max, 1),
+        "predictions": drive.predictions
+        and {key: number(value, 3) for key, value in drive.predictions._asdict().items()},
         "latency_arrival_ms": _latency(drive.arrival),
         "latency_decode_ms": _latency(drive.decode),
         "freezes": drive.freezes,

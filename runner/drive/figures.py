@@ -12,8 +12,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from runner.drive.predictions import EVERY_S, Compared, compared
 from runner.drive.series import CameraSeries, FloatSeries, Panel, Positions, Series, TimeSeries, held
-from runner.drive.statistics import DriveStatistics, latencies, per_second, to_arrival
+from runner.drive.statistics import SECOND_S, DriveStatistics, latencies, per_second, to_arrival
 
 MINUTES_FROM_S = 900.0
 STEP_OFFSET = 0.014  # of the largest factor, between steps that would overlap
@@ -48,6 +49,7 @@ class Curve:
     around     lowest and highest of the cameras whose mean is the curve
     steps      each value is in force until the next
     filled     down to 0, without a line
+    points     without a line
     reasons    for each value, shown on hover
     """
 
@@ -60,6 +62,7 @@ class Curve:
     around: tuple[FloatSeries, FloatSeries] | None = None
     steps: bool = False
     filled: bool = False
+    points: bool = False
     reasons: tuple[str, ...] = ()
 
 
@@ -79,13 +82,13 @@ class Strip(NamedTuple):
 
 
 class MapTrack(NamedTuple):
-    """Positions, m, bitrate at some of them, kbit/s, and arrows (m, m, degrees from east to north) along the track."""
+    """Positions, m, a quantity at some of them, and arrows (m, m, degrees from east to north) along the track."""
 
     way: tuple[FloatSeries, FloatSeries]
     t: FloatSeries
     east: FloatSeries
     north: FloatSeries
-    kbps: FloatSeries
+    values: FloatSeries
     low: float
     high: float
     title: str
@@ -96,7 +99,7 @@ class MapTrack(NamedTuple):
 class Chart:
     """One pair of axes.
 
-    drive   its index among the drives, None for a chart of all of them
+    drive   its index among the drives, None for a chart of all of them, or one that is not over time
     unit_s  unit of a time axis, s
     hover   plotly's format of a value
     """
@@ -143,19 +146,14 @@ def bitrate_on_track(drives: Drives) -> Rows | str:
     tracks = {at: on_track(drive.series) for at, drive in enumerate(drives) if drive.series.positions}
     if not tracks:
         return "no positions were logged"
-    known = np.concatenate([kbps for *_, kbps in tracks.values()])
+    known = np.concatenate([kbps for _, kbps in tracks.values()])
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
-    rows: Rows = []
-    for at, (t, east, north, kbps) in tracks.items():
-        series = drives[at].series
-        assert series.positions is not None
-        xlim, ylim = _limits(series.positions)
-        title = f"total {series.measured or 'allocated'} in kbit/s"
-        way = (series.positions.east, series.positions.north)
-        track = MapTrack(way, t, east, north, kbps, low, high, title, tuple(_arrows(*way)))
-        x, y = Axis("m east of the start", *xlim), Axis("m north", *ylim)
-        rows.append([Chart(_label(drives, at), x, y, drive=at, track=track)])
-    return rows
+
+    def chart(at: int, t: FloatSeries, kbps: FloatSeries) -> Chart:
+        title = f"total {drives[at].series.measured or 'allocated'} in kbit/s"
+        return _on_map(drives, at, TimeSeries(t, kbps), (low, high), title, "%{marker.color:,.0f} kbit/s")
+
+    return [[chart(at, t, kbps)] for at, (t, kbps) in tracks.items()]
 
 
 def totals(drives: Drives) -> Rows:
@@ -172,6 +170,70 @@ def totals(drives: Drives) -> Rows:
     found = [tuple(curves(drive.series)) for drive in drives]
     y = Axis("total in kbit/s", 0.0, _top(found))
     return [[_over_time(drives, at, _label(drives, at), y, each, hover=KBPS)] for at, each in enumerate(found)]
+
+
+def predictions(drives: Drives) -> Rows | str:
+    """What was predicted against what the link carried; the same over time, with what was learned of it; by place."""
+    found = {at: both for at, drive in enumerate(drives) if (both := compared(drive.series))}
+    if not found:
+        return "nothing was predicted, or no rule believed anything of the link (modes=belief)"
+    every = np.concatenate([np.exp(-both.off[np.isfinite(both.off)]) for both in found.values()])
+    most = max(float(np.nanmax(np.fmax(both.predicted, both.carried))) for both in found.values())
+    limits = float(np.percentile(every, 5)), float(np.percentile(every, 95))
+    rows: Rows = []
+    for at, both in found.items():
+        rows.append([_calibration(drives, at, both, 1.05 * most)])
+        rows += [[_errors(drives, at, both, limits)], [_learned(drives, at)]]
+        known = np.isfinite(both.off)
+        if drives[at].series.positions:
+            percent = TimeSeries(both.t[known], 100 * np.exp(-both.off[known]))
+            colours = (100 * limits[0], 100 * limits[1])
+            rows.append([_on_map(drives, at, percent, colours, RATIO + " in %", "predicted: %{marker.color:.0f} %")])
+    return rows
+
+
+RATIO = "predicted / carried"
+
+
+def _calibration(drives: Drives, at: int, both: Compared, most: float) -> Chart:
+    """A point for each second, and the line on which predictions are right."""
+    each = np.isfinite(both.off)
+    each[np.arange(each.size) % round(SECOND_S / EVERY_S) > 0] = False
+    ends = np.array([0.0, most])
+    curves = (
+        Curve("predicted = carried", ends, ends, "text", dash=1),
+        Curve("each second", both.predicted[each], both.carried[each], "allocated", points=True),
+    )
+    x, y = Axis("predicted in kbit/s", 0.0, most), Axis("carried in kbit/s", 0.0, most)
+    return Chart(_label(drives, at), x, y, curves, drive=None, hover=f"{KBPS} carried, %{{x:,.0f}} predicted:")
+
+
+def _errors(drives: Drives, at: int, both: Compared, limits: tuple[float, float]) -> Chart:
+    """How far predictions were off, and what was believed of it, over time."""
+    believed = drives[at].series.believed
+    assert believed is not None
+    low, mean, high = (np.exp(-believed.bias + n * believed.error) for n in (-1, 0, 1))
+    curves = (
+        Curve("learned: mean and deviation", believed.t, mean, "predicted", around=(low, high)),
+        Curve(RATIO, both.t, np.exp(-both.off), "text", width=0.8),
+    )
+    low_end, high_end = min(0.5, 0.9 * limits[0]), max(2.0, 1.1 * limits[1])
+    marks = tuple(mark for mark in (0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 10.0) if low_end <= mark <= high_end)
+    y = Axis(RATIO, low_end, high_end, marks, log=True, percent=True)
+    return _over_time(drives, at, _label(drives, at), y, curves, hover="%{y:.0%}")
+
+
+def _learned(drives: Drives, at: int) -> Chart:
+    """How far changes of predictions came true, and what was kept free for errors, over time."""
+    series = drives[at].series
+    believed = series.believed
+    assert believed is not None
+    curves = (
+        _steps("share of changes that come true", TimeSeries(believed.t, believed.gain), series, "allocated"),
+        _steps("kept free", TimeSeries(believed.t, 1 - np.exp(-believed.margin)), series, "late", dash=1),
+    )
+    y = Axis("share", 0.0, 1.05, (0.0, 0.25, 0.5, 0.75, 1.0), percent=True)
+    return _over_time(drives, at, _label(drives, at), y, curves, hover="%{y:.0%}")
 
 
 def bitrates(drives: Drives) -> Rows:
@@ -281,6 +343,7 @@ def _quality_axis(title: str) -> Callable[[int, Sequence[Sequence[Curve]]], Axis
 FIGURES: dict[str, tuple[str, Callable[[Drives], Rows | str]]] = {
     "bitrate_on_track": ("Total bitrate on the track", bitrate_on_track),
     "totals": ("Predicted, allocated and actual total", totals),
+    "predictions": ("What predictions were worth", predictions),
     "bitrates": ("Camera bitrates over time", bitrates),
     "scaling": ("Resolution factors over time", scaling),
     "latency": ("Latency and freezes", latency),
@@ -463,15 +526,26 @@ def _shares(label: str, values: FloatSeries, colour: int | str, **more: Any) -> 
 # --- the map ----------------------------------------------------------------------------------------------------------
 
 
-def on_track(drive: Series) -> tuple[FloatSeries, FloatSeries, FloatSeries, FloatSeries]:
-    """Time, m east, m north and total bitrate, kbit/s: as measured, or as allocated if nothing was."""
+def _on_map(drives: Drives, at: int, line: TimeSeries, limits: tuple[float, float], title: str, hover: str) -> Chart:
+    """A quantity by colour on the positions of the vehicle. title: of the colours, which cover the limits."""
+    places = drives[at].series.positions
+    assert places is not None
+    xlim, ylim = _limits(places)
+    way = (places.east, places.north)
+    east, north = (np.interp(line.t, places.t, each) for each in way)
+    track = MapTrack(way, line.t, east, north, line.y, *limits, title, tuple(_arrows(*way)))
+    x, y = Axis("m east of the start", *xlim), Axis("m north", *ylim)
+    return Chart(_label(drives, at), x, y, drive=at, track=track, hover=hover)
+
+
+def on_track(drive: Series) -> TimeSeries:
+    """Total bitrate while positions are known, kbit/s: as measured, or as allocated if nothing was."""
     places = drive.positions
     assert places is not None
     t = drive.actual.t if drive.measured else places.t
     t = t[(t >= places.t[0]) & (t <= places.t[-1])]
     kbps = np.interp(t, *drive.actual) if drive.measured else held(drive.allocated, t)
-    t, kbps = t[np.isfinite(kbps)], kbps[np.isfinite(kbps)]
-    return t, np.interp(t, places.t, places.east), np.interp(t, places.t, places.north), kbps
+    return TimeSeries(t[np.isfinite(kbps)], kbps[np.isfinite(kbps)])
 
 
 def _limits(places: Positions) -> tuple[tuple[float, float], tuple[float, float]]:

@@ -225,13 +225,14 @@ def _chart(chart: Chart) -> dict[str, Any]:
 
 def _curve(curve: Curve) -> dict[str, Any]:
     """A thinned curve; steps are kept where they change, and at their end."""
-    keys = ("label", "colour", "dash", "width", "steps", "filled")
+    keys = ("label", "colour", "dash", "width", "steps", "filled", "points")
     x, y = curve.x, curve.y
     kept = np.zeros(x.shape, dtype=bool)
     kept[:: 1 + len(x) // MOST_POINTS] = True
     if curve.steps and x.size:
         changed = np.append(True, ~np.isclose(y[1:], y[:-1], equal_nan=True))
-        kept = changed | (kept if curve.reasons else False)
+        last = np.append(np.isnan(y[1:]), False)  # a step is drawn up to the next known value
+        kept = changed | last | (kept if curve.reasons else False)
         kept[-1] = True
     around = curve.around and [_rounded(side[kept]) for side in curve.around]
     why = [curve.reasons[at] for at in np.flatnonzero(kept)] if curve.reasons else None
@@ -241,7 +242,7 @@ def _curve(curve: Curve) -> dict[str, Any]:
 
 def _track(track: MapTrack) -> dict[str, Any]:
     each, every = 1 + len(track.t) // MOST_POINTS, 1 + len(track.way[0]) // MOST_POINTS
-    columns = {key: _rounded(getattr(track, key)[::each]) for key in ("t", "east", "north", "kbps")}
+    columns = {key: _rounded(getattr(track, key)[::each]) for key in ("t", "east", "north", "values")}
     way = [_rounded(side[::every]) for side in track.way]
     return columns | {"way": way, "low": track.low, "high": track.high, "title": track.title, "arrows": track.arrows}
 

@@ -159,6 +159,8 @@ def _scale(side: Any, axis: Axis, most: int) -> None:
 
 
 def _style(curve: Curve) -> dict[str, Any]:
+    if curve.points:
+        return {"color": _colour(curve.colour), "ls": "", "marker": "o", "ms": 2.5, "mew": 0, "alpha": 0.6}
     dashes = DASHES[curve.dash % len(DASHES)]
     return {"color": _colour(curve.colour), "ls": dashes, "lw": 0.9 * curve.width}
 
@@ -202,7 +204,7 @@ def _draw_track(axes: Axes, track: MapTrack) -> None:
     viridis = ListedColormap(mpl.colormaps["viridis"](np.linspace(0, 0.93, 256)))  # its lightest is invisible on white
     style: dict[str, Any] = {"mfc": "white", "mec": "black", "ls": ""}
     axes.plot(x, y, color=NAMED["link"], lw=1.2, zorder=1)  # also where no bitrate is known
-    points = axes.scatter(track.east, track.north, c=track.kbps, s=7, lw=0, cmap=viridis, zorder=2)
+    points = axes.scatter(track.east, track.north, c=track.values, s=7, lw=0, cmap=viridis, zorder=2)
     points.set_clim(track.low, track.high)
     for east, north, degrees in track.arrows:
         axes.plot(east, north, marker=MarkerStyle(">").rotated(deg=degrees), ms=5, mew=0.6, zorder=4, **style)

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from runner.drive.predictions import Worth, compared, worth
 from runner.drive.quality_file import DeliveredQuality
 from runner.drive.series import (
     RATE_WINDOW_S,
@@ -147,7 +148,10 @@ class CameraStatistics:
 
 @dataclass(frozen=True, slots=True)
 class DriveStatistics:
-    """A drive: its cameras, and all of them together."""
+    """A drive: its cameras, and all of them together.
+
+    predictions  what they were worth; None: nothing was predicted, or believed of the link, for long enough
+    """
 
     series: Series
     cameras: Mapping[str, CameraStatistics]
@@ -169,6 +173,7 @@ class DriveStatistics:
     moving: float
     delivered: float
     delivered_worst: float
+    predictions: Worth | None
     notes: tuple[str, ...]
 
 
@@ -195,6 +200,8 @@ def statistics(
     estimates = [camera.quality for camera in each if camera.quality]
     metrics = {estimate.metric for estimate in estimates}
     known = drive.predicted.y[np.isfinite(drive.predicted.y)]
+    both = compared(drive)
+    known_worth = worth(both) if both else None
     frozen = [freeze for camera in each for freeze in camera.freezes or ()]
     watched = any(camera.freezes is not None for camera in each)
     kbps, allocated = (sum_known(getattr(camera, key) for camera in each) for key in ("kbps", "allocated"))
@@ -219,7 +226,8 @@ def statistics(
         moving=mean(np.array([e.moving for e in estimates])) if len(metrics) == 1 else NAN,
         delivered=mean(means),
         delivered_worst=float(means.min()) if means.size else NAN,
-        notes=tuple(_notes(drive, cameras)),
+        predictions=known_worth,
+        notes=tuple(_notes(drive, cameras, known_worth)),
     )
 
 
@@ -261,10 +269,12 @@ def _arrivals_logged(received: ReceivedSeries) -> bool:
     return bool(received.arrival_t.size) or not received.frames[-1]
 
 
-def _notes(drive: Series, cameras: Mapping[str, CameraStatistics]) -> Iterable[str]:
+def _notes(drive: Series, cameras: Mapping[str, CameraStatistics], predictions: Worth | None) -> Iterable[str]:
     """Missing data, and caveats of the quality estimates."""
     if not drive.measured:
         yield "neither sent nor received video was logged: bitrates and quality are those of what was allocated"
+    if predictions:
+        yield f"predictions: {predictions.words}"
     if drive.positions is None:
         yield "no positions were logged: not drawn on the map"
     for camera in drive.cameras.values():

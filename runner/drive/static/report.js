@@ -7,9 +7,9 @@ const byId = (id) => /** @type {HTMLElement} */ (document.getElementById(id));
  * The charts as runner/drive/figures.py describes them, converted to plotly's traces.
  * @typedef {{title: string, low: number, high: number, marks: number[], log: boolean, percent: boolean}} Axis
  * @typedef {{label: string, x: number[], y: (number|null)[], colour: number|string, dash: number, width: number, steps: boolean,
- *   filled: boolean, around: number[][]|null, why: string[]|null}} Curve
+ *   filled: boolean, points: boolean, around: number[][]|null, why: string[]|null}} Curve
  * @typedef {{label: string, colour: number, spans: [number, number][]}} Bars
- * @typedef {{way: number[][], t: number[], east: number[], north: number[], kbps: number[], low: number, high: number,
+ * @typedef {{way: number[][], t: number[], east: number[], north: number[], values: number[], low: number, high: number,
  *   title: string, arrows: number[][]}} Track
  * @typedef {{x: Axis, y: Axis, drive: number|null, unit_s: number, hover: string, curves: Curve[],
  *   strip: {bars: Bars[], none: string}|null, track: Track|null}} Chart
@@ -44,13 +44,13 @@ function viridis() {
 
 /** @param {Curve} curve  @param {string} hover of a value */
 function traces(curve, hover) {
-  const { label, x, y, steps, filled, around, why } = curve;
+  const { label, x, y, steps, filled, points, around, why } = curve;
   const colour = colourOf(curve.colour);
   const name = plain(label);
   const shape = steps ? "hv" : "linear";
   const base = { type: "scatter", mode: "lines", x, legendgroup: name };
   const trace = {
-    ...base, y, name, hovertemplate: why ? "%{text}<extra></extra>" : `${hover} ${name}<extra></extra>`, text: why?.map(plain),
+    ...base, ...(points ? { mode: "markers", marker: { color: colour, size: 6, opacity: 0.6 } } : {}), y, name, hovertemplate: why ? "%{text}<extra></extra>" : `${hover} ${name}<extra></extra>`, text: why?.map(plain),
     line: { color: colour, width: filled ? 0 : 1.6 * curve.width, dash: DASHES[curve.dash % DASHES.length], shape },
     ...(filled ? { fill: "tozeroy", fillcolor: `${colour}99` } : {}),
   };
@@ -70,8 +70,12 @@ function freezes({ label, colour, spans }, x, unit_s) {
   };
 }
 
-/** The track, the bitrate on it, arrows, its ends, and the position at the pointer. @param {Track} track */
-function mapTraces({ way: [x, y], t, east, north, kbps, low, high, title, arrows }) {
+/**
+ * The track, the values on it, arrows, its ends, and the position at the pointer.
+ * @param {Track} track
+ * @param {string} hover of a value
+ */
+function mapTraces({ way: [x, y], t, east, north, values, low, high, title, arrows }, hover) {
   const bar = { title: { text: title, side: "right", font: { size: 13 } }, thickness: 12, outlinewidth: 0, tickfont: { size: 12 }, nticks: 6 };
   const markers = { type: "scatter", mode: "markers", hoverinfo: "skip" };
   const outlined = { color: themed("panel"), line: { width: 2.5, color: themed("text") } };
@@ -80,8 +84,8 @@ function mapTraces({ way: [x, y], t, east, north, kbps, low, high, title, arrows
   return [
     { type: "scatter", mode: "lines", x, y, name: "way", showlegend: false, hoverinfo: "skip", line: { color: themed("line"), width: 2 } },
     { ...markers, x: east, y: north, customdata: t, name: "track", showlegend: false, hoverinfo: undefined,
-      marker: { color: kbps, cmin: low, cmax: high, colorscale: viridis(), size: 7, colorbar: bar },
-      hovertemplate: "%{customdata:.1f} s: %{marker.color:,.0f} kbit/s<br>%{x:.0f} m east, %{y:.0f} m north<extra></extra>" },
+      marker: { color: values, cmin: low, cmax: high, colorscale: viridis(), size: 7, colorbar: bar },
+      hovertemplate: `%{customdata:.1f} s: ${hover}<br>%{x:.0f} m east, %{y:.0f} m north<extra></extra>` },
     { ...markers, x: arrows.map(([each]) => each), y: arrows.map(([, each]) => each), name: "direction", showlegend: false,
       marker: { ...outlined, symbol: "triangle-up", size: 11, angle, line: { ...outlined.line, width: 1.5 } } },
     end(0, "circle", "start"), end(-1, "square", "end"),
@@ -124,7 +128,7 @@ function draw(element) {
   const chart = data.charts[charts.indexOf(element)];
   const { x, y, hover, curves, strip, track, unit_s } = chart;
   const drawn = [
-    ...(track ? mapTraces(track) : []),
+    ...(track ? mapTraces(track, hover) : []),
     ...curves.flatMap((curve) => traces(curve, hover)),
     ...(strip?.bars ?? []).map((bars) => freezes(bars, x, unit_s)),
   ];
@@ -132,7 +136,7 @@ function draw(element) {
   const layout = {
     autosize: true, margin: { l: 56, r: 12, t: 26, b: 44 }, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
     font: { family: "system-ui, DejaVu Sans, sans-serif", size: 12, color: themed("text") },
-    hovermode: overTime && hover && !strip ? "x unified" : "closest", hoverdistance: hover ? 20 : 60,
+    hovermode: overTime && hover && !strip ? "x unified" : "closest", hoverdistance: hover && !track ? 20 : 60,
     hoverlabel: { font: { size: 12, color: themed("text") }, bgcolor: themed("raised"), bordercolor: themed("line"), align: "left" },
     showlegend: true, legend: { orientation: "h", x: 0, y: 1, xanchor: "left", yanchor: "bottom", font: { size: 12 } },
     modebar: { color: themed("muted"), activecolor: themed("accent"), bgcolor: "rgba(0,0,0,0)", orientation: "v" },

@@ -5,6 +5,7 @@ const STEP = 5; // %: finer figures would change all the time
 const SCATTER = 10; // %: errors below this are not worth words
 const TRUE = 80; // %: changes come true
 const UNTRUE = 15; // %: they do not
+const CAPACITY = "capacity of the link"; // in the reason of a decision
 
 const rounded = (share, step = STEP) => step * Math.round((100 * share) / step);
 
@@ -20,6 +21,9 @@ export function believedWords(believed) {
   return believed ? [linkWords(believed), predictionWords(believed)].filter(Boolean).join(" ") : "";
 }
 
+/** Why the total is limited, without what these words say. @param {string[]} reasons  @param {string} words */
+export const furtherReasons = (reasons, words) => reasons.filter((reason) => !(words.startsWith("Link: ") && reason.includes(CAPACITY)));
+
 function linkWords({ kbps, deviation, margin, policer_kbps }) {
   if (policer_kbps !== null) return `Link: drops what exceeds ${about(policer_kbps)} kbit/s.`;
   return deviation > SURE ? "" : `Link: about ${about(kbps)} kbit/s, ${rounded(1 - Math.exp(-margin))} % kept free.`;
@@ -30,7 +34,7 @@ function predictionWords({ bias, error, gain }) {
   const off = rounded(Math.exp(-bias) - 1);
   const scatter = rounded(error);
   const give = scatter >= SCATTER ? ` ± ${scatter} %` : "";
-  const level = off ? `${Math.abs(off)} % too ${off > 0 ? "high" : "low"}` : "right";
+  const level = off >= 100 ? `${Math.round(Math.exp(-bias))} times too high` : off ? `${Math.abs(off)} % too ${off > 0 ? "high" : "low"}` : "right";
   return `Predictions here are ${level}${give}${gain === null ? "" : `, changes ${changeWords(rounded(gain))}`}.`;
 }
 

@@ -3,7 +3,7 @@
 import { inControl, listen, mode, store } from "./store.js";
 import { pending, request, showProblem, whyNoControl } from "./requests.js";
 import { makeSlider } from "./slider.js";
-import { believedWords } from "./believed.js";
+import { believedWords, furtherReasons } from "./believed.js";
 import { byId, make, setText, whole } from "./format.js";
 
 const WHY = {
@@ -56,7 +56,8 @@ function refresh() {
   setText(prediction, whole(store.sample?.predicted_kbps));
   const words = believedWords(mode() ? store.state?.believed : undefined);
   const unlimited = mode() === "automatic" && words ? "" : reason ?? "shared among the cameras by demand and weight";
-  show(why, isLimited ? limitReasons().join("; ") || "limited by a rule" : unlimited);
+  const reasons = limitReasons();
+  show(why, !isLimited ? unlimited : reasons.length ? furtherReasons(reasons, words).join("; ") : "limited by a rule");
   show(believed, words);
   slider.update({ value: wanted, max: maxTotal(), why: reason });
 }
