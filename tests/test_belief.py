@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import exp, inf, isfinite
+from math import exp, inf, isfinite, isnan, log
 from pathlib import Path
 
 import pytest
@@ -15,6 +15,9 @@ from runner.core.evidence import Evidence, EvidenceMemory, observe
 from runner.core.learned import Learned
 from runner.core.policer import Losses, Policer, police
 from runner.core.uplink import LinkReport, ReceivedUnit
+from runner.drive.predictions import compared, worth
+from runner.drive.read import read_drive
+from runner.drive.series import series
 from runner.simulation.figures import Figures
 from runner.simulation.runs import Job, Setup, run_job
 
@@ -244,6 +247,19 @@ def test_a_wrong_prediction_costs_little_against_none() -> None:
         figures = drive("gauss_0.5_5", prediction)
         assert figures["use"] >= none["use"] - 0.05, prediction
         assert figures["p95"] <= none["p95"] + 25, prediction
+
+
+@pytest.mark.slow
+def test_a_drive_tells_what_its_predictions_were_worth(tmp_path: Path) -> None:
+    place = (tmp_path / "drive", 1.77e9)
+    run_job(Setup(WORDS, None), Job("saw", 0.0, "high_50", 1, 30), False, place)
+    done = series(read_drive(place[0]))
+    both = compared(done)
+    assert both and done.believed
+    found = worth(both)
+    assert found.bias == pytest.approx(-log(1.5), abs=0.15)
+    assert isnan(done.believed.bias[0])
+    assert done.believed.bias[-1] == pytest.approx(found.bias, abs=0.2), "as was known while driving"
 
 
 @pytest.mark.slow

@@ -17,15 +17,17 @@ import pytest
 import yaml
 
 from rig import CHECKOUT, free_port
-from runner.core.model import Endpoint
+from runner.core.decision import Believed
+from runner.core.model import Endpoint, Mode
 from runner.errors import RunError
 from runner.metrics.side import metrics_of
 from runner.mqtt.link import ControlLink
-from runner.records import CameraTelemetry, Telemetry
+from runner.records import CameraTelemetry, Telemetry, VehicleState
 
 pytest.importorskip("prometheus_client")
 
 CAMERA = CameraTelemetry(applied={}, frames=10, bytes=2000, encode_ms=4.0)
+BELIEVED = Believed(2431, 0.1, 0.05, bias=-0.2, error=0.1)
 TELEMETRY = Telemetry(1.0, None, None, {"front": CAMERA, "rear": CAMERA}, refused=3)
 
 
@@ -44,6 +46,7 @@ def test_a_side_serves_its_figures_and_its_health() -> None:
     figures.serve(lambda: problems[-1] if problems else None)
     try:
         figures.take(TELEMETRY)
+        figures.take(VehicleState(1.0, "", Mode.AUTOMATIC, 2000, {}, believed=BELIEVED))
         figures.show_online(True)
         status, text = fetch(port, "/metrics")
         assert status == 200
@@ -51,7 +54,9 @@ def test_a_side_serves_its_figures_and_its_health() -> None:
         assert 'tod_camera_encode_seconds{camera="rear",vehicle="car"} 0.004' in text
         assert 'tod_refused_requests_total{vehicle="car"} 3.0' in text
         assert 'tod_vehicle_online{vehicle="car"} 1.0' in text
+        assert 'tod_prediction_bias{vehicle="car"} -0.2' in text
         assert "tod_predicted_kbps{" not in text  # unknown
+        assert "tod_prediction_gain{" not in text
         assert fetch(port, "/health") == (200, "ok\n")
         assert 'tod_healthy{vehicle="car"} 1.0' in text
         problems.append("the control loop hangs in a rule")

@@ -558,6 +558,8 @@ def _believed(belief: Belief, cameras: tuple[Camera, ...]) -> Believed:
 def _why_believed(believed: Believed, evidence: Evidence) -> str:
     if evidence.silent_s:
         return f"nothing has arrived for {evidence.silent_s:.1f} s"
+    if believed.policer_kbps is not None and believed.policer_kbps < believed.kbps:
+        return f"the link drops what exceeds {believed.policer_kbps}"
     return f"capacity of the link, believed to be {believed.kbps}"
 
 

@@ -92,7 +92,8 @@ def carried(drive: Series, t: FloatSeries) -> FloatSeries:
     if believed is None:
         return np.full(t.shape, np.nan)
     kbps, deviation, usable = (
-        held(TimeSeries(believed.t, y), t) for y in (believed.kbps, believed.deviation, believed.usable)
+        held(TimeSeries(believed.t, y), t)
+        for y in (np.fmin(believed.kbps, believed.policer_kbps), believed.deviation, believed.usable)
     )
     known = (deviation <= SURE) & (kbps < USED * usable) & ~_held_up(drive, t)
     return np.where(known, kbps, np.nan)

@@ -14,6 +14,7 @@ EVERY_S = 0.1
 CHANGE_S = 0.4  # over which changes are compared
 CHANGE, CHANGES = 0.1, 5  # ln: a change that is more than noise, and how many must have been seen to tell a delay
 MOST_S = 5.0  # the longest delay that is looked for
+IN_TIME_S = 0.25  # what is believed is some 0.1 to 0.2 s late itself
 ALIKE, LESS = 0.5, 0.05  # correlation of changes with those predicted: least, and by how much less is as good
 
 
@@ -27,24 +28,31 @@ class Compared(NamedTuple):
     @property
     def off(self) -> FloatSeries:
         """ln(carried / predicted)."""
-        return np.log(np.maximum(self.carried, 1.0) / np.maximum(self.predicted, 1.0))
+        return _ln(self.carried) - _ln(self.predicted)
 
 
 class Worth(NamedTuple):
     """bias, error  mean of ln(carried / predicted), and the deviation from it
-    late_s       by how much changes were predicted too late, below 0: too early; nan: it cannot be told
+    late_s       by how much changes were predicted too late, below 0: too early; None: it cannot be told
     """
 
     bias: float
     error: float
-    late_s: float
+    late_s: float | None
 
     @property
     def words(self) -> str:
         share = np.exp(-self.bias) - 1
         level = f"{abs(share):.0%} too {'high' if share > 0 else 'low'}"
-        late = "" if np.isnan(self.late_s) else f", {abs(self.late_s):.1f} s {'late' if self.late_s >= 0 else 'early'}"
-        return f"{level} ± {self.error:.0%}{late}"
+        return f"{level} ± {self.error:.0%}{self._late_words}"
+
+    @property
+    def _late_words(self) -> str:
+        if self.late_s is None:
+            return ""
+        if abs(self.late_s) < IN_TIME_S:
+            return ", in time"
+        return f", {abs(self.late_s):.1f} s {'late' if self.late_s > 0 else 'early'}"
 
 
 def compared(drive: Series) -> Compared | None:
@@ -61,19 +69,23 @@ def compared(drive: Series) -> Compared | None:
 def worth(found: Compared) -> Worth:
     """Over the whole drive."""
     known = found.off[np.isfinite(found.off)]
-    return Worth(float(known.mean()), float(known.std()), _late_s(np.log(found.predicted), np.log(found.carried)))
+    return Worth(float(known.mean()), float(known.std()), _late_s(_ln(found.predicted), _ln(found.carried)))
 
 
-def _late_s(predicted: FloatSeries, came: FloatSeries) -> float:
+def _ln(kbps: FloatSeries) -> FloatSeries:
+    return np.log(np.maximum(kbps, 1.0))
+
+
+def _late_s(predicted: FloatSeries, came: FloatSeries) -> float | None:
     """The delay at which changes of both, ln, are most alike; of several that are as good, the shortest."""
     apart = round(CHANGE_S / EVERY_S)
     p, x = (line[apart:] - line[:-apart] for line in (predicted, came))
     if min(_number(np.abs(change) > CHANGE) for change in (p, x)) < CHANGES:
-        return float("nan")
+        return None
     most = round(MOST_S / EVERY_S)
     alike = {n * EVERY_S: _correlation(p, x, n) for n in range(-most, most + 1)}
     best = max(alike.values())
-    return min((late for late, r in alike.items() if r >= best - LESS), key=abs) if best >= ALIKE else float("nan")
+    return min((late for late, r in alike.items() if r >= best - LESS), key=abs) if best >= ALIKE else None
 
 
 def _number(flags: Flags) -> int:

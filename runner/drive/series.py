@@ -50,7 +50,7 @@ LOOP_S, SAMPLE_S, REPORT_S = 0.1, 0.25, 0.04
 HELD_UP_S = 0.1
 LATE_S = 0.05  # that the vehicle was late to send a frame
 DOWN_DEG = 25.0  # a camera pitched down by this much is a top view, as on the operator's page
-BELIEVED = ("kbps", "deviation", "margin", "bias", "error", "gain")  # of `Believed`, over time
+BELIEVED = ("kbps", "deviation", "margin", "bias", "error", "gain", "policer_kbps")  # of `Believed`, over time
 PANEL_CAMERAS = 4  # number of curves distinguishable in one panel; more are split if the mounting gives no groups
 
 
@@ -178,6 +178,7 @@ class BelievedSeries:
     bias: FloatSeries
     error: FloatSeries
     gain: FloatSeries
+    policer_kbps: FloatSeries
     usable: FloatSeries
 
 

@@ -5,7 +5,7 @@ const STEP = 5; // %: finer figures would change all the time
 const SCATTER = 10; // %: errors below this are not worth words
 const TRUE = 80; // %: changes come true
 const UNTRUE = 15; // %: they do not
-const CAPACITY = "capacity of the link"; // in the reason of a decision
+const SAID = ["capacity of the link", "the link drops"]; // in reasons of decisions
 
 const rounded = (share, step = STEP) => step * Math.round((100 * share) / step);
 
@@ -22,7 +22,7 @@ export function believedWords(believed) {
 }
 
 /** Why the total is limited, without what these words say. @param {string[]} reasons  @param {string} words */
-export const furtherReasons = (reasons, words) => reasons.filter((reason) => !(words.startsWith("Link: ") && reason.includes(CAPACITY)));
+export const furtherReasons = (reasons, words) => reasons.filter((reason) => !words.startsWith("Link: ") || !SAID.some((each) => reason.includes(each)));
 
 function linkWords({ kbps, deviation, margin, policer_kbps }) {
   if (policer_kbps !== null) return `Link: drops what exceeds ${about(policer_kbps)} kbit/s.`;
