@@ -94,9 +94,11 @@ def _number(flags: Flags) -> int:
 
 
 def _correlation(predicted: FloatSeries, came: FloatSeries, later: int) -> float:
-    """Of changes that came with those predicted so many samples later."""
+    """Of changes that came with those predicted so many samples later; 0 if only few of them are known."""
     p, x = (predicted[later:], came[: len(came) - later]) if later >= 0 else (predicted[:later], came[-later:])
     known = np.isfinite(p) & np.isfinite(x)
+    if 2 * known.sum() < np.isfinite(came).sum():
+        return 0.0
     p, x = p[known], x[known]
     power = float((p * p).sum() * (x * x).sum())
     return float((p * x).sum()) / power**0.5 if power else 0.0
