@@ -1,6 +1,6 @@
 """Long repetitions of faults that a drive must survive: signals, stalls, openings, kills, frozen cameras, slow readers,
-new sizes, garbage, reports and links of any kind, clocks that drift apart, outages with keys, addresses that change, variants of
-cameras, bags and players as people own them, and thousands of changes that must leak nothing.
+new sizes, garbage, reports and links of any kind, clocks that drift apart, outages with keys, addresses that change,
+variants of cameras, bags and players as people own them, and thousands of changes that must leak nothing.
 
     make soak                           everything, about 80 minutes on two cores
     SOAK=0.1 make soak                  a tenth of it
