@@ -85,6 +85,12 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     return ByGroup(config, log)
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """To import files none of whose tests is wanted would take each worker seconds."""
+    is_wanted = "not timed and not alone" not in config.option.markexpr or collection_path.stem in UNTIMED
+    return True if collection_path.match("test_*.py") and not is_wanted else None
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     rank = {name: place for place, name in enumerate(LONGEST)}
     items.sort(key=lambda item: rank.get(item.path.stem, len(LONGEST)))
