@@ -225,9 +225,9 @@ def test_every_picture_is_in_the_export_and_can_be_decoded(filmed, tmp_path):
 
 
 @pytest.mark.alone
-def test_received_pictures_get_the_times_at_which_they_were_sent(filmed, tmp_path):
+def test_received_pictures_get_the_times_at_which_they_were_sent(tod, filmed, tmp_path):
     drive, _ = filmed
-    run("export", str(drive), f"output={tmp_path / 'out.mcap'}")
+    tod("export", str(drive), f"output={tmp_path / 'out.mcap'}")
     topics = messages(tmp_path / "out.mcap")
     for name in CAMERAS:
         sent, received = (
@@ -239,9 +239,9 @@ def test_received_pictures_get_the_times_at_which_they_were_sent(filmed, tmp_pat
         assert max(abs(sent[end] - received[end]) for end in same) < 1_000_000  # 1 ms: clocks are read, numbers rounded
 
 
-def test_each_message_is_one_picture_and_keyframes_bring_their_parameters(filmed, tmp_path):
+def test_each_message_is_one_picture_and_keyframes_bring_their_parameters(tod, filmed, tmp_path):
     drive, _ = filmed
-    run("export", str(drive), f"output={tmp_path / 'out.mcap'}")
+    tod("export", str(drive), f"output={tmp_path / 'out.mcap'}")
     _, _, pictures = messages(tmp_path / "out.mcap")["/front/video"]
     for picture in pictures:
         data = fields(picture.data)[3]
@@ -257,15 +257,15 @@ def keys_of(units):
     return [5 in [part[0] & 31 for part in unit.split(b"\0\0\1")[1:]] for unit in units]
 
 
-def test_video_is_encoded_again_with_key_frames(filmed, tmp_path):
+def test_video_is_encoded_again_with_key_frames(tod, filmed, tmp_path):
     """Each picture at its own time; over the change of size within a file."""
     drive, _ = filmed
     plain, again = tmp_path / "plain.mcap", tmp_path / "again.mcap"
-    assert run("export", str(drive), f"output={plain}").returncode == 0
-    done = run("export", str(drive), f"output={again}", "key_interval_s=0.5")
-    assert done.returncode == 0, done.stderr
+    assert tod("export", str(drive), f"output={plain}").status == 0
+    done = tod("export", str(drive), f"output={again}", "key_interval_s=0.5")
+    assert done.status == 0, done.err
     said = "video is encoded again, with a key frame every 0.5 s: it is not what was sent"
-    assert said in done.stderr.splitlines()
+    assert said in done.err.splitlines()
     for topic, (_, _, pictures) in messages(plain).items():
         if not topic.endswith("/video"):
             continue
@@ -284,13 +284,13 @@ def test_video_is_encoded_again_with_key_frames(filmed, tmp_path):
 
 
 @pytest.mark.parametrize("form", ["mcap", "rosbag2"])
-def test_an_export_is_a_source(filmed, tmp_path, form):
+def test_an_export_is_a_source(tod, filmed, tmp_path, form):
     """Its video in either format, played as recorded: all pictures, and the position."""
     from runner.bag import POSITIONS, Bag, PictureForm
 
     drive, _ = filmed
     output = tmp_path / ("out.mcap" if form == "mcap" else "out")
-    assert run("export", str(drive), f"output={output}", f"format={form}").returncode == 0
+    assert tod("export", str(drive), f"output={output}", f"format={form}").status == 0
     with Bag(output) as bag:
         pictures = list(bag.pictures("/front/video"))
         found = bag.form("/front/video")
@@ -306,7 +306,7 @@ def test_an_export_is_a_source(filmed, tmp_path, form):
     assert recorded["frames"] + recorded["left_out_frames"] == kept  # those beyond the camera's rate are left out
 
 
-def test_a_video_that_is_missing_or_damaged_is_reported_and_the_rest_exported(filmed, tmp_path):
+def test_a_video_that_is_missing_or_damaged_is_reported_and_the_rest_exported(tod, filmed, tmp_path):
     drive = tmp_path / "drive"
     shutil.copytree(filmed[0], drive)
     (drive / "video/front.vehicle.0.ts").unlink()
@@ -314,9 +314,9 @@ def test_a_video_that_is_missing_or_damaged_is_reported_and_the_rest_exported(fi
     (drive / "video/rear.vehicle.1.ts").write_bytes(b"")
     cut = drive / "video/front.operator.1.ts"
     cut.write_bytes(cut.read_bytes()[:20_000])
-    done = run("export", str(drive))
-    assert done.returncode == 0
-    warnings = sorted(line for line in done.stderr.splitlines() if "video/" in line)
+    done = tod("export", str(drive))
+    assert done.status == 0
+    warnings = sorted(line for line in done.err.splitlines() if "video/" in line)
     assert warnings == [
         f"{drive}/video/front.vehicle.0.ts: no such file; the export continues without it",
         f"{drive}/video/rear.vehicle.0.ts: contains no readable video; the export continues without it",
@@ -332,16 +332,16 @@ def test_a_video_that_is_missing_or_damaged_is_reported_and_the_rest_exported(fi
 # --- lines ------------------------------------------------------------------------------------------------------------
 
 
-def test_lines_become_messages_with_their_schemas_on_one_clock(tmp_path):
+def test_lines_become_messages_with_their_schemas_on_one_clock(tod, tmp_path):
     drive = tmp_path / "drive"
     write(drive, "drive.jsonl", began("vehicle"), *VEHICLE, ENDED)
     write(drive, "operator.jsonl", began("operator", BEGAN + 1), SAMPLE, {"t": 0.5, "log": "note", "text": "hm"}, ENDED)
     link = {"t": 0.1, "log": "link", "kbps": 3000, "queue_ms": 4.5, "bytes": 1, "packets": 1, "dropped": 0}
     write(drive, "link.jsonl", began("link"), link, ENDED)
-    done = run("export", str(drive))
-    assert (done.returncode, done.stderr) == (0, "")
+    done = tod("export", str(drive))
+    assert (done.status, done.err) == (0, "")
     topics = messages(drive / "drive.mcap")
-    assert done.stdout.startswith(f"{drive}/drive.mcap: {sum(len(found) for *_, found in topics.values())} messages, ")
+    assert done.out.startswith(f"{drive}/drive.mcap: {sum(len(found) for *_, found in topics.values())} messages, ")
     assert set(topics) == {
         "/position",
         "/notes",
@@ -370,11 +370,11 @@ def test_lines_become_messages_with_their_schemas_on_one_clock(tmp_path):
     assert [(note[4], note[3]) for note in notes] == [(b"vehicle", b"front: pipeline built"), (b"operator", b"hm")]
 
 
-def test_positions_are_location_fixes(tmp_path):
+def test_positions_are_location_fixes(tod, tmp_path):
     drive = tmp_path / "drive"
     write(drive, "drive.jsonl", began("vehicle"), *VEHICLE, ENDED)
     write(drive, "operator.jsonl", began("operator"), SAMPLE, ENDED)
-    run("export", str(drive))
+    tod("export", str(drive))
     schema, _, fixes = messages(drive / "drive.mcap")["/position"]
     assert schema.name == "foxglove.LocationFix"
     found = [fields(fix.data) for fix in fixes]
@@ -387,20 +387,20 @@ def test_positions_are_location_fixes(tmp_path):
     assert math.isclose(json.loads(began_with["operator began"]["time"]), BEGAN)
 
 
-def test_an_operator_alone_knows_the_position_too(tmp_path):
+def test_an_operator_alone_knows_the_position_too(tod, tmp_path):
     drive = tmp_path / "drive"
     write(drive, "operator.jsonl", began("operator"), SAMPLE, {**SAMPLE, "t": 0.5, "position": None}, ENDED)
-    run("export", str(drive))
+    tod("export", str(drive))
     (fix,) = messages(drive / "drive.mcap")["/position"][2]
     assert number(fields(fix.data)[1]) == 48.5
 
 
-def test_the_chunks_are_compressed_and_in_the_order_of_time(tmp_path):
+def test_the_chunks_are_compressed_and_in_the_order_of_time(tod, tmp_path):
     drive = tmp_path / "drive"
     ticks = [{"t": n / 10, "event": "clock_advanced"} for n in range(30_000)]
     write(drive, "drive.jsonl", began("vehicle"), *ticks, ENDED)
     write(drive, "operator.jsonl", began("operator"), *({**SAMPLE, "t": n / 4} for n in range(2000)), ENDED)
-    assert run("export", str(drive)).returncode == 0
+    assert tod("export", str(drive)).status == 0
     with (drive / "drive.mcap").open("rb") as file:
         summary = reader.make_reader(file, validate_crcs=True).get_summary()
         file.seek(0)
@@ -414,12 +414,12 @@ def test_the_chunks_are_compressed_and_in_the_order_of_time(tmp_path):
 # --- errors -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_truncated_drive_is_reported_and_exported(tmp_path):
+def test_a_truncated_drive_is_reported_and_exported(tod, tmp_path):
     drive = tmp_path / "drive"
     write(drive, "drive.jsonl", began("vehicle"), *VEHICLE, end='\n{"t": 1.6, "ev')
-    done = run("export", str(drive))
-    assert done.returncode == 0
-    assert "line 8 is truncated" in done.stderr
+    done = tod("export", str(drive))
+    assert done.status == 0
+    assert "line 8 is truncated" in done.err
     assert len(messages(drive / "drive.mcap")["/position"][2]) == 2
 
 
@@ -433,15 +433,15 @@ def test_a_truncated_drive_is_reported_and_exported(tmp_path):
         ([], "drive.jsonl: is empty"),
     ],
 )
-def test_an_invalid_drive_is_reported_in_one_line(tmp_path, lines, expected):
+def test_an_invalid_drive_is_reported_in_one_line(tod, tmp_path, lines, expected):
     (tmp_path / "drive.jsonl").write_text("".join(f"{line}\n" for line in lines))
-    done = run("export", str(tmp_path))
-    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
-    assert done.stderr.startswith(f"{tmp_path}/{expected}")
+    done = tod("export", str(tmp_path))
+    assert (done.status, done.out, done.err.count("\n")) == (2, "", 1)
+    assert done.err.startswith(f"{tmp_path}/{expected}")
     assert [path.name for path in tmp_path.iterdir()] == ["drive.jsonl"]
 
 
-def test_invalid_exports(tmp_path):
+def test_invalid_exports(tod, tmp_path):
     drive = tmp_path / "drive"
     write(drive, "drive.jsonl", began("vehicle"), *VEHICLE, ENDED)
     (tmp_path / "empty").mkdir()
@@ -466,8 +466,8 @@ def test_invalid_exports(tmp_path):
             f"command line: output: '{tmp_path}/none/x.mcap': no such file or directory",
         ),
     ):
-        done = run("export", *words)
-        assert (done.returncode, done.stdout, done.stderr) == (2, "", f"{expected}\n")
+        done = tod("export", *words)
+        assert (done.status, done.out, done.err) == (2, "", f"{expected}\n")
     assert (tmp_path / "there.mcap").read_text() == "precious"
     assert [path.name for path in drive.iterdir()] == ["drive.jsonl"]
 
@@ -511,7 +511,7 @@ def stamped(message):
     return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
 
 
-def test_a_ros_2_bag_has_the_same_content_as_the_mcap_file(filmed, tmp_path):
+def test_a_ros_2_bag_has_the_same_content_as_the_mcap_file(tod, filmed, tmp_path):
     pytest.importorskip("rosbags")
     drive = tmp_path / "drive"
     shutil.copytree(filmed[0], drive)
@@ -519,8 +519,8 @@ def test_a_ros_2_bag_has_the_same_content_as_the_mcap_file(filmed, tmp_path):
     first, *rest = log.read_text().splitlines()
     more = sorted([*VEHICLE, *map(json.loads, rest)], key=lambda line: line["t"])
     log.write_text("\n".join([first, *map(json.dumps, more)]) + "\n")
-    mcap, ros = run("export", str(drive)), run("export", str(drive), "format=rosbag2")
-    assert (mcap.returncode, ros.returncode) == (0, 0), ros.stderr
+    mcap, ros = tod("export", str(drive)), tod("export", str(drive), "format=rosbag2")
+    assert (mcap.status, ros.status) == (0, 0), ros.err
     topics, same = bag_messages(drive / "rosbag2"), messages(drive / "drive.mcap")
     assert topics.keys() == same.keys()
     for topic, (kind, found) in topics.items():
@@ -542,26 +542,26 @@ def test_a_ros_2_bag_has_the_same_content_as_the_mcap_file(filmed, tmp_path):
         else:
             assert kind == "std_msgs/msg/String"
             assert [m.data.encode() for _, m in found] == [message.data for message in same[topic][2]]
-    assert ros.stdout.startswith(f"{drive}/rosbag2: {sum(len(found) for _, found in topics.values())} messages, ")
-    again = run("export", str(drive), "format=rosbag2")
+    assert ros.out.startswith(f"{drive}/rosbag2: {sum(len(found) for _, found in topics.values())} messages, ")
+    again = tod("export", str(drive), "format=rosbag2")
     rule = "already exists; remove it, or choose another path with output="
-    assert (again.returncode, again.stderr) == (2, f"command line: output: '{drive}/rosbag2': {rule}\n")
+    assert (again.status, again.err) == (2, f"command line: output: '{drive}/rosbag2': {rule}\n")
     assert sorted(path.name for path in drive.iterdir() if path.name.startswith(".")) == []
 
 
-def test_a_bag_that_cannot_be_written_is_reported(tmp_path):
+def test_a_bag_that_cannot_be_written_is_reported(tod, tmp_path):
     pytest.importorskip("rosbags")
     write(tmp_path / "drive", "drive.jsonl", began("vehicle"), *VEHICLE, ENDED)
-    done = run("export", str(tmp_path / "drive"), "format=rosbag2", f"output={tmp_path}/none/bag")
-    assert (done.returncode, done.stderr) == (
+    done = tod("export", str(tmp_path / "drive"), "format=rosbag2", f"output={tmp_path}/none/bag")
+    assert (done.status, done.err) == (
         2,
         f"command line: output: '{tmp_path}/none/bag': no such file or directory\n",
     )
 
 
-def test_a_time_that_ros_2_cannot_express_is_reported(tmp_path):
+def test_a_time_that_ros_2_cannot_express_is_reported(tod, tmp_path):
     pytest.importorskip("rosbags")
     write(tmp_path / "drive", "drive.jsonl", began("vehicle") | {"time": 4e9}, *VEHICLE, ENDED)
-    done = run("export", str(tmp_path / "drive"), "format=rosbag2")
+    done = tod("export", str(tmp_path / "drive"), "format=rosbag2")
     rule = "the bag cannot be written: times of ROS 2 end in January 2038, this drive's are later\n"
-    assert (done.returncode, done.stderr) == (1, rule)
+    assert (done.status, done.err) == (1, rule)
