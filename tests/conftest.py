@@ -59,6 +59,12 @@ def tod(capfd: pytest.CaptureFixture[str]) -> Command:
 
 
 @pytest.fixture
+def unprinted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make only the page and report.json of a report: the figures for print take most of the time."""
+    monkeypatch.setattr("runner.drive.print.write_figures", lambda *_: None)
+
+
+@pytest.fixture
 def composed_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Compose each packaged configuration once for all tests that use this."""
 

@@ -78,12 +78,6 @@ def made_with_models(drive: Path, models: Path, tmp_path_factory: pytest.TempPat
     return Report(Result(done.returncode, done.stdout, done.stderr), output)
 
 
-@pytest.fixture
-def unprinted(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Make only the page and report.json: the figures for print take most of the time."""
-    monkeypatch.setattr("runner.drive.print.write_figures", lambda *_: None)
-
-
 def defined(path: Path) -> dict[str, Figure]:
     """The figures of a drive, by name."""
     return {figure.name: figure for figure in figures([statistics(series(read_drive(path)))])[0]}
@@ -156,9 +150,7 @@ def test_with_models_quality_is_estimated(
 
 
 @pytest.mark.usefixtures("unprinted")
-def test_quality_that_was_measured_on_the_pictures_is_shown(
-    tod: Command, drive: Path, tmp_path: Path, unprinted: None
-) -> None:
+def test_quality_that_was_measured_on_the_pictures_is_shown(tod: Command, drive: Path, tmp_path: Path) -> None:
     path = tmp_path / "measured"
     shutil.copytree(drive, path)
     moments = tuple(np.arange(0.5, 19, 0.5))
@@ -239,6 +231,7 @@ def test_several_drives(tod: Command, drive: Path, tmp_path: Path) -> None:
     assert taller > single
 
 
+@pytest.mark.usefixtures("unprinted")
 def test_a_replay_is_compared_by_what_it_allocated(tod: Command, drive: Path, tmp_path: Path) -> None:
     """It used to leave an empty axis, and a row of dashes."""
     replayed = tmp_path / "steadier"

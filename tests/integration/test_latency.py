@@ -31,7 +31,7 @@ RTSP, SRT = ("link=relay",), ("link=netns", "graph=h264_srt")
         pytest.param("vehicle", 1, SRT, marks=[pytest.mark.soak, needs_root]),
     ],
 )
-def test_latencies_are_right_over_a_link_that_delays_one_direction(tmp_path, verb, sign, transport):
+def test_latencies_are_right_over_a_link_that_delays_one_direction(tod, unprinted, tmp_path, verb, sign, transport):
     """One side's clock is set 3.7 s ahead; both are the same clock, so that the true difference is known."""
     env = clock_ahead(tmp_path, AHEAD_MS / 1000, verb)
     path, report = tmp_path / "drive", tmp_path / "report"
@@ -66,7 +66,7 @@ def test_latencies_are_right_over_a_link_that_delays_one_direction(tmp_path, ver
     factors = [line.speed_factor for line in drive.sides["vehicle"].of(Telemetry) if line.t > 3]
     # The displayed value, its maximum error, and 60 ms that are not measured; more while the machine is busy.
     assert 0.4 < max(factors) <= 150 / (ONE_WAY_MS + 60)
-    assert run("report", str(path), f"output={report}").returncode == 0
+    assert tod("report", str(path), f"output={report}").status == 0
     (found,) = json.loads((report / "report.json").read_text())["drives"]
     assert ONE_WAY_MS / 4 < found["latency_arrival_ms"]["bound"] < 2 * ONE_WAY_MS
     assert found["latency_arrival_ms"]["median"] > 0

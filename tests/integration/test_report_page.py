@@ -156,9 +156,8 @@ def test_tables_are_reached_by_keyboard(chromium: Any, single: Path) -> None:
 
 
 def test_several_drives_share_their_axes(
-    chromium: Any, drives: list[Path], tmp_path: Path, screenshots: Path, monkeypatch: pytest.MonkeyPatch
+    chromium: Any, drives: list[Path], tmp_path: Path, screenshots: Path, unprinted: None
 ) -> None:
-    monkeypatch.setattr("runner.drive.print.write_figures", lambda *_: None)  # only the page counts
     with opened(chromium, report(drives, tmp_path / "out")) as page:
         traces = [tuple(each) for each in page.evaluate(TRACES)]
         assert len(traces) == 1 + 2 + 4 + 4 + 3
