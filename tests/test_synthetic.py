@@ -41,10 +41,14 @@ def nothing(what: str, share: float) -> None:
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Everything is compiled here: each of several workers that start together would do it again."""
+    from runner.synthetic.picture import pictures
     from runner.synthetic.world import build_world
 
     file = tmp_path_factory.mktemp("world") / "world"
     build_world(SECONDS, file)
+    for view in (replace(FORWARD, fps=Fraction(1)), replace(TOP, fps=Fraction(1))):
+        next(iter(pictures(view, SECONDS, file)))
     return file
 
 
