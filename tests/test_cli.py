@@ -149,7 +149,11 @@ def test_print_and_replay_never_import_gstreamer(verb: str) -> None:
             "raise ImportError('there is no gi here')",
             "Python module gi: there is no gi here; apt-get install python3-gi",
         ),
-        ("raise AttributeError('half a gi')", "Python module gi: half a gi; apt-get install python3-gi"),
+        pytest.param(
+            "raise AttributeError('half a gi')",
+            "Python module gi: half a gi; apt-get install python3-gi",
+            marks=pytest.mark.soak,
+        ),
         (
             "def require_version(name, version): raise ValueError(f'Namespace {name} not available')",
             "typelib GstRtspServer: Namespace GstRtspServer not available; apt-get install gir1.2-gst-rtsp-server-1.0",

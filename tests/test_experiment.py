@@ -26,7 +26,13 @@ TAIL = "experiment: {about: x, duration_s: 5}\n"
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", options("experiment", [directory("conf")]))
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[] if name in ("bottleneck", "driving_test") else pytest.mark.soak)
+        for name in options("experiment", [directory("conf")])
+    ],  # `validate all=true` in test_validate.py composes all of them
+)
 def test_every_packaged_experiment_and_each_of_its_runs_can_be_driven(name: str) -> None:
     config = configuration([f"experiment={name}"], runnable=False)
     experiment, link = config.experiment(), config.link()

@@ -122,14 +122,14 @@ def test_a_worker_process_that_dies_is_reported(tod: Command, conf: UserConf, mo
 @pytest.mark.parametrize(
     "words",
     [
-        ["pqos=trace"],
+        pytest.param(["pqos=trace"], marks=pytest.mark.soak),
         ["graph=h264_srt", "vehicle=delivery_robot"],
-        ["cameras.rear_center.weight=2"],
+        pytest.param(["cameras.rear_center.weight=2"], marks=pytest.mark.soak),
         ["+experiment=driving_test"],
     ],
 )
-def test_a_choice_is_not_combined_with_unchosen_files(words: list[str]) -> None:
-    result = process("validate", *words)
+def test_a_choice_is_not_combined_with_unchosen_files(tod: Command, words: list[str]) -> None:
+    result = tod("validate", *words)
     assert (result.status, result.err) == (0, "")
     files = sum(map(count, (".", *GROUPS)))
     assert result.out.splitlines()[0] == f"valid: {files} files, 1 configuration"

@@ -23,7 +23,10 @@ PROGRAMS = ("tod-runner", "mosquitto_", "t=$(", "ffplay", "make", "pip")
 # `make test` runs this; test_api.py installs the wheel; a player needs a screen, and test_lines.py plays without one
 NOT_RUN = ("make", "pip", "ffplay", "tod-runner demo log=drive ")  # `place` runs the last
 # `make soak` runs these; test_live.py drives over each graph.
-LONG = ("tod-runner demo experiment=", "tod-runner demo graph=", "tod-runner model vehicle=")
+LONG = (
+    *("tod-runner demo experiment=", "tod-runner demo graph=", "tod-runner demo vehicle=", "tod-runner model vehicle="),
+    "tod-runner record vehicle=delivery_robot",
+)
 FEWER = [f"~cameras.top_{side}" for side in ("front", "left", "right", "rear")]
 SMALL = [
     f"cameras.{name}.{key}"
@@ -169,7 +172,9 @@ def check_shell(lines: list[str], place: Path) -> None:
 
 @pytest.mark.parametrize("document", dict.fromkeys(reversed(COMMANDS.values())), ids=lambda path: path.stem)
 @pytest.mark.parametrize("long", [False, pytest.param(True, marks=pytest.mark.soak)], ids=["short", "long"])
-def test_commands_run(document: Path, long: bool, place: Path, tod: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_commands_run(
+    document: Path, long: bool, place: Path, tod: Command, monkeypatch: pytest.MonkeyPatch, unprinted: None
+) -> None:
     monkeypatch.chdir(place)
     lines = [line for line in commands(document) if COMMANDS[line] == document and not line.startswith(NOT_RUN)]
     if long:
