@@ -113,7 +113,7 @@ def others_leave(broker, stack, number, tmp_path):
     until(lambda: gone <= set(notes(tmp_path)))
 
 
-@pytest.mark.parametrize("stall_s", [2.2, 4.0])
+@pytest.mark.parametrize("stall_s", [pytest.param(2.2, marks=pytest.mark.soak), 4.0])
 def test_a_stalled_operator_is_back_when_it_wakes(broker, vehicle, ports, stall_s, tmp_path):
     """The broker may or may not have closed its connection meanwhile."""
     waking_of_a_stalled_operator(broker, ports, stall_s, tmp_path)

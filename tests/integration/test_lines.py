@@ -14,10 +14,10 @@ from rig import CLIPS, free_port, run, streaming, until
 GRAPHS = ["h264_rtsp", "openh264_rtsp", "h264_srt"]
 
 
-def printed(*words):
-    done = run("print", "format=json", "total_kbps=6000", *words)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)["cameras"]
+def printed(tod, *words):
+    done = tod("print", "format=json", "total_kbps=6000", *words)
+    assert done.status == 0, done.err
+    return json.loads(done.out)["cameras"]
 
 
 def start(line):
@@ -33,10 +33,10 @@ def end(process):
 
 
 @pytest.mark.parametrize("graph", GRAPHS)
-def test_a_printed_pair_of_lines_sends_and_shows_the_decided_size(graph):
-    camera = printed("source=test", f"graph={graph}", f"graph.first_port={free_port(3)}", "vehicle=delivery_robot")[
-        "rear"
-    ]
+def test_a_printed_pair_of_lines_sends_and_shows_the_decided_size(tod, graph):
+    camera = printed(
+        tod, "source=test", f"graph={graph}", f"graph.first_port={free_port(3)}", "vehicle=delivery_robot"
+    )["rear"]
     operator = start(camera["operator"])
     vehicle = start(camera["vehicle"])
     size = f"width=(int){camera['decision']['width']}, height=(int){camera['decision']['height']}"
@@ -47,7 +47,7 @@ def test_a_printed_pair_of_lines_sends_and_shows_the_decided_size(graph):
         end(vehicle)
 
 
-@pytest.mark.parametrize("source", ["test", "appsrc", "synthetic"])
+@pytest.mark.parametrize("source", [pytest.param("test", marks=pytest.mark.soak), "appsrc", "synthetic"])
 def test_every_line_of_the_paper_s_vehicle_runs(source, tmp_path):
     """Also with a stand-in: for frames generated in Python, and for a drive that is not rendered."""
     done = run("print", "format=json", f"source={source}", env={"XDG_CACHE_HOME": str(tmp_path)})
@@ -60,7 +60,7 @@ def test_every_line_of_the_paper_s_vehicle_runs(source, tmp_path):
         assert "ERROR" not in end(process)
 
 
-def test_a_clip_with_blanks_in_its_path_plays(tmp_path):
+def test_a_clip_with_blanks_in_its_path_plays(tod, tmp_path):
     clip = tmp_path / "it's a clip.mp4"
     if CLIPS:
         shutil.copy(CLIPS[2], clip)
@@ -68,7 +68,7 @@ def test_a_clip_with_blanks_in_its_path_plays(tmp_path):
         line = "videotestsrc num-buffers=50 ! x264enc ! mp4mux ! filesink location=clip.mp4"
         subprocess.run(["gst-launch-1.0", "-q", *line.split()], cwd=tmp_path, check=True)
         (tmp_path / "clip.mp4").rename(clip)
-    camera = printed("source=file", f'source.clip="{clip}"', "vehicle=delivery_robot")["rear"]
+    camera = printed(tod, "source=file", f'source.clip="{clip}"', "vehicle=delivery_robot")["rear"]
     process = start(camera["vehicle"])
     until(lambda: "PLAYING" in process.stdout.readline())
     assert "ERROR" not in end(process)

@@ -31,6 +31,8 @@ SETTLE_S, MEASURE_S = 2.0, 4.0
 
 
 KINDS = [pytest.param("netns", marks=needs_root), "relay"]
+# Over a relay there are also the drives of test_latency.py and test_live.py.
+MAINLY_NETNS = [KINDS[0], pytest.param("relay", marks=pytest.mark.soak)]
 WIDE = Limit(lambda t: 5000, queue_ms=200, delay_ms=0)
 
 
@@ -126,7 +128,7 @@ def _names():
     return {line.split()[0].partition("@")[0] for lines in outputs for line in lines.splitlines()}
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", MAINLY_NETNS)
 def test_a_wide_link_passes_everything(kind):
     with driving(kind, lambda t: 5000, sent_kbps=1000) as drive:
         drive.settle()
@@ -136,7 +138,7 @@ def test_a_wide_link_passes_everything(kind):
 
 
 @pytest.mark.alone
-@pytest.mark.parametrize("kind", [KINDS[0], pytest.param("relay", marks=pytest.mark.soak)])
+@pytest.mark.parametrize("kind", MAINLY_NETNS)
 def test_a_narrow_link_passes_its_rate_and_follows_the_trace(kind):
     def kbps_at(t):
         return 5000 if t < 1 else 1000 if t < 7 else 1500
@@ -218,7 +220,7 @@ def _narrow(client, kbps):
     return lambda: passed
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", MAINLY_NETNS)
 def test_a_delay_is_added_to_the_wait(kind):
     with driving(kind, lambda t: 5000, sent_kbps=1000, delay_at=lambda t: 200) as drive:
         drive.settle()

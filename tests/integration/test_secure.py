@@ -750,7 +750,7 @@ def captured(address):
         ("h264_rtsp", True),
         ("h264_rtsp", False),
         ("h264_srt", True),
-        ("h264_srt", False),
+        pytest.param("h264_srt", False, marks=pytest.mark.soak),
     ],
 )
 def test_nothing_on_the_wire_can_be_read(keys, encrypted, graph, tmp_path):
