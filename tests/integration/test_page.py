@@ -73,7 +73,7 @@ def demo():
         "fps_max=5",  # so that counts are meaningful on two cores that also run the tests
         *(f"cameras.{name}.width_px={width}" for name, (width, _) in SIZES.items()),
         *(f"cameras.{name}.height_px={height}" for name, (_, height) in SIZES.items()),
-        "pqos.position.speed_mps=32",  # one loop in 25 s
+        "pqos.position.speed_mps=64",  # one loop in 13 s
     )
     with process("demo", *words, stdout=subprocess.DEVNULL) as child:
         until(lambda: answers(port) or child.poll() is not None, seconds=300)  # the drive may have to be rendered
@@ -497,7 +497,7 @@ def test_drive_shows_what_a_driver_must_not_miss(page):
     viewing(page, "drive")
     until(lambda: re.fullmatch(r"\d+ ± \d+ ms", page.inner_text("#worst")))
     until(lambda: page.inner_text("#worst-of").removeprefix("worst: ").replace(" ", "_") in TUM)
-    until(lambda: page.inner_text("#driven") == "115 km/h")  # 32 m/s
+    until(lambda: page.inner_text("#driven") == "230 km/h")  # 64 m/s
     assert page.inner_text("#advised") == "no speed advised"
     shape = """level => {
       const figure = document.querySelector("#speed-now");
