@@ -151,7 +151,7 @@ def decided(lines):
     return [line for line in lines if line.get("log") == "decision"]
 
 
-def test_a_killed_vehicle_leaves_a_drive_that_can_be_read(broker, vehicle, tmp_path):
+def test_a_killed_vehicle_leaves_a_drive_that_can_be_read(tod, broker, vehicle, tmp_path):
     operator = Operator(broker)
     operator.state(lambda state: state["online"])
     time.sleep(1)
@@ -160,7 +160,7 @@ def test_a_killed_vehicle_leaves_a_drive_that_can_be_read(broker, vehicle, tmp_p
     drive = read_drive(tmp_path / "drive")
     assert drive.warnings[-1].endswith("was not closed; the process was killed or is still running")
     assert len(drive.sides["vehicle"].lines) > 10
-    assert run("replay", f"input={tmp_path / 'drive'}").returncode == 0
+    assert tod("replay", f"input={tmp_path / 'drive'}").status == 0
 
 
 @pytest.mark.soak

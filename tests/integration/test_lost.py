@@ -37,7 +37,7 @@ def decided(lines):
 
 
 @needs_clips
-def test_a_vehicle_drives_without_a_camera_until_it_is_found(broker, tmp_path):
+def test_a_vehicle_drives_without_a_camera_until_it_is_found(tod, broker, tmp_path):
     """Its share goes to the others, and a replay decides the same."""
     clip, drive = tmp_path / "clip.mp4", tmp_path / "drive"
     own = ("+source@cameras.mast.source=file", f"cameras.mast.source.clip={clip}")
@@ -62,8 +62,8 @@ def test_a_vehicle_drives_without_a_camera_until_it_is_found(broker, tmp_path):
     assert "mast: found again" in output
     reported, lines = events(drive)
     assert [event["works"] for event in reported] == [False, True]
-    done = run("replay", f"input={drive}", f"log={tmp_path / 'again'}", f"output={tmp_path / 'decisions'}")
-    assert done.returncode == 0, done.stderr
+    done = tod("replay", f"input={drive}", f"log={tmp_path / 'again'}", f"output={tmp_path / 'decisions'}")
+    assert done.status == 0, done.err
     assert decided(lines) == decided(events(tmp_path / "again")[1])
 
 

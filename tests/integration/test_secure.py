@@ -23,7 +23,7 @@ from helpers import out_of_reach
 from mcap.reader import make_reader
 from soak.signals import MARK, marked_processes
 
-from rig import LOOPBACK6, free_port, needs_root, passes, process, run, small_robot, until
+from rig import LOOPBACK6, free_port, needs_root, passes, process, small_robot, until
 from rtsp_client import RtspClient, client_hello, tls
 from runner.core.commands import Command
 from runner.core.model import Endpoint
@@ -670,7 +670,7 @@ def _unencrypted(plan):
 
 
 @pytest.mark.parametrize("graph", ["h264_rtsp", pytest.param("h264_srt", marks=pytest.mark.soak)])
-def test_a_demo_with_keys_streams_and_shows_no_secret(keys, tmp_path, graph):
+def test_a_demo_with_keys_streams_and_shows_no_secret(tod, keys, tmp_path, graph):
     """Neither in its output nor its drive, nor the MCAP of that, nor what a list of processes shows.
 
     Its page is served to other machines, so that all kinds of secrets are in use.
@@ -691,7 +691,7 @@ def test_a_demo_with_keys_streams_and_shows_no_secret(keys, tmp_path, graph):
     assert demo.returncode == 0, output
     sampled = list(read_drive(drive).sides["operator"].of(Sample))
     assert min(camera.frames for camera in sampled[-1].cameras.values()) > 20
-    run("export", str(drive))
+    assert tod("export", str(drive)).status == 0
     with (drive / "drive.mcap").open("rb") as file:
         mcap = make_reader(file)
         exported = [message.data for *_, message in mcap.iter_messages()]
