@@ -272,8 +272,8 @@ def test_an_experiment_is_driven_over_a_limited_link_and_reported(tmp_path):
     words = (f"conf={tmp_path / 'conf'}", "experiment=mine", *ports, f"output={tmp_path / 'out'}")
     done = run("demo", *words)
     assert done.returncode == 0, done.stderr
-    assert "was not applied" not in done.stderr
-    assert done.stderr.count("the request at 100 s was not made: the drive ended before") == 2
+    assert "was not applied" not in done.stdout
+    assert done.stdout.count("the request at 100 s was not made: the drive ended before") == 2
     for name in ("equal", "paper"):
         drive = read_drive(tmp_path / "out" / name)
         assert (sorted(drive.sides), drive.warnings) == (["link", "operator", "vehicle"], [])
