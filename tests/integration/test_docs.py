@@ -25,7 +25,7 @@ NOT_RUN = ("make", "pip", "ffplay", "tod-runner demo log=drive ")  # `place` run
 # `make soak` runs these; test_live.py drives over each graph.
 LONG = (
     *("tod-runner demo experiment=", "tod-runner demo graph=", "tod-runner demo vehicle=", "tod-runner model vehicle="),
-    "tod-runner record vehicle=delivery_robot",
+    *("tod-runner record vehicle=delivery_robot", "tod-runner tune "),
 )
 FEWER = [f"~cameras.top_{side}" for side in ("front", "left", "right", "rear")]
 SMALL = [
