@@ -205,7 +205,7 @@ def _add_frames(memory: EvidenceMemory, units: tuple[ReceivedUnit, ...], at: flo
 
 def _path(paths: Mapping[str, Path], unit: ReceivedUnit, first: float) -> Path:
     """The path of a camera once its frame, whose first packet arrived then, is known."""
-    delay = first - unit.captured - unit.late
+    delay = first - unit.captured  # `late` may be too long, which would make the path look too short for good
     path = paths.get(unit.camera)
     if path is None:
         # A camera that starts while a queue lasts would mistake it for its path.
