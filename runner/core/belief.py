@@ -31,6 +31,8 @@ OPTIMISM = (
     0.1  # ln: by so much more is sent after HORIZON_S in which no frame waited; after twice the time, twice as much
 )
 CREDIT, MOST_CREDIT_KBIT = 0.3, 80.0  # weight of one comparison of trains with the rate of the busy link, and its limit
+FORGET = 10.0
+AT_ONCE = 0.75  # share of a train
 YIELDED = 1 / 3  # of the best capacity: competing traffic gets no more than the rest
 BEST_S = 60.0  # memory of the best capacity
 LOSSY, LOSS_S = 0.1, 0.5  # share of losses, in this time, that random loss does not reach
@@ -139,7 +141,8 @@ def observe(b: Belief, t: float, seen: Evidence, rtt_s: float) -> Belief:
     dt = min(LONGEST_S, t - b.t)
     b = b._replace(v=min(1.0, b.v + DRIFT * dt), t=t, reported=t)
     if seen.kbit:
-        b = _weigh(_measure_queue(b, seen), seen, rtt_s)._replace(observed=t)
+        weighed = _weigh(_measure_queue(b, seen), seen, rtt_s)
+        b = weighed._replace(m=min(weighed.m, b.m + HIGHEST_STEP), observed=t)
     b = b._replace(levels=recorded(b.levels, t, b.m, 1.0))
     return b._replace(learned=b.learned.judged(t, dt, b.levels)) if seen.kbit else b
 
@@ -238,7 +241,7 @@ def _weigh(b: Belief, seen: Evidence, rtt_s: float) -> Belief:
         expected_s = seen.train_kbit / kbps
         surprise = _surprise(expected_s, seen.train_s)
         b = _weigh_trains(b, surprise, expected_s, seen.train_s, seen.trains, seen.backlog)
-    least = seen.idle_kbit - seen.idle * max(0.0, b.credit)
+    least = seen.idle_kbit - seen.idle * b.credit
     if least > seen.idle_kbit / 2:
         slower = _surprise(seen.idle_kbit / kbps, seen.idle_s)
         surprise = slower if slower < 0 else max(0.0, _surprise(least / kbps, seen.idle_s))
@@ -260,7 +263,10 @@ def _weigh_busy(b: Belief, seen: Evidence, kbps: float) -> Belief:
     if number and b.t - b.waited < STUCK_S:
         # What these trains got at once. A link that changed meanwhile is no reason: the faster rate is the one to meet.
         saved = (kbit - took_s * max(busy, b.busy)) / number
-        credit += CREDIT * (max(-MOST_CREDIT_KBIT, min(MOST_CREDIT_KBIT, saved)) - credit)
+        if saved > AT_ONCE * kbit / number:  # the whole train: longer ones may pass at once, too
+            saved = max(credit, 2 * saved)
+        saved = max(0.0, min(MOST_CREDIT_KBIT, saved))
+        credit += (CREDIT if saved > credit else CREDIT / FORGET) * (saved - credit)
     b = b._replace(waited=b.t, busy=busy, credit=credit, trains=NO_TRAINS)
     surprise = _surprise(seen.busy_kbit / kbps, seen.busy_s)
     after = _update(b, surprise, seen.busy_kbit / kbps, seen.busy_s, 2, seen.backlog)

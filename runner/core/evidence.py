@@ -18,7 +18,7 @@ from typing import NamedTuple
 from runner.core.uplink import BUCKET_S, EXPIRED_S, GAP_S, ONE_CLOCK_S, SAME_S, LinkReport, ReceivedUnit
 
 JITTER_S = 0.004  # of an arrival: half of 8 ms, a usual grant cycle of a mobile uplink
-BUSY_S = JITTER_S / 4  # a frame that waited longer found the link busy
+BUSY_S = JITTER_S  # a frame that waited longer found the link busy; it may have been sent late by less
 GAP_INTERVALS = 1.5  # frame intervals without a frame are no gap, either
 FIRST_INTERVAL_S = 1 / 15
 
