@@ -60,6 +60,16 @@ def test_frames_with_missing_packets_are_no_evidence() -> None:
     assert evidence.lost_kbit == pytest.approx(2 / 8 * evidence.kbit)
 
 
+def test_a_frame_that_was_sent_late_does_not_shorten_its_path() -> None:
+    """It came 20 ms later than usual, and states 50: the next ones would seem to wait for good."""
+    memory, _ = observe(EvidenceMemory(), LinkReport(0.98, (unit("front", 0.9, 0.9 + PATH_S),), 4))
+    late = ReceivedUnit("front", 1.0, 1.0 + PATH_S + 0.02, 5000, late=0.05)
+    memory, _ = observe(memory, LinkReport(1.06, (late,), 4))
+    _, evidence = observe(memory, LinkReport(1.14, (unit("front", 1.1, 1.1 + PATH_S),), 4))
+    assert evidence
+    assert evidence.wait_s == pytest.approx(0.0)
+
+
 def test_what_a_stalled_link_releases_is_no_evidence() -> None:
     """Nothing came for a second; then three frames at once."""
     memory, _ = observe(EvidenceMemory(), LinkReport(0.2, (unit("front", 0.0, 0.03),), 4))

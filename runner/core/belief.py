@@ -31,8 +31,8 @@ OPTIMISM = (
     0.1  # ln: by so much more is sent after HORIZON_S in which no frame waited; after twice the time, twice as much
 )
 CREDIT, MOST_CREDIT_KBIT = 0.3, 80.0  # weight of one comparison of trains with the rate of the busy link, and its limit
-FORGET = 10.0
-AT_ONCE = 0.75  # share of a train
+FORGET = 10.0  # times slower is a credit forgotten than learned: one that is too low lets the total overshoot
+AT_ONCE = 0.75  # share of a train: if so much of it passed at once, a longer one might have, too
 YIELDED = 1 / 3  # of the best capacity: competing traffic gets no more than the rest
 BEST_S = 60.0  # memory of the best capacity
 LOSSY, LOSS_S = 0.1, 0.5  # share of losses, in this time, that random loss does not reach
