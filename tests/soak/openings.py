@@ -5,9 +5,9 @@ from __future__ import annotations
 import random
 import time
 
-from system import Watched, newest, player, running
+from system import Watched, flowing, newest, player, running
 
-from rig import free_port
+from rig import free_port, until
 
 STATES = ("sending", "switched off", "paused")
 EVERY = 8  # openings between two checks of the watched camera
@@ -17,7 +17,8 @@ def soak(seed: int, scale: float) -> list[str]:
     """rear is in one of the states, mast is an IP camera that delivers nothing; front is watched."""
     rng, problems = random.Random(seed), []
     dead = f'cameras.mast.source.address="rtsp://127.0.0.1:{free_port()}/none"'
-    with running("+source@cameras.mast.source=rtsp", dead) as (system, operator):
+    with running("+source@cameras.mast.source=rtsp", dead, complete=False) as (system, operator):
+        until(lambda: flowing(operator, ("front", "rear")), every_s=0.1)
         watched = Watched(system, operator)
         for number in range(max(EVERY, round(64 * scale))):
             state, transport = rng.choice(STATES), rng.choice(("tcp", "udp"))
