@@ -269,6 +269,7 @@ def _weigh_busy(b: Belief, seen: Evidence, kbps: float) -> Belief:
         credit += (CREDIT if saved > credit else CREDIT / FORGET) * (saved - credit)
     b = b._replace(waited=b.t, busy=busy, credit=credit, trains=NO_TRAINS)
     surprise = _surprise(seen.busy_kbit / kbps, seen.busy_s)
+    # It lies between two arrivals, each with its error.
     after = _update(b, surprise, seen.busy_kbit / kbps, seen.busy_s, 2, seen.backlog)
     is_steady = abs(seen.growth) * REPORT_S < JITTER_S and b.loss < LOSSY
     if surprise < 0 and is_steady:  # A longer path looks as busy, and as narrow as what is sent.

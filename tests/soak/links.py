@@ -11,10 +11,11 @@ import heapq
 import math
 import random
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from itertools import count
 from statistics import fmean
+
+import batches
 
 from runner.core import belief, evidence
 from runner.core.uplink import LinkReport, ReceivedUnit
@@ -30,16 +31,7 @@ ONE_WAY_S = 0.015
 
 
 def soak(seed: int, scale: float) -> list[str]:
-    links = max(BATCH, round(LINKS * scale))
-    batches = [seed * LINKS + first for first in range(0, links, BATCH)]
-    with ProcessPoolExecutor() as pool:
-        problems = [problem for found in pool.map(_batch, batches) for problem in found]
-    print(f"{len(batches) * BATCH} links", flush=True)
-    return problems
-
-
-def _batch(first: int) -> list[str]:
-    return [f"seed {seed}: {what}" for seed in range(first, first + BATCH) if (what := link(seed))]
+    return batches.problems(link, "links", seed, LINKS, scale, BATCH)
 
 
 def link(seed: int) -> str:

@@ -9,9 +9,10 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from functools import cache
 from typing import Any
+
+import batches
 
 from runner.configuration.config import configuration
 from runner.core import events
@@ -39,16 +40,7 @@ def vehicle() -> Vehicle:
 
 
 def soak(seed: int, scale: float) -> list[str]:
-    count = max(BATCH, round(SEQUENCES * scale))
-    batches = [seed * SEQUENCES + first for first in range(0, count, BATCH)]
-    with ProcessPoolExecutor() as pool:
-        problems = [problem for found in pool.map(_batch, batches) for problem in found]
-    print(f"{len(batches) * BATCH} sequences of reports", flush=True)
-    return problems
-
-
-def _batch(first: int) -> list[str]:
-    return [f"seed {seed}: {what}" for seed in range(first, first + BATCH) if (what := sequence(seed))]
+    return batches.problems(sequence, "sequences of reports", seed, SEQUENCES, scale, BATCH)
 
 
 def sequence(seed: int) -> str:
