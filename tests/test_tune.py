@@ -168,6 +168,8 @@ def test_the_figure_is_drawn(tmp_path: Path) -> None:
             ["vary=automatic.total_from_prediction.start_kbps=3000"],
             "vary: automatic.total_from_prediction.start_kbps=3000: gives no value but those in force",
         ),
+        (["seeds=5-3"], "seeds: '5-3': must be their number, or the first and the last: 3 or 100-102"),
+        (["seeds=1-99999999"], "seeds: '1-99999999': must be 1000 at most"),
         (["duration_s=3"], "duration_s: 3: must be at least 4: the first 3 s do not count"),
         (["figure=x.txt"], "figure: 'x.txt': must end in .png, .pdf, .svg"),
     ],

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 ALL, SYNTHETIC = "all", "synthetic"
 SHORTEST_S = 1.0  # that counts
+MOST_SEEDS = 1000  # each is a drive for every link and prediction
 FORMATS = (".png", ".pdf", ".svg")  # of the figure
 Place = tuple[Path, float]  # directory of a drive, and when it began, s since 1970
 
@@ -81,10 +82,12 @@ def _repeated(arguments: Arguments) -> str:
 
 def seeds(arguments: Arguments, default: str = "1") -> range:
     text = arguments.values.get("seeds", default)
-    found = re.fullmatch(r"(?:(\d+)-)?(\d+)", text, re.ASCII)
+    found = re.fullmatch(r"(?:(\d{1,9})-)?(\d{1,9})", text, re.ASCII)
     first, last = (int(found[1] or 1), int(found[2])) if found else (1, 0)
     if not 1 <= first <= last:
         raise ArgumentError("seeds", repr(text), "must be their number, or the first and the last: 3 or 100-102")
+    if last - first >= MOST_SEEDS:
+        raise ArgumentError("seeds", repr(text), f"must be {MOST_SEEDS} at most")
     return range(first, last + 1)
 
 
