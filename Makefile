@@ -83,7 +83,7 @@ uplink-given:
 	@test -f "$(UPLINK)" || { echo 'make deadspot needs UPLINK=FILE.csv: a recorded uplink with the columns t_s (s) and uplink_kbps (kbit/s)' >&2; exit 2; }
 
 soak: $(TEST_READY) $(NODE_READY)
-	PYTHONPATH=tests/integration $(BIN)/python tests/soak $(PARTS)
+	PYTHONPATH=tests:tests/integration $(BIN)/python tests/soak $(PARTS)
 
 setup: $(READY)
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from itertools import count
 from statistics import fmean
 
-import batches
+from soak import batches
 
 from runner.core import belief, evidence
 from runner.core.uplink import LinkReport, ReceivedUnit

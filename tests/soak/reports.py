@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from functools import cache
 from typing import Any
 
-import batches
+from soak import batches
 
 from runner.configuration.config import configuration
 from runner.core import events
