@@ -62,6 +62,7 @@ class Belief(NamedTuple):
     total       kbit/s on the wire that may be sent
     learned     of predictions
     innovation  what remained of the last surprise
+    before      that of the previous report
     noise       variance of the error of an arrival time, s^2
     margin      ln
     best        the best recent x
@@ -74,6 +75,7 @@ class Belief(NamedTuple):
     busy        the rate of the link when it was last busy, kbit/s
     credit      kbit that an idle link passes at once
     trains      (kbit, s, number) of the trains of an idle link since `waited`
+    within      (kbit, s) of the trains of a busy link, forgotten with LOSS_S
     """
 
     t: float
@@ -84,6 +86,7 @@ class Belief(NamedTuple):
     total: float
     learned: Learned
     innovation: float = 0.0
+    before: float = 0.0
     noise: float = JITTER_S**2
     margin: float = THIN
     best: float = -inf
@@ -97,6 +100,7 @@ class Belief(NamedTuple):
     busy: float = 0.0
     credit: float = 0.0
     trains: tuple[float, float, int] = NO_TRAINS
+    within: tuple[float, float] = (0.0, 0.0)
     policer: Policer = Policer()
     levels: History[float] = ()
     forwards: History[float] = ((-inf, 0.0),)
@@ -235,6 +239,7 @@ def _weigh(b: Belief, seen: Evidence, rtt_s: float) -> Belief:
     # Changes of the prediction since these frames were served do not apply to them.
     later = b.forward - (value_at(b.forwards, served) or 0.0) if b.forwards[-1][0] > served else 0.0
     kbps = exp(b.m - later)
+    b = b._replace(before=b.innovation)
     if seen.busy_kbit and seen.busy_s:
         b = _weigh_busy(b, seen, kbps)
     if seen.trains and seen.train_kbit:
@@ -254,7 +259,7 @@ def _weigh(b: Belief, seen: Evidence, rtt_s: float) -> Belief:
     if seen.idle:
         kbit, took_s, number = b.trains
         b = b._replace(trains=(kbit + seen.idle_kbit, took_s + seen.idle_s, number + seen.idle))
-    return _contend(b, seen.growth)
+    return _contend(b, seen)
 
 
 def _weigh_busy(b: Belief, seen: Evidence, kbps: float) -> Belief:
@@ -306,7 +311,8 @@ def _update(b: Belief, surprise: float, expected_s: float, seen_s: float, pieces
     if not surprise or (backlog and surprise > 0):
         return b
     scale = max(expected_s, RARE * seen_s) ** 2 / pieces
-    noise, repeated = b.noise, surprise * b.innovation
+    # What passes at once shows in busy frames and in trains of one report: to be a rise, it must last.
+    noise, repeated = b.noise, surprise * (b.before if surprise > 0 else b.innovation)
     if repeated <= 0:  # innovations of one sign are a change, not noise
         new = scale * min(1.0, max(0.0, surprise * surprise - b.v))
         noise += REPORT_S / MEMORY_S * (min(GOAL_S**2, max(LEAST_JITTER_S**2, new)) - noise)  # a queue is no noise
@@ -316,11 +322,16 @@ def _update(b: Belief, surprise: float, expected_s: float, seen_s: float, pieces
     return b._replace(m=m, v=max(DRIFT * REPORT_S / 2, (1 - k) * v), innovation=(1 - k) * surprise, noise=noise)
 
 
-def _contend(b: Belief, growth: float) -> Belief:
-    """The best capacity falls fast only while less is served than is sent: then the link itself is narrow."""
+def _contend(b: Belief, seen: Evidence) -> Belief:
+    """The best capacity is one of the link itself, of which competing traffic takes a part."""
     dt = min(LONGEST_S, b.t - b.observed)
-    slower = log1p(max(-0.9, growth)) - log1p(-min(0.9, b.loss))
-    best = b.best
-    if slower > THICK and (b.queue > GOAL_S or b.loss > LOSSY):
-        best -= slower * dt / REPORT_S
+    kbit, took_s = (keep * exp(-dt / LOSS_S) for keep in b.within)
+    kbit, took_s = kbit + seen.train_kbit, took_s + seen.train_s
+    b = b._replace(within=(kbit, took_s))
+    if took_s > JITTER_S:  # Others send between frames, not within one.
+        return b._replace(best=max(b.m, min(b.best, log(kbit / took_s))))
+    # Without trains: the link is narrow while less is served than is sent.
+    slower = log1p(max(-0.9, seen.growth)) - log1p(-min(0.9, b.loss))
+    is_narrow = slower > THICK and (b.queue > GOAL_S or b.loss > LOSSY)
+    best = b.best - slower * dt / REPORT_S * is_narrow
     return b._replace(best=max(b.m, best - (best - b.m) * dt / BEST_S))
