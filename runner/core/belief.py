@@ -11,6 +11,7 @@ the share TAIL of the time (adaptive conformal inference; Gibbs and Candès 2021
 from __future__ import annotations
 
 from math import exp, inf, log, log1p
+from statistics import median
 from typing import NamedTuple
 
 from runner.core.evidence import JITTER_S, Evidence
@@ -36,6 +37,7 @@ AT_ONCE = 0.75  # share of a train: if so much of it passed at once, a longer on
 YIELDED = 1 / 3  # of the best capacity: competing traffic gets no more than the rest
 BEST_S = 60.0  # memory of the best capacity
 LOSSY, LOSS_S = 0.1, 0.5  # share of losses, in this time, that random loss does not reach
+MANY = 10
 STUCK_S = 2.0  # a queue that is constant for this long while the link is not busy is a longer path
 HALVE_S = 0.2  # in which the total is halved while nothing arrives
 ABSENT_S = 0.3  # without a report for longer, perhaps nothing arrives
@@ -75,7 +77,7 @@ class Belief(NamedTuple):
     busy        the rate of the link when it was last busy, kbit/s
     credit      kbit that an idle link passes at once
     trains      (kbit, s, number) of the trains of an idle link since `waited`
-    within      (kbit, s) of the trains of a busy link, forgotten with LOSS_S
+    within      the rates of the trains of a busy link in the last STUCK_S, one for each report, kbit/s
     """
 
     t: float
@@ -100,8 +102,8 @@ class Belief(NamedTuple):
     busy: float = 0.0
     credit: float = 0.0
     trains: tuple[float, float, int] = NO_TRAINS
-    within: tuple[float, float] = (0.0, 0.0)
     policer: Policer = Policer()
+    within: History[float] = ()
     levels: History[float] = ()
     forwards: History[float] = ((-inf, 0.0),)
     arrived: History[Arrived] = ()
@@ -325,11 +327,13 @@ def _update(b: Belief, surprise: float, expected_s: float, seen_s: float, pieces
 def _contend(b: Belief, seen: Evidence) -> Belief:
     """The best capacity is one of the link itself, of which competing traffic takes a part."""
     dt = min(LONGEST_S, b.t - b.observed)
-    kbit, took_s = (keep * exp(-dt / LOSS_S) for keep in b.within)
-    kbit, took_s = kbit + seen.train_kbit, took_s + seen.train_s
-    b = b._replace(within=(kbit, took_s))
-    if took_s > JITTER_S:  # Others send between frames, not within one.
-        return b._replace(best=max(b.m, min(b.best, log(kbit / took_s))))
+    rates = b.within
+    if seen.train_s:
+        rates = recorded(rates, b.t, seen.train_kbit / seen.train_s, STUCK_S)
+        b = b._replace(within=rates)
+    recent = [rate for at, rate in rates if at > b.t - STUCK_S]
+    if len(recent) > MANY:  # Others send between frames; what they send within one slows some trains.
+        return b._replace(best=max(b.m, min(b.best, log(median(recent)))))
     # Without trains: the link is narrow while less is served than is sent.
     slower = log1p(max(-0.9, seen.growth)) - log1p(-min(0.9, b.loss))
     is_narrow = slower > THICK and (b.queue > GOAL_S or b.loss > LOSSY)
