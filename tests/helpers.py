@@ -57,6 +57,11 @@ def out_of_reach(directory: Path) -> Iterator[None]:
         directory.chmod(mode)
 
 
+def carries(kbps: float) -> dict[str, Any]:
+    """Evidence, as logged, of a link that was busy since the report before and carried this much, kbit/s."""
+    return {"busy_kbit": 0.04 * kbps, "busy_s": 0.04, "kbit": 0.04 * kbps}
+
+
 class Drive:
     """A run that accepts events as JSON keys; time does not advance unless `t` is given."""
 
@@ -72,6 +77,12 @@ class Drive:
         run = self.feed(event, **keys)
         assert run.refused is None
         return run
+
+    def reports(self, t: float, kbps: float, **evidence: Any) -> Any:
+        """The total after a report of a link that is busy and carries this much; `evidence` replaces what that says."""
+        received = {"kbps": kbps, "queue_ms": 0, "loss": 0, "state": "clear", "rtt_ms": 30}
+        self.accept("link_measured", t=t, **received, evidence=carries(kbps) | evidence)
+        return self.total
 
     @property
     def total(self) -> Any:

@@ -11,10 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from runner.core import belief
-from runner.core.evidence import Evidence, EvidenceMemory, observe
+from runner.core.evidence import Evidence, EvidenceMemory, LinkReport, ReceivedUnit, observe
 from runner.core.learned import Learned
 from runner.core.policer import Losses, Policer, police
-from runner.core.uplink import LinkReport, ReceivedUnit
 from runner.drive.predictions import compared, worth
 from runner.drive.read import read_drive
 from runner.drive.series import series
@@ -23,7 +22,7 @@ from runner.simulation.runs import Job, Setup, run_job
 
 KBIT = 8 / 1000
 PATH_S = 0.03
-WORDS = ("modes=belief", "vehicle=delivery_robot", "fps_max=15")
+WORDS = ("modes=safe", "vehicle=delivery_robot", "fps_max=15")
 
 
 def unit(camera: str, captured: float, arrived: float, size: int = 5000, train_s: float = 0.0) -> ReceivedUnit:

@@ -14,12 +14,11 @@ from math import exp, inf, log, log1p
 from statistics import median
 from typing import NamedTuple
 
-from runner.core.evidence import JITTER_S, Evidence
+from runner.core.evidence import JITTER_S, REPORT_S, Evidence
 from runner.core.history import History, recorded, value_at
 from runner.core.learned import HORIZON_S, MEMORY_S, WRONG, Learned
 from runner.core.policer import Losses, Policer, police
 
-REPORT_S = 0.04  # between two reports
 LEAST_JITTER_S = JITTER_S / 2  # of an arrival, once learned
 LONGEST_S = 0.3  # a report that comes later counts as if it came after this time
 DRIFT = 0.02  # variance that a second adds to x while innovations are white
@@ -124,7 +123,7 @@ def begin(
     bias, error  of predictions, as their source states them: mean and deviation of ln(capacity / prediction)
     """
     ln = None if prediction is None else _ln(prediction, most)
-    m, v = (log(max(LOWEST, start)), 1.0) if ln is None else (min(log(most), ln + bias), error * error)
+    m, v = (log(max(LOWEST, start)), 1.0) if ln is None else (min(_highest(most), ln + bias), error * error)
     learned = Learned(ln).starting(bias, error).stated(t, ln)
     return Belief(t, t, m, v, most, start, learned, best=m, reported=t, observed=t, waited=t)
 
@@ -134,7 +133,7 @@ def predict(b: Belief, t: float, prediction: float | None, bias: float = 0.0, er
     ln, known = None if prediction is None else _ln(prediction, b.most), b.learned.starting(bias, error)
     if ln is not None and known.ln is not None and ln != known.ln:
         m, v = known.followed(b.m, b.v, ln)
-        step = min(log(b.most), m) - b.m
+        step = min(_highest(b.most), m) - b.m
         forward = b.forward + step
         forwards = recorded(b.forwards, t, forward, 1.0)
         best = b.best + min(0.0, step)  # one that is too high would raise it again and again
@@ -166,13 +165,18 @@ def decide(b: Belief, t: float, silent_s: float, floors: float = 0.0, ceiling: f
     total = max(total, YIELDED * exp(b.best), min(floors, exp(b.best - THICK)))
     total = min(total, b.policer.kbps * exp(-THIN))
     total = max(LOWEST, total * 2 ** (-silent_s / HALVE_S))
-    total = min(total, b.most, ceiling)
-    is_same = abs(total - b.total) < STEADY * b.total and b.total <= min(b.most, ceiling)
-    return b if is_same else b._replace(total=total)
+    limit = min(b.most, ceiling)
+    is_same = abs(total - b.total) < STEADY * b.total and max(total, b.total) <= limit
+    return b if is_same else b._replace(total=min(total, limit))
 
 
 def _ln(kbps: float, most: float) -> float:
-    return log(min(most, max(LOWEST, kbps)))
+    return min(_highest(most), log(max(LOWEST, kbps)))
+
+
+def _highest(most: float) -> float:
+    """x above which all that is asked for may be sent, whatever the margin."""
+    return log(most) + THICK
 
 
 # --- queue, losses and margin -----------------------------------------------------------------------------------------
@@ -298,7 +302,7 @@ def _send_more(b: Belief) -> Belief:
     if since < HORIZON_S or not (rate := _rate(b.arrived, b.t, HORIZON_S)):
         return b
     step = min(HIGHEST_STEP, OPTIMISM * since / HORIZON_S)
-    more = min(log(b.most), log(rate) + b.margin + step) - b.m
+    more = min(_highest(b.most), log(rate) + b.margin + step) - b.m
     return b._replace(m=b.m + more, v=min(1.0, b.v + more * more)) if more > 0 else b
 
 
@@ -320,7 +324,7 @@ def _update(b: Belief, surprise: float, expected_s: float, seen_s: float, pieces
         noise += REPORT_S / MEMORY_S * (min(GOAL_S**2, max(LEAST_JITTER_S**2, new)) - noise)  # a queue is no noise
     v = min(1.0, b.v + max(0.0, repeated))
     k = v / (v + noise / scale)
-    m = min(log(b.most), b.m + k * surprise)
+    m = min(_highest(b.most), b.m + k * surprise)
     return b._replace(m=m, v=max(DRIFT * REPORT_S / 2, (1 - k) * v), innovation=(1 - k) * surprise, noise=noise)
 
 

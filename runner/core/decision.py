@@ -89,8 +89,8 @@ class Draft(NamedTuple):
     demand     kbit/s by camera, 0 when off
     bitrate    exact kbit/s by camera
     scaling    factor by camera that is on
-    measured   True: the total is the measured capacity of the link, whatever the age of the prediction
-    uncapped   kbit/s, the total before the measured link lowered it; None: not lowered
+    measured   True: the total is the measured capacity of the link, without a prediction or another limit
+    uncapped   kbit/s, the total without the measured link, or the total if that is more; None: the link changed nothing
     sized_for  total for which picture sizes are chosen, kbit/s; None: the actual total
     sending    False stops all cameras, whatever their bitrate
     believed   of the uplink; None: nothing
@@ -122,3 +122,15 @@ class Draft(NamedTuple):
     def noted(self, note: str, **changes: Any) -> Draft:
         """The draft with these parts replaced and the reason added."""
         return self._replace(notes=(*self.notes, note), **changes)
+
+    def limited(self, total: Kbps, why: str) -> Draft:
+        """The draft with another total, in tenths of a kbit/s, and the reason; unchanged if it is the same."""
+        assert self.total is not None
+        total = Fraction(int(10 * total), 10)
+        if total == self.total:
+            return self
+        return self.noted(f"total {short(self.total)} -> {short(total)}: {why}", total=total)
+
+
+def short(bitrate: Kbps) -> int | str:
+    return bitrate.numerator if bitrate.denominator == 1 else f"{float(bitrate):.1f}"

@@ -11,9 +11,8 @@ from enum import StrEnum
 from fractions import Fraction
 from typing import Any
 
-from runner.core.evidence import Evidence
+from runner.core.evidence import Evidence, LinkState
 from runner.core.model import Kbps, Mode, Roi, exact, plain
-from runner.core.uplink import LinkState
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,11 +96,11 @@ class WeightsSet(_Event):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkMeasured(_Event):
-    """The uplink, estimated from what the operator's side received of all cameras, see `runner.core.uplink`.
+    """The uplink, by what the operator's side received of all cameras, see `runner.core.evidence`.
 
-    kbps      received kbit/s; while a queue lasts, the capacity of the link; None: too little has arrived
-    queue_ms  queueing delay in front of the link
-    loss      share of packets lost, 0 to 1
+    kbps      received in the last 0.5 s, kbit/s. Older logs: of the link while a queue lasted
+    queue_ms  standing queue in front of the link
+    loss      share of the packets of the last second that was lost, 0 to 1
     rtt_ms    round trip of the control link
     evidence  of the link's capacity; None: in older logs
     camera    set in older logs, which measured each camera; no rule reads these

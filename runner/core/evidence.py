@@ -11,16 +11,80 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from enum import StrEnum
 from math import inf
 from types import MappingProxyType
 from typing import NamedTuple
 
-from runner.core.uplink import BUCKET_S, EXPIRED_S, GAP_S, ONE_CLOCK_S, SAME_S, LinkReport, ReceivedUnit
+from runner.core.history import History, recorded
 
+REPORT_S = 0.04  # between two reports
+BUCKET_S = 10.0  # the path's delay is the minimum of the current time bucket and the previous one
+SAME_S = 0.001  # closer capture times, after rounding, belong to the same frame
+# Without a unit for longer, path delays expire: clocks that drift apart by 50 ppm change them by 6 ms.
+EXPIRED_S = 120.0
+# Delays that differ by more are not of the same clock: a graph without capture times has an origin for each camera.
+ONE_CLOCK_S = 10.0
+GAP_S = 0.12  # without a unit for this long, the link has stalled
 JITTER_S = 0.004  # of an arrival: half of 8 ms, a usual grant cycle of a mobile uplink
 BUSY_S = JITTER_S  # a frame that waited longer found the link busy; it may have been sent late by less
 GAP_INTERVALS = 1.5  # frame intervals without a frame are no gap, either
 FIRST_INTERVAL_S = 1 / 15
+QUEUE_S = 0.02  # a shorter standing wait is no queue worth mentioning
+RATE_S, COUNTED_S = 0.5, 1.0  # what is received, and the share lost, are stated of this time
+
+
+class LinkState(StrEnum):
+    """State of the queue in front of the link."""
+
+    CLEAR = "clear"
+    FILLING = "filling"
+    DRAINING = "draining"
+    STALLED = "stalled"
+
+
+@dataclass(frozen=True, slots=True)
+class ReceivedUnit:
+    """A frame as the operator's side received it, or a part of one: its rest may follow in a later report.
+
+    captured  s by the vehicle's clock
+    arrived   of its last packet, s by the operator's monotonic clock
+    bytes     received on the wire, including headers
+    whole     whether no packet was initially missing
+    playout   s for which the transport holds a unit back, which hides a shorter wait in the queue
+    late      s by which the vehicle at least took longer than usual to send it: no queue
+    train_s   from the arrival of its first packet to that of its last
+    train     bytes on the wire of all cameras that arrived in that time, without the first packet; 0: unknown
+    carried   bytes on the wire of all cameras that arrived after the last packet of the previous unit; 0: unknown
+    """
+
+    camera: str
+    captured: float
+    arrived: float
+    bytes: int
+    whole: bool = True
+    playout: float = 0.0
+    late: float = 0.0
+    train_s: float = 0.0
+    train: int = 0
+    carried: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class LinkReport:
+    """What the operator's side has received since its previous report.
+
+    at             s, time of the report by the operator's monotonic clock
+    units          in order of arrival
+    packets, lost  RTP packets of all cameras received, and missing
+    all_received   the vehicle had sent nothing that was still on its way
+    """
+
+    at: float
+    units: tuple[ReceivedUnit, ...] = ()
+    packets: int = 0
+    lost: int = 0
+    all_received: bool = False
 
 
 class Evidence(NamedTuple):
@@ -80,6 +144,28 @@ class Path(NamedTuple):
         return self._replace(now=delay) if delay < self.now else self
 
 
+class Received(NamedTuple):
+    """Of one report: kbit, packets, and packets lost."""
+
+    kbit: float
+    packets: int
+    lost: int
+
+
+class LinkSummary(NamedTuple):
+    """The uplink in a few numbers, for people: no rule reads them.
+
+    kbps      received in the last RATE_S
+    queue_s   the standing queue
+    loss      share of the packets of the last COUNTED_S that was lost
+    """
+
+    kbps: float
+    queue_s: float
+    loss: float
+    state: LinkState
+
+
 @dataclass(frozen=True, slots=True)
 class EvidenceMemory:
     """Of what has arrived until now.
@@ -90,6 +176,7 @@ class EvidenceMemory:
     interval  between two frames of a camera, averaged, s
     last      arrival of the newest frame; None: there was none
     resumed   when frames arrived again after the last stall
+    received  by the time of the report
     """
 
     paths: Mapping[str, Path] = field(default_factory=lambda: MappingProxyType({}))
@@ -98,16 +185,43 @@ class EvidenceMemory:
     interval: float = FIRST_INTERVAL_S
     last: float | None = None
     resumed: float = -inf
+    received: History[Received] = ()
 
 
 def observe(memory: EvidenceMemory, report: LinkReport) -> tuple[EvidenceMemory, Evidence | None]:
     """What a report tells; None before the first frame."""
+    if memory.last is None and not report.units:
+        return memory, None
+    memory, evidence = _observe(memory, report)
+    counted = Received(sum(_carried(unit) for unit in report.units), report.packets, report.lost)
+    return replace(memory, received=recorded(memory.received, report.at, counted, COUNTED_S)), evidence
+
+
+def summarise(memory: EvidenceMemory, evidence: Evidence) -> LinkSummary:
+    """After a report that told this."""
+    now = memory.received[-1][0]
+    recent = [of for at, of in memory.received if at > now - COUNTED_S]
+    lost = sum(of.lost for of in recent)
+    kbit = sum(of.kbit for at, of in memory.received if at > now - RATE_S)
+    loss = lost / max(1, lost + sum(of.packets for of in recent))
+    return LinkSummary(kbit / RATE_S, evidence.wait_s, loss, _state(evidence))
+
+
+def _state(evidence: Evidence) -> LinkState:
+    if evidence.silent_s:
+        return LinkState.STALLED
+    if evidence.wait_s <= QUEUE_S:
+        return LinkState.CLEAR
+    return LinkState.FILLING if evidence.growth > 0 else LinkState.DRAINING
+
+
+def _observe(memory: EvidenceMemory, report: LinkReport) -> tuple[EvidenceMemory, Evidence]:
     units, last = report.units, memory.last
     if not units:
-        if last is None:
-            return memory, None
-        silent = 0.0 if report.all_received else max(0.0, report.at - last - _gap_s(memory))
-        return memory, Evidence(wait_s=_standing(memory), silent_s=silent)
+        if report.all_received:
+            return memory, Evidence()
+        assert last is not None
+        return memory, Evidence(wait_s=_standing(memory), silent_s=max(0.0, report.at - last - _gap_s(memory)))
     if _is_of_another_clock(memory, units):
         memory, last = EvidenceMemory(), None
     began = units[0].arrived
@@ -164,7 +278,7 @@ def _add_frames(memory: EvidenceMemory, units: tuple[ReceivedUnit, ...], at: flo
         if unit.whole:
             if is_busy:
                 if last is not None and unit.arrived > last:
-                    busy_kbit, busy_s = busy_kbit + _kbit(unit.carried or unit.bytes), busy_s + unit.arrived - last
+                    busy_kbit, busy_s = busy_kbit + _carried(unit), busy_s + unit.arrived - last
                     served, services = served + due + wait, services + 1
             elif not unit.playout:
                 unqueued += 1
@@ -193,7 +307,7 @@ def _add_frames(memory: EvidenceMemory, units: tuple[ReceivedUnit, ...], at: flo
         idle_s=trains[False][1],
         idle=trains[False][2],
         unqueued=unqueued,
-        kbit=sum(_kbit(unit.carried or unit.bytes) for unit in units),
+        kbit=sum(_carried(unit) for unit in units),
         longest_s=max(wait for _, wait in kept),
         shorter_s=shorter_s,
         growth=grown / grown_s if grown_s else 0.0,
@@ -225,6 +339,10 @@ def _idle(unit: ReceivedUnit, last: float | None) -> float:
 
 def _standing(memory: EvidenceMemory) -> float:
     return min(wait for _, wait in memory.waits)
+
+
+def _carried(unit: ReceivedUnit) -> float:
+    return _kbit(unit.carried or unit.bytes)
 
 
 def _kbit(size: int) -> float:

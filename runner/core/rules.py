@@ -10,21 +10,17 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
-from enum import StrEnum
 from fractions import Fraction
 from functools import cache
-from math import ceil, inf, isfinite, sqrt
+from math import ceil, inf
 from typing import Any
 
-from runner.core import allocation, link_cap, scaling
-from runner.core import belief as uplink_belief
-from runner.core.belief import Belief
+from runner.core import allocation, scaling
+from runner.core import follow_link as follow
+from runner.core.belief import LOWEST, Belief
 from runner.core.budget import video_kbps, wire_kbps
-from runner.core.decision import Believed, Decision, Draft, Setting
-from runner.core.events import LinkMeasured
-from runner.core.evidence import Evidence
-from runner.core.learned import WRONG
-from runner.core.link_memory import LEAST, UNCAPPED, LinkCap
+from runner.core.decision import Decision, Draft, Setting, short
+from runner.core.follow_link import FLOOR, Ceiling, Reports
 from runner.core.model import Camera, Kbps, Mode, Roi, Vehicle, exact, least_float, plain
 from runner.core.state import State
 from runner.errors import RunError
@@ -276,7 +272,7 @@ def _scaled(
         seen = ""
         if kbps and (later is not None or (roi is not full and roi != full)):
             seen = f", as {_whole(of_full)} for the full image" + ("" if later is None else " after the start")
-        reasons[name] = f"{kbps} of {_short(demand[name])} kbit/s{seen}, {why}"
+        reasons[name] = f"{kbps} of {short(demand[name])} kbit/s{seen}, {why}"
     return factors, reasons
 
 
@@ -322,130 +318,10 @@ def fit_to_total(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -
 # --- responses to stale or lost inputs: modes=safe --------------------------------------------------------------------
 
 
-@rule(needs=["total"], gives=["total"], reads=["prediction"])
-def cap_at_lower_bound(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
-    """The total is at most the lower bound of the prediction, if it states one."""
-    lower = None if state.prediction is None else state.prediction.lower_kbps
-    assert draft.total is not None
-    if lower is None or lower >= draft.total:
-        return draft, memory
-    note = f"total {_short(draft.total)} -> {_short(lower)}: lower bound of the prediction"
-    return draft.noted(note, total=lower), memory
-
-
-@rule(needs=["total"], gives=["total"], reads=["copies", "on", "prediction", "t"])
-def fade_when_stale(
-    vehicle: Vehicle,
-    state: State,
-    draft: Draft,
-    memory: Memory,
-    *,
-    after_s: Fraction,
-    halve_every_s: Fraction,
-    floor_kbps: Kbps,
-) -> Step:
-    """A stale prediction is trusted less and less, unless the measured link replaces it (`cap_by_link`).
-
-    Once it is older than its own `valid_s`, otherwise `after_s`, the total is halved, and again every `halve_every_s`,
-    down to `floor_kbps`; never above the prediction. After a prediction of 0 it is `floor_kbps`, or less if the link is
-    known to carry less: with nothing sent, it could never be measured. Before the first prediction, the age counts from
-    the start of the run; the halvings count from when the link last replaced the prediction, if it did since.
-    """
-    age, limit = _age(state, after_s)
-    assert draft.total is not None
-    if age <= limit or draft.measured:
-        return draft, memory
-    overdue, cap = age - limit, memory.get("cap_by_link", UNCAPPED)
-    if isfinite(cap.replaced):
-        overdue = min(overdue, max(allocation.ZERO, exact(state.t) - exact(cap.replaced)))
-    halvings = int(overdue / halve_every_s) + 1
-    # 64 halvings are below any floor; more would only produce long fractions.
-    cameras = sent_cameras(vehicle, state)
-    is_nothing = draft.total < max(1, len(cameras))
-    least = floor_kbps if is_nothing else min(floor_kbps, draft.total)
-    uncapped = total = max(Fraction(draft.total) / 2 ** min(halvings, 64), least)
-    if is_nothing and cap.kbps is not None:
-        total = min(total, _tenths(video_kbps(cameras, _carried(cap, cameras))))
-    why = f"no prediction for {float(age):.1f} s, limit {plain(limit)} s"
-    note = f"total {_short(draft.total)} -> {_short(total)}: {why}"
-    is_capped = draft.uncapped is not None or total < uncapped
-    return draft.noted(note, total=total, uncapped=uncapped if is_capped else None), memory
-
-
 @rule(
     needs=["total"],
     gives=["total"],
-    reads=["copies", "link", "on", "operator_lost", "operator_since", "position", "prediction", "rois", "t", "weights"],
-)
-def cap_by_link(
-    vehicle: Vehicle,
-    state: State,
-    draft: Draft,
-    memory: Memory,
-    *,
-    reserve_kbps: Kbps = allocation.ZERO,
-    alone_after_s: Fraction | None = None,
-    least_trust: Fraction = Fraction(1),
-    start: Fraction = Fraction(1),
-) -> Step:
-    """The total is at most what the uplink carries, as the operator's side measures it; see `runner.core.link_cap`.
-
-    The measured link also carries packet headers, and `reserve_kbps` of it are left to other traffic. The operator
-    measures its own copy of each camera; other copies that leave the vehicle carry the same bitrates. While there is
-    nothing to send, nothing can be measured. A prediction older than its own `valid_s`, otherwise `alone_after_s`,
-    is ignored while the link is measured: the total then follows the measurement alone. A prediction that repeatedly
-    proved too high is trusted less, down to the share `least_trust`; trust recovers with time, and drops again at
-    places where it dropped before; see `runner.core.trust`. When an operator connects, the total starts at the share
-    `start` of the limit and recovers once the link has been measured.
-
-    Memory: the cap, `LinkCap`.
-    """
-    assert draft.total is not None
-    if state.link is None and "cap_by_link" not in memory and (start == 1 or state.operator_since is None):
-        return draft, memory  # never measured
-    cameras = sent_cameras(vehicle, state)
-    limit, least = wire_kbps(cameras, draft.total), _least(cameras)
-    cap = memory.get("cap_by_link", UNCAPPED)._replace(reserve=reserve_kbps)
-    link = _of_all_copies(vehicle, state, draft, memory, cameras, limit)
-    alone = alone_after_s is not None and _is_stale(state, alone_after_s) and link_cap.is_fresh(link, state.t)
-    if not cameras or state.operator_lost is not None or (draft.total < max(1, len(cameras)) and not alone):
-        cap = cap._replace(idle=state.t)  # silence now, or soon after, is no stall
-    else:
-        if alone:
-            most = sum((camera.rate_quality.b_full for camera in cameras), allocation.ZERO)
-            draft, asked, limit = draft.replaced(measured=True, total=most), limit, wire_kbps(cameras, most)
-            cap = link_cap.probe(cap, state.t, link_cap.believed_limit(cap, asked, least_trust), limit)
-        else:
-            cap = cap._replace(alone=False)  # `follow` relates the known capacity to the limit
-        cap = link_cap.follow(cap, limit, state.mode is Mode.AUTOMATIC and not alone)
-        cap = link_cap.start_cap(cap, link, state.operator_since, limit, start)
-        cap = cap._replace(floors=_capped_floors(vehicle, state, draft, cameras, reserve_kbps))
-        cap = link_cap.update_cap(cap, link, state.t, limit, least_trust, state.position)
-        cap = link_cap.raise_cap(cap, least)  # with less, some cameras would not be sent, and so not measured
-    memory = {**memory, "cap_by_link": cap}
-    carried = link_cap.believed_limit(cap, limit, least_trust)
-    why = f"{float(cap.trust.share):.0%} of a prediction that proved too high"
-    if cap.kbps is not None and cap.kbps - reserve_kbps < carried:
-        carried, why = _carried(cap, cameras), _why_capped(cap)
-    lowered = _lower_total(draft, video_kbps(cameras, carried), why)
-    # A new size restarts the encoder, so sizes at the start are chosen for the time after it.
-    return lowered.replaced(sized_for=lowered.uncapped) if cap.provisional else lowered, memory
-
-
-FLOOR = Kbps(500)
-
-
-class Ceiling(StrEnum):
-    """What the total never exceeds, beside what the cameras can use."""
-
-    NONE = "none"
-    PREDICTION = "prediction"
-
-
-@rule(
-    needs=["total"],
-    gives=["total"],
-    reads=["copies", "link", "on", "operator_lost", "operator_since", "prediction", "rois", "t", "weights"],
+    reads=["copies", "link", "on", "operator_since", "prediction", "rois", "t"],
 )
 def follow_link(
     vehicle: Vehicle,
@@ -453,6 +329,7 @@ def follow_link(
     draft: Draft,
     memory: Memory,
     *,
+    reports: Reports = Reports.FOLLOWED,
     ceiling: Ceiling = Ceiling.NONE,
     reserve_kbps: Kbps = allocation.ZERO,
     start: Fraction = Fraction(1, 2),
@@ -466,134 +343,44 @@ def follow_link(
     right. With `ceiling: prediction`, and in modes C and S, the total before this rule is a limit, too. Of the link,
     `reserve_kbps` are left to other traffic. When an operator connects, the total starts at the share `start`.
 
-    Without reports, a prediction is a limit that fades: once it is older than its own `valid_s`, otherwise `after_s`,
-    the total is halved, and again every `halve_every_s`, down to `floor_kbps`.
+    Without reports, or with `reports: ignored`, a prediction is a limit that fades: the total is at most its lower
+    bound, and once it is older than its own `valid_s`, otherwise `after_s`, the total is halved, and again every
+    `halve_every_s`, down to `floor_kbps`. Before the first prediction, its age counts from the start of the run.
 
     Memory: `Belief`.
     """
-    assert draft.total is not None
-    cameras = sent_cameras(vehicle, state)
-    belief: Belief | None = memory.get("follow_link")
-    link = state.link
-    evidence = None if link is None else link.evidence
-    is_measured = link is not None and state.t - link.t < link_cap.START_S
-    if not cameras or state.operator_since is None or link is None or evidence is None or not is_measured:
-        return _unmeasured(state, draft, start, after_s, halve_every_s, floor_kbps), memory
-    predicted, bias, error = None, 0.0, WRONG
-    most = float(wire_kbps(cameras, _of_all(state, _wanted(vehicle, state, draft))))
-    if state.mode is Mode.AUTOMATIC and state.prediction is not None and not _is_stale(state, after_s):
-        predicted = float(wire_kbps(cameras, state.prediction.kbps))
-        bias = state.prediction.bias or 0.0
-        error = WRONG if state.prediction.error is None else state.prediction.error
-    if belief is None or belief.since != state.operator_since:
-        first = float(wire_kbps(cameras, draft.total))
-        belief = uplink_belief.begin(state.operator_since, first * float(start), most, predicted, bias, error)
-    belief = uplink_belief.predict(belief._replace(most=most), state.t, predicted, bias, error)
-    if link.t > belief.reported:
-        belief = uplink_belief.observe(belief, link.t, _of_every_copy(state, evidence), (link.rtt_ms or 0.0) / 1000)
-    limit = inf
-    if state.mode is not Mode.AUTOMATIC or ceiling is Ceiling.PREDICTION:
-        limit = float(wire_kbps(cameras, draft.total) + reserve_kbps)
-    floors = float(_capped_floors(vehicle, state, draft, cameras, reserve_kbps))
-    belief = uplink_belief.decide(belief, state.t, evidence.silent_s, floors, limit)
-    carried = video_kbps(cameras, max(_least(cameras), exact(round(belief.total, 1)) - reserve_kbps))
-    total = _tenths(min(carried, draft.total) if limit < inf else carried)
-    memory = {**memory, "follow_link": belief}
-    believed, before = _believed(belief, cameras), draft.total
-    draft = draft.replaced(measured=True, believed=believed)
-    if total == before:
-        return draft, memory
-    note = f"total {_short(before)} -> {_short(total)}: {_why_believed(believed, evidence)}"
-    return draft.noted(note, total=total, uncapped=max(before, total)), memory
-
-
-def _unmeasured(
-    state: State,
-    draft: Draft,
-    start: Fraction,
-    after_s: Fraction,
-    halve_s: Fraction,
-    floor: Kbps,
-) -> Draft:
-    """A prediction is a limit, at most its lower bound, that fades; an operator's total stays."""
-    assert draft.total is not None
-    before, why = draft.total, ""
-    total = before
-    if state.mode is Mode.AUTOMATIC:
-        lower = None if state.prediction is None else state.prediction.lower_kbps
-        if lower is not None and lower < total:
-            total, why = lower, "lower bound of the prediction"
-        age, limit = _age(state, after_s)
-        if age > limit:
-            halvings = min(64, int((age - limit) / halve_s) + 1)  # 64 are below any floor
-            total = max(Fraction(total) / 2**halvings, min(floor, total) if total >= 1 else floor)
-            why = f"no prediction for {float(age):.1f} s, limit {plain(limit)} s"
-    if state.operator_since is not None and state.t - state.operator_since < link_cap.START_S and start < 1:
-        draft = draft.replaced(sized_for=total)
-        total, why = total * start, "the link has not been measured yet"
-    if total == before:
-        return draft
-    return draft.noted(f"total {_short(before)} -> {_short(total)}: {why}", total=_tenths(total), uncapped=before)
-
-
-def _believed(belief: Belief, cameras: tuple[Camera, ...]) -> Believed:
-    """As it is stated: for video, rounded."""
-    learned, policer = belief.learned, belief.policer
-
-    def video(wire: float) -> int:
-        return int(video_kbps(cameras, Fraction(int(wire))))
-
-    is_level_known = learned.ln is not None and learned.is_level_known
-    return Believed(
-        kbps=video(belief.kbps),
-        deviation=round(sqrt(belief.v), 2),
-        margin=round(belief.margin, 2),
-        bias=round(learned.bias, 2) if is_level_known else None,
-        error=round(sqrt(learned.error), 2) if is_level_known else None,
-        gain=round(learned.gain, 2) if learned.ln is not None and learned.is_gain_known else None,
-        policer_kbps=video(policer.kbps) if policer.proven else None,
+    asked = draft.total
+    assert asked is not None
+    cameras, is_automatic = sent_cameras(vehicle, state), state.mode is Mode.AUTOMATIC
+    past: Belief | None = memory.get("follow_link")
+    link = state.link if reports is Reports.FOLLOWED else None
+    if not cameras or not follow.is_measured(state, link, past):
+        if is_automatic:
+            draft = follow.faded(state, draft, len(cameras), after_s, halve_every_s, floor_kbps)
+        return follow.started(state, draft, start), memory
+    limit = float(wire_kbps(cameras, asked) + reserve_kbps)
+    has_limit = not is_automatic or ceiling is Ceiling.PREDICTION
+    least = max(exact(LOWEST), Fraction(len(cameras)))
+    belief = follow.updated(
+        past,
+        state,
+        link,
+        start=float(start * wire_kbps(cameras, asked)),
+        most=float(wire_kbps(cameras, _of_all(state, _wanted(vehicle, state, draft)))),
+        prediction=follow.predicted(state, cameras, after_s) if is_automatic else follow.NO_PREDICTION,
+        floors=float(_capped_floors(vehicle, state, draft, cameras, reserve_kbps)),
+        ceiling=limit if has_limit else inf,
     )
-
-
-def _why_believed(believed: Believed, evidence: Evidence) -> str:
-    if evidence.silent_s:
-        return f"nothing has arrived for {evidence.silent_s:.1f} s"
-    if believed.policer_kbps is not None and believed.policer_kbps < believed.kbps:
-        return f"the link drops what exceeds {believed.policer_kbps}"
-    return f"capacity of the link, believed to be {believed.kbps}"
-
-
-def _of_every_copy(state: State, evidence: Evidence) -> Evidence:
-    """The operator measures one copy of each camera."""
-    if not state.copies:
-        return evidence
-    # All copies carry the same, so that a number of copies for each kbit is enough.
-    names = [name for name, on in state.on.items() if on]
-    ratio = sum(state.copies.get(name, 1) for name in names) / max(1, len(names))
-    return evidence._replace(
-        busy_kbit=ratio * evidence.busy_kbit,
-        train_kbit=ratio * evidence.train_kbit,
-        idle_kbit=ratio * evidence.idle_kbit,
-        kbit=ratio * evidence.kbit,
-        lost_kbit=ratio * evidence.lost_kbit,
-    )
+    carried = video_kbps(cameras, max(wire_kbps(cameras, least), exact(round(belief.total, 1)) - reserve_kbps))
+    draft = draft.replaced(measured=not has_limit and belief.learned.ln is None)
+    total = asked if has_limit and belief.total >= min(limit, belief.most) else carried
+    return follow.followed(draft, total, belief, cameras, link), {**memory, "follow_link": belief}
 
 
 def sent_cameras(vehicle: Vehicle, state: State) -> tuple[Camera, ...]:
     """The cameras that are on, with repetitions for those that leave the vehicle in several copies."""
     mounted = vehicle.cameras.items()
     return tuple(c for name, c in mounted if state.on[name] for _ in range(state.copies.get(name, 1)))
-
-
-def _least(cameras: tuple[Camera, ...]) -> Kbps:
-    """kbit/s on the wire with which all cameras are sent, and so measured."""
-    return wire_kbps(cameras, max(LEAST, Fraction(len(cameras))))
-
-
-def _carried(cap: LinkCap, cameras: tuple[Camera, ...]) -> Kbps:
-    """kbit/s on the wire under a cap in force."""
-    assert cap.kbps is not None
-    return max(_least(cameras), cap.kbps - cap.reserve)
 
 
 def _wanted(vehicle: Vehicle, state: State, draft: Draft) -> Mapping[str, Kbps]:
@@ -620,73 +407,9 @@ def _capped_floors(vehicle: Vehicle, state: State, draft: Draft, cameras: tuple[
     return Fraction(ceil(10 * (reserve + wire_kbps(cameras, floors))), 10) if floors else floors
 
 
-def _why_capped(cap: LinkCap) -> str:
-    if cap.measured < cap.connected:
-        return "the link has not been measured yet"
-    return "nothing arrives" if cap.stall else "measured capacity of the link"
-
-
-def _lower_total(draft: Draft, total: Kbps, why: str) -> Draft:
-    """The draft with a smaller total, in tenths of a kbit/s; unchanged if it would not be smaller."""
-    assert draft.total is not None
-    if total >= draft.total:
-        return draft
-    total = _tenths(total)
-    return draft.noted(f"total {_short(draft.total)} -> {_short(total)}: {why}", total=total, uncapped=draft.total)
-
-
-def _tenths(kbps: Kbps) -> Kbps:
-    return Fraction(int(10 * kbps), 10)
-
-
-def _of_all_copies(
-    vehicle: Vehicle, state: State, draft: Draft, memory: Memory, cameras: tuple[Camera, ...], limit: Kbps
-) -> LinkMeasured | None:
-    """The measurement of one copy of each camera, scaled to all copies that leave the vehicle.
-
-    kbps is None if all cameras are given up, so that nothing can arrive.
-
-    cameras  that are on, with repetitions for copies
-    limit    kbit/s on the wire, until the link has been measured under one
-    """
-    link = state.link
-    if link is None or link.kbps is None:
-        return link
-    if link.kbps == 0 and not any(_sent_wanted(vehicle, state, draft, memory).values()):
-        return replace(link, kbps=None)  # nothing arrives because all cameras are given up: the cap has to grow
-    if not state.copies:
-        return link
-    cap, wanted = memory.get("cap_by_link", UNCAPPED), _sent_wanted(vehicle, state, draft, memory)
-    total = video_kbps(cameras, cap.may_send(cap.limit.kbps or limit))
-    fits = state.mode is Mode.SINGLE and total >= _of_all(state, wanted)
-    sent = wanted if fits else _shared(vehicle, state, wanted, total)
-    if not (of_one := sum(sent.values())):
-        return link
-    return replace(link, kbps=_tenths(link.kbps * _of_all(state, sent) / of_one))
-
-
 def _of_all(state: State, kbps: Mapping[str, Kbps]) -> Kbps:
     """The sum over all copies that leave the vehicle."""
     return sum((own * state.copies.get(name, 1) for name, own in kbps.items()), allocation.ZERO)
-
-
-def _sent_wanted(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Mapping[str, Kbps]:
-    """As `_wanted`, without the cameras that the last decision gave up."""
-    given_up = memory.get("fit_to_total" if state.mode is Mode.SINGLE else "share_above_floors", ())
-    return _without(given_up, _wanted(vehicle, state, draft))
-
-
-def _is_stale(state: State, after_s: Fraction) -> bool:
-    """Whether the prediction (before the first one, the run) is older than its own `valid_s`, otherwise `after_s`."""
-    age, limit = _age(state, after_s)
-    return age > limit
-
-
-def _age(state: State, after_s: Fraction) -> tuple[Fraction, Fraction]:
-    """Age of the prediction, s, and how old it may be."""
-    made = state.prediction
-    limit = after_s if made is None or made.valid_s is None else exact(made.valid_s)
-    return exact(state.t) - (exact(made.t) if made else 0), limit
 
 
 @rule(reads=["operator_lost", "t"])
@@ -790,8 +513,7 @@ def decide_without_link(vehicle: Vehicle, state: State, memory: Memory) -> Decis
 
     raises  RuleFailed
     """
-    unmeasured = {name: past for name, past in memory.items() if name != cap_by_link.__name__}
-    return decide(vehicle, replace(state, link=None, operator_since=None), unmeasured)[0]
+    return decide(vehicle, replace(state, link=None, operator_since=None), memory)[0]
 
 
 def _draft_problem(state: State, before: Draft, draft: Any) -> str | None:
@@ -869,7 +591,3 @@ def _is_at_most(factor: Fraction, bound: Fraction) -> bool:
 def _whole(bitrate: Kbps) -> int:
     """A bitrate rounded down."""
     return bitrate.numerator // bitrate.denominator
-
-
-def _short(bitrate: Kbps) -> int | str:
-    return bitrate.numerator if bitrate.denominator == 1 else f"{float(bitrate):.1f}"

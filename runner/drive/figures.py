@@ -176,7 +176,7 @@ def predictions(drives: Drives) -> Rows | str:
     """What was predicted against what the link carried; the same over time, with what was learned of it; by place."""
     found = {at: both for at, drive in enumerate(drives) if (both := compared(drive.series))}
     if not found:
-        return "no prediction could be compared with what the link carries, which takes 10 s and modes=belief"
+        return "no prediction could be compared with what the link carries, which takes 10 s and the rule follow_link"
     every = np.concatenate([np.exp(-both.off[np.isfinite(both.off)]) for both in found.values()])
     most = max(float(np.nanmax(np.fmax(both.predicted, both.carried))) for both in found.values())
     limits = float(np.percentile(every, 5)), float(np.percentile(every, 95))

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 from runner.configuration import agreement
 from runner.configuration.config import configuration
-from runner.core.link_cap import REPORT_S
+from runner.core.evidence import REPORT_S
 from runner.core.model import Vehicle
 from runner.drive.log import Log
 from runner.errors import RunError

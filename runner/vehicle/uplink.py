@@ -11,9 +11,8 @@ from msgspec import UNSET
 
 from runner.core.budget import header_bytes, on_the_wire
 from runner.core.events import LinkMeasured
-from runner.core.evidence import EvidenceMemory, observe, rounded
+from runner.core.evidence import EvidenceMemory, LinkReport, ReceivedUnit, observe, rounded, summarise
 from runner.core.model import Graph, Vehicle, exact
-from runner.core.uplink import LinkReport, ReceivedUnit, UplinkMemory, estimate
 from runner.records import ReceptionReported, UnitReceived
 
 ROUND_TRIPS = 64  # remembered; the smallest is the round trip
@@ -23,14 +22,13 @@ PRESENT_S = 1.0  # an operator's side that has reported within this time still r
 
 @dataclass
 class MeasuredUplink:
-    """Estimates the uplink from what the operator in control receives. Another operator or process begins anew."""
+    """Measures the uplink by what the operator in control receives. Another operator or process begins anew."""
 
     vehicle: Vehicle
     _source: tuple[str, object] = ("", None)  # operator, and its run
     _at: float = 0.0
     _t: float = 0.0
-    _memory: UplinkMemory = field(default_factory=UplinkMemory)
-    _evidence: EvidenceMemory = field(default_factory=EvidenceMemory)
+    _memory: EvidenceMemory = field(default_factory=EvidenceMemory)
     _round_trips: deque[float] = field(default_factory=lambda: deque(maxlen=ROUND_TRIPS))
 
     def is_rival(self, reported: ReceptionReported) -> bool:
@@ -45,23 +43,22 @@ class MeasuredUplink:
             return None
         source = (reported.operator, reported.report.run)
         if source != self._source or reported.report.at < self._at:
-            self._source, self._memory, self._evidence = source, UplinkMemory(), EvidenceMemory()
+            self._source, self._memory = source, EvidenceMemory()
             self._round_trips.clear()
         self._at, self._t = reported.report.at, reported.t
         self._round_trips.append(max(0.0, reported.t - reported.report.as_of))
-        report = _on_the_wire(self.vehicle, reported)
-        self._memory, link = estimate(self._memory, report)
-        self._evidence, evidence = observe(self._evidence, report)
-        if link is None:
+        self._memory, evidence = observe(self._memory, _on_the_wire(self.vehicle, reported))
+        if evidence is None:
             return None
+        summary = summarise(self._memory, evidence)
         return LinkMeasured(
             t=reported.t,
-            kbps=None if link.kbps is None else exact(round(link.kbps, 1)),
-            queue_ms=round(link.queue_ms, 1),
-            loss=round(link.loss, 4),
-            state=link.state,
+            kbps=exact(round(summary.kbps, 1)),
+            queue_ms=round(1000 * summary.queue_s, 1),
+            loss=round(summary.loss, 4),
+            state=summary.state,
             rtt_ms=round(1000 * min(*self._round_trips, LONGEST_S), 1),
-            evidence=rounded(evidence) if evidence else None,
+            evidence=rounded(evidence),
         )
 
 

@@ -4,7 +4,7 @@ Makes a bandwidth map from drives, for pqos=map: per square of the ground, a per
 kbit/s of video, and how far that varied: mean (bias) and deviation (error) of ln(capacity / kbps). A vehicle that
 drives by such a map knows from its start what the predictions are worth.
 
-Where rules believe something about the link (modes=belief), the capacity is what they believed, four times a second,
+Where rules believe something about the link (`follow_link`), the capacity is what they believed, four times a second,
 while reports told it to within 20 % and it was less than the cameras can use; the vehicle's log is enough.
 
 In other drives it is the received rate, which needs both logs (log=DIR) and rules that measure the link (modes=safe).
