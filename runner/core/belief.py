@@ -148,6 +148,9 @@ def observe(b: Belief, t: float, seen: Evidence, rtt_s: float) -> Belief:
     if seen.kbit:
         weighed = _weigh(_measure_queue(b, seen), seen, rtt_s)
         b = weighed._replace(m=min(weighed.m, b.m + HIGHEST_STEP), observed=t)
+    elif not seen.silent_s and t - b.observed > ABSENT_S:
+        # Too little for any camera to be sent: nothing is measured until more is tried.
+        b = b._replace(m=min(_highest(b.most), b.m + OPTIMISM * dt / HORIZON_S))
     b = b._replace(levels=recorded(b.levels, t, b.m, 1.0))
     return b._replace(learned=b.learned.judged(t, dt, b.levels)) if seen.kbit else b
 

@@ -52,11 +52,15 @@ NO_PREDICTION = Prediction(None)
 def is_measured(state: State, link: LinkMeasured | None, past: Belief | None) -> bool:
     """Whether reports tell what the link carries.
 
-    Control may have passed to an operator who has not reported yet: what is believed of the vehicle's uplink holds.
+    While an operator is gone, or another one who has taken control has not reported yet, what they told last holds.
     """
     if link is None:
-        return past is not None and past.since == state.operator_since and state.t - past.reported < START_S
+        return past is not None and _is_recent(past, state.t)
     return link.evidence is not None and state.operator_since is not None and state.t - link.t < START_S
+
+
+def _is_recent(belief: Belief, t: float) -> bool:
+    return t - belief.reported < START_S
 
 
 def predicted(state: State, cameras: tuple[Camera, ...], after_s: Fraction) -> Prediction:
@@ -80,10 +84,10 @@ def updated(
     ceiling: float,
 ) -> Belief:
     """What is believed after an event, with the total for it. All in kbit/s on the wire; see `runner.core.belief`."""
-    assert state.operator_since is not None
-    if past is None or past.since != state.operator_since:
-        past = beliefs.begin(state.operator_since, start, most, *prediction)
-    belief = beliefs.predict(past._replace(most=most), state.t, *prediction)
+    since = state.operator_since or state.t
+    if past is None or (past.since != since and not _is_recent(past, since)):
+        past = beliefs.begin(since, start, most, *prediction)
+    belief = beliefs.predict(past._replace(since=since, most=most), state.t, *prediction)
     if link is None or link.evidence is None:
         return belief
     if link.t > belief.reported:
