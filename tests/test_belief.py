@@ -72,7 +72,8 @@ def test_a_frame_that_was_sent_late_does_not_shorten_its_path() -> None:
 def test_what_a_stalled_link_releases_is_no_evidence() -> None:
     """Nothing came for a second; then three frames at once."""
     memory, _ = observe(EvidenceMemory(), LinkReport(0.2, (unit("front", 0.0, 0.03),), 4))
-    silent, before = observe(memory, LinkReport(1.0, ()))
+    silent, _ = observe(memory, LinkReport(0.96, ()))
+    silent, before = observe(silent, LinkReport(1.0, ()))
     assert before
     assert before.silent_s == pytest.approx(1.0 - 0.03 - 0.12)
     burst = tuple(unit("front", 0.1 * n, 1.02 + 0.001 * n) for n in (1, 2, 3))

@@ -16,7 +16,7 @@ from math import inf
 from types import MappingProxyType
 from typing import NamedTuple
 
-from runner.core.history import History, recorded
+from runner.core.history import History, rate, recorded
 
 REPORT_S = 0.04  # between two reports
 BUCKET_S = 10.0  # the path's delay is the minimum of the current time bucket and the previous one
@@ -155,7 +155,7 @@ class Received(NamedTuple):
 class LinkSummary(NamedTuple):
     """The uplink in a few numbers, for people: no rule reads them.
 
-    kbps      received in the last RATE_S
+    kbps      received in the last RATE_S; 0 with the first report
     queue_s   the standing queue
     loss      share of the packets of the last COUNTED_S that was lost
     """
@@ -202,9 +202,9 @@ def summarise(memory: EvidenceMemory, evidence: Evidence) -> LinkSummary:
     now = memory.received[-1][0]
     recent = [of for at, of in memory.received if at > now - COUNTED_S]
     lost = sum(of.lost for of in recent)
-    kbit = sum(of.kbit for at, of in memory.received if at > now - RATE_S)
     loss = lost / max(1, lost + sum(of.packets for of in recent))
-    return LinkSummary(kbit / RATE_S, evidence.wait_s, loss, _state(evidence))
+    kbps = rate(tuple((at, of.kbit) for at, of in memory.received), now, RATE_S)
+    return LinkSummary(kbps, evidence.wait_s, loss, _state(evidence))
 
 
 def _state(evidence: Evidence) -> LinkState:
@@ -212,7 +212,7 @@ def _state(evidence: Evidence) -> LinkState:
         return LinkState.STALLED
     if evidence.wait_s <= QUEUE_S:
         return LinkState.CLEAR
-    return LinkState.FILLING if evidence.growth > 0 else LinkState.DRAINING
+    return LinkState.FILLING if evidence.growth >= 0 else LinkState.DRAINING
 
 
 def _observe(memory: EvidenceMemory, report: LinkReport) -> tuple[EvidenceMemory, Evidence]:
@@ -221,7 +221,10 @@ def _observe(memory: EvidenceMemory, report: LinkReport) -> tuple[EvidenceMemory
         if report.all_received:
             return memory, Evidence()
         assert last is not None
-        return memory, Evidence(wait_s=_standing(memory), silent_s=max(0.0, report.at - last - _gap_s(memory)))
+        # While the operator's side is held up it reads nothing, and reports nothing either.
+        held_up_s = max(0.0, report.at - memory.received[-1][0] - REPORT_S) if memory.received else 0.0
+        silent_s = max(0.0, report.at - last - _gap_s(memory) - held_up_s)
+        return memory, Evidence(wait_s=_standing(memory), silent_s=silent_s)
     if _is_of_another_clock(memory, units):
         memory, last = EvidenceMemory(), None
     began = units[0].arrived

@@ -513,7 +513,8 @@ def decide_without_link(vehicle: Vehicle, state: State, memory: Memory) -> Decis
 
     raises  RuleFailed
     """
-    return decide(vehicle, replace(state, link=None, operator_since=None), memory)[0]
+    unmeasured = {name: past for name, past in memory.items() if name != follow_link.__name__}
+    return decide(vehicle, replace(state, link=None, operator_since=None), unmeasured)[0]
 
 
 def _draft_problem(state: State, before: Draft, draft: Any) -> str | None:
