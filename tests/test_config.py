@@ -77,9 +77,9 @@ def test_the_second_vehicle_has_another_structure() -> None:
 def test_modes_safe_is_the_default_and_automatic_the_mode() -> None:
     assert vehicle().mode is Mode.AUTOMATIC
     names = [call.rule.name for call in vehicle().modes[Mode.AUTOMATIC]]
-    assert {"fade_when_stale", "cap_at_lower_bound", "pause_without_operator"} <= set(names)
+    assert {"follow_link", "pause_without_operator"} <= set(names)
     paper = {call.rule.name for calls in vehicle("modes=paper").modes.values() for call in calls}
-    assert not paper & {"fade_when_stale", "cap_at_lower_bound", "pause_without_operator", "hold_upscaling"}
+    assert not paper & {"follow_link", "pause_without_operator", "hold_upscaling"}
 
 
 @pytest.mark.parametrize(
@@ -200,7 +200,7 @@ def problems(tod: Command, conf: UserConf, *words: str) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    "word", ["modes.automatic.cap_by_link.reserve_kbps=200", "modes.automatic.x=1", "~graph.vehicle.0"]
+    "word", ["modes.automatic.follow_link.reserve_kbps=200", "modes.automatic.x=1", "~graph.vehicle.0"]
 )
 def test_an_entry_of_a_list_is_named_by_its_number(tod: Command, word: str) -> None:
     found = tod("print", word)

@@ -129,13 +129,12 @@ RULES = "  - demand_from_roi: {}\n  - share_by_demand: {}\n  - scaling_from_rate
 
 
 def test_a_parameter_missing_in_a_list_of_ones_own(conf: UserConf, tod: Command) -> None:
-    head = (
-        "defaults: [safe, _self_]\nautomatic:\n  - total_from_prediction: {start_kbps: 1}\n  - cap_at_lower_bound: {}\n"
-    )
-    conf.write("modes/mine.yaml", f"{head}  - fade_when_stale: {{}}\n{RULES}")
+    head = "defaults: [safe, _self_]\nautomatic:\n  - total_from_prediction: {start_kbps: 1}\n"
+    conf.write("modes/mine.yaml", f"{head}  - pause_without_operator: {{}}\n  - cap_by_link: {{}}\n{RULES}")
     problems = tod("print", "source=test", "modes=mine", conf.word).problems
     assert {problem.partition(": ")[0] for problem in problems} == {str(conf.path / "modes/mine.yaml")}
-    assert "automatic[2].fade_when_stale.after_s: missing: required by this rule" in problems[0]
+    assert "automatic[1].pause_without_operator.after_s: missing: required by this rule" in problems[0]
+    assert "automatic[2]: 'cap_by_link': was replaced by follow_link, see docs/rules.md" in problems[1]
 
 
 @pytest.mark.parametrize(

@@ -393,7 +393,7 @@ def test_a_rule_may_give_whole_numbers() -> None:
     drive = Drive("modes=safe")
     calls = []
     for call in drive.vehicle.modes[Mode.AUTOMATIC]:
-        calls += [mine, call] if call.rule.name in ("fade_when_stale", "share_above_floors") else [call]
+        calls += [mine, call] if call.rule.name in ("follow_link", "share_above_floors") else [call]
     drive.vehicle = replace(drive.vehicle, modes={**drive.vehicle.modes, Mode.AUTOMATIC: tuple(calls)})
     drive.run = start(drive.vehicle)
     drive.accept("bitrate_predicted", t=1, kbps=4001)

@@ -11,6 +11,7 @@ from runner import schema
 from runner.configuration.files import GROUPS, bases_of, chosen_by, conf_directories, defaults, find_file, options
 from runner.configuration.origin import PICKED, Composed, Part, nested
 from runner.configuration.overrides import Override, choice_problems, parse_overrides
+from runner.configuration.replaced_rules import with_successors
 from runner.configuration.resolve import resolved
 from runner.configuration.yaml_file import label, load_file, read
 from runner.core.model import suggest
@@ -68,7 +69,7 @@ def recompose(base: dict[str, Any], name: str, overrides: Sequence[str], user: P
 
     Keys that an earlier version did not have are taken from the packaged config.yaml.
     """
-    base = _completed(base)
+    base, _ = with_successors(_completed(base))
     if not overrides:
         return Composed(base, [Part(name, (), base)])
     from omegaconf import OmegaConf

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from typing import Any
 
+from runner.configuration.replaced_rules import REPLACED, SUCCESSOR
 from runner.core import rules
 from runner.core.model import Mode, ModelError, exact, suggest
 from runner.core.rules import Rule, RuleCall
@@ -31,6 +32,8 @@ def find_rule(name: str) -> Rule:
             except Exception as error:  # a user's package may raise anything on import
                 rule = f"{entry.value} cannot be imported: {type(error).__name__}: {error}"
                 raise ModelError("", repr(name), rule) from None
+    if name in REPLACED:
+        raise ModelError("", repr(name), f"was replaced by {SUCCESSOR}, see docs/rules.md")
     if name not in rules.RULES:
         raise ModelError("", repr(name), f"unknown rule{suggest(name, rules.RULES)}{OWN_RULES}")
     return rules.RULES[name]

@@ -7,14 +7,15 @@ events. An invalid line ends the run with an error that states its number; outpu
 cannot be accepted is answered with "accepted": false and the reason, and the run continues.
 
 A drive (the directory that log= wrote, or its drive.jsonl) is replayed with its own configuration: the decisions are
-those of the drive. Overrides change that configuration and so answer "what if"; with log= the result is written as a
-new drive, for `report`, and to output= only if that is given.
+those of the drive. Where a rule has been replaced since, its successor decides, which is said: decisions may differ,
+and measurements of the link tell follow_link something only with link=again. Overrides change that configuration and
+so answer "what if"; with log= the result is written as a new drive, for `report`, and to output= only if that is given.
 
 Predictions are taken from the input. With a pqos= on the command line they are dropped and that source predicts
 instead, from the positions and times of the input; its events are marked "source": "pqos".
 
-Link measurements are taken from the input. With link=again they are estimated again from the drive's reception reports;
-the same version estimates the same events.
+Link measurements are taken from the input. With link=again they are made again from the drive's reception reports;
+the same version makes the same events.
 
 Positions are taken from the input. With positions=BAG they are replaced by those of a ROS bag that was recorded during
 the drive (sensor_msgs/NavSatFix), marked "source": "bag"; topic= is needed if it has several such topics.
@@ -27,7 +28,7 @@ events. Each line begins with the key overrides; with log=DIR the drives are DIR
   tod-runner replay input=drive modes=steady log=steadier    other rules; then: tod-runner report drive steadier
   tod-runner replay input=drive pqos=map pqos.file=other_map.csv
   tod-runner replay input=drive positions=gps.bag pqos=map pqos.file=other_map.csv
-  tod-runner replay input=drive link=again     for a change of the estimator
+  tod-runner replay input=drive link=again     for a change of what is measured
   tod-runner replay input=drive cameras.rear_center.weight=2
   tod-runner replay input=drive vehicle=delivery_robot
   tod-runner replay -m input=drive modes=safe,steady cameras.rear_center.weight=1,2
@@ -49,6 +50,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
 from msgspec import UNSET
 
 from runner.configuration.config import Base, configuration
+from runner.configuration.replaced_rules import SUCCESSOR, with_successors
 from runner.core.decision import Decision
 from runner.core.events import NAMES, BitratePredicted, Event, LinkMeasured, PositionReported, parse, to_json
 from runner.core.model import Vehicle
@@ -92,6 +94,7 @@ def run(arguments: Arguments) -> int:
     with _input(arguments) as (name, text):
         lines, began = _begin(text, name)
         began = began and _corrected(began, arguments)
+        _tell_replaced(began, name)
         one = _prepare(arguments, name, began, _positions(arguments, began))
         _check(arguments)
         with _output(arguments) as output:
@@ -107,6 +110,7 @@ def _sweep(arguments: Arguments) -> int:
     with _input(arguments) as (name, text):
         _, began = _begin(text, name)
     began = began and _corrected(began, arguments)
+    _tell_replaced(began, name)
     positions = _positions(arguments, began)
     runs = prepare_all(arguments, lambda own: _prepare(own, name, began, positions))
     logged = [one._replace(arguments=one.arguments.in_directory(str(n), ["log"])) for n, (_, one) in enumerate(runs)]
@@ -158,7 +162,7 @@ def _output_lines(run: _Prepared, lines: Iterable[str], name: str, began: Began 
 
 
 def _uplink(arguments: Arguments, vehicle: Vehicle) -> MeasuredUplink | None:
-    """The estimator that measures the link again; None: the logged measurements are used."""
+    """What measures the link again; None: the logged measurements are used."""
     if arguments.choice("link") == "logged":
         return None
     from runner.vehicle.uplink import MeasuredUplink
@@ -190,6 +194,16 @@ def _corrected(began: Began, arguments: Arguments) -> Began:
         # Wrong lines are skipped here as `events` skips them, which reads no line of this kind.
         valid = (step for step in steps if is_log(step) and step["log"] == KINDS[ClockSet] and not log_problem(step))
         return replace(began, time=began.time + sum(step["by_s"] for step in valid))
+
+
+def _tell_replaced(began: Began | None, name: str) -> None:
+    """Say on standard error which rules of a drive are no longer run."""
+    _, replaced = with_successors(began.config) if began else (None, [])
+    if replaced:
+        print(
+            f"{name}: {SUCCESSOR} replaces {', '.join(replaced)}; decisions may differ from the drive's",
+            file=sys.stderr,
+        )
 
 
 def _base(name: str, began: Began | None) -> Base | None:

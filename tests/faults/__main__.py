@@ -39,8 +39,9 @@ FAULTS = [
         "bisect_right(model.b_min, bitrate)",
         "test_scaling",
     ),
-    Fault("core/link_cap.py", "target = max(target, cap.floors)", "target = max(target, cap.reserve)", "test_uplink"),
-    Fault("core/link_capacity.py", "limit >= OUTAGE * (link.kbps or 0)", "limit < 0", "test_uplink"),
+    Fault("core/evidence.py", "- _gap_s(memory) - held_up_s", "- _gap_s(memory)", "test_sending"),
+    Fault("core/follow_link.py", "state.t - link.t < START_S", "True", "test_rules"),
+    Fault("core/learned.py", "- self.bias", "", "test_belief"),
     Fault("configuration/overrides.py", "if str(override.value) not in known:", "if False:", "test_config"),
     Fault(
         "configuration/interpolation.py",

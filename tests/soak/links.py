@@ -18,7 +18,7 @@ from statistics import fmean
 from soak import batches
 
 from runner.core import belief, evidence
-from runner.core.uplink import LinkReport, ReceivedUnit
+from runner.core.evidence import REPORT_S, LinkReport, ReceivedUnit
 from runner.simulation.queues import RateQueue
 from runner.simulation.steps import Steps
 
@@ -83,7 +83,7 @@ class Drive:
         memory, total, order = evidence.EvidenceMemory(), known.total, count()
         frame_s = 1 / self.fps
         waiting = [(frame_s * n / self.cameras, next(order), n) for n in range(self.cameras)]
-        report_at, arriving, missing = belief.REPORT_S, list[tuple[float, int, ReceivedUnit, int]](), 0
+        report_at, arriving, missing = REPORT_S, list[tuple[float, int, ReceivedUnit, int]](), 0
         while report_at < self.end_s:
             while waiting[0][0] < report_at:
                 t, _, camera = heapq.heappop(waiting)
@@ -110,7 +110,7 @@ class Drive:
             if known.policer.kbps < math.inf and t > self.well_s:
                 self.end_s = self.well_s + LOSSY_S
             yield t, total
-            report_at += belief.REPORT_S
+            report_at += REPORT_S
 
     def _send(self, t: float, camera: int, total: float) -> tuple[ReceivedUnit | None, int, int]:
         """A frame over the link: what arrives of it, and its packets received and lost."""
