@@ -2,37 +2,45 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from runner.core.rules import follow_link
-
-Calls = Sequence[Mapping[str, Mapping[str, Any]]]
 
 REPLACED = ("cap_at_lower_bound", "cap_by_link", "fade_when_stale")
 SUCCESSOR = follow_link.__name__
 
 
 def with_successors(config: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
-    """The configuration of a drive with `follow_link` in place of what it replaced, and the names found."""
-    modes = {mode: list(calls) for mode, calls in config.get("modes", {}).items()}
-    found = {name for calls in modes.values() for call in calls for name in call if name in REPLACED}
+    """The configuration of a drive, not yet checked, with `follow_link` in place of what it replaced; names found."""
+    modes = config.get("modes")
+    lists = modes if isinstance(modes, Mapping) else {}
+    found = {name for calls in lists.values() for name in _replaced(calls)}
     if not found:
         return dict(config), []
-    return {**config, "modes": {mode: _followed(calls) for mode, calls in modes.items()}}, sorted(found)
+    return {**config, "modes": {mode: _followed(calls) for mode, calls in lists.items()}}, sorted(found)
 
 
-def _followed(calls: Calls) -> list[Mapping[str, Any]]:
-    old = {name: parameters for call in calls for name, parameters in call.items() if name in REPLACED}
-    if not old:
-        return list(calls)
-    cap, fade = old.get("cap_by_link"), old.get("fade_when_stale", {})
-    parameters = {"after_s": cap["alone_after_s"]} if cap and "alone_after_s" in cap else {}
-    parameters |= fade
-    if cap is None:
-        parameters |= {"reports": "ignored", "start": 1}
-    else:
-        parameters |= {"reserve_kbps": cap.get("reserve_kbps", 0), "start": cap.get("start", 1)}
-    first = next(index for index, call in enumerate(calls) if old.keys() & call.keys())
-    kept = [call for call in calls if not old.keys() & call.keys()]
+def _replaced(calls: Any) -> dict[str, Mapping[str, Any]]:
+    """Parameters of the replaced rules that a list calls."""
+    named = (
+        [each for call in calls if isinstance(call, Mapping) for each in call.items()]
+        if isinstance(calls, list)
+        else []
+    )
+    return {name: own if isinstance(own, Mapping) else {} for name, own in named if name in REPLACED}
+
+
+def _followed(calls: Any) -> Any:
+    if not (old := _replaced(calls)):
+        return calls
+    cap = old.get("cap_by_link")
+    parameters: dict[str, Any] = {"reports": "ignored"} if cap is None else {"reserve_kbps": cap.get("reserve_kbps", 0)}
+    parameters |= {"start": 1 if cap is None else cap.get("start", 1)}
+    if cap and "alone_after_s" in cap:
+        parameters["after_s"] = cap["alone_after_s"]
+    parameters |= old.get("fade_when_stale", {})
+    is_old = [isinstance(call, Mapping) and not old.keys().isdisjoint(call) for call in calls]
+    first = is_old.index(True)
+    kept = [call for call, drops in zip(calls, is_old, strict=True) if not drops]
     return [*kept[:first], {SUCCESSOR: parameters}, *kept[first:]]

@@ -89,7 +89,7 @@ def updated(
         past = beliefs.begin(since, start, most, *prediction)
     belief = beliefs.predict(past._replace(since=since, most=most), state.t, *prediction)
     if link is None or link.evidence is None:
-        return belief
+        return belief._replace(total=min(belief.total, most, ceiling))
     if link.t > belief.reported:
         belief = beliefs.observe(belief, link.t, _of_every_copy(state, link.evidence), (link.rtt_ms or 0.0) / 1000)
     return beliefs.decide(belief, state.t, link.evidence.silent_s, floors, ceiling)

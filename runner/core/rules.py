@@ -373,8 +373,9 @@ def follow_link(
     )
     carried = video_kbps(cameras, max(wire_kbps(cameras, least), exact(round(belief.total, 1)) - reserve_kbps))
     draft = draft.replaced(measured=not has_limit and belief.learned.ln is None)
-    total = asked if has_limit and belief.total >= min(limit, belief.most) else carried
-    return follow.followed(draft, total, belief, cameras, link), {**memory, "follow_link": belief}
+    if has_limit:
+        carried = asked if belief.total >= min(limit, belief.most) else min(asked, carried)
+    return follow.followed(draft, carried, belief, cameras, link), {**memory, "follow_link": belief}
 
 
 def sent_cameras(vehicle: Vehicle, state: State) -> tuple[Camera, ...]:
