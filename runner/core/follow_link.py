@@ -84,7 +84,7 @@ def updated(
     ceiling: float,
 ) -> Belief:
     """What is believed after an event, with the total for it. All in kbit/s on the wire; see `runner.core.belief`."""
-    since = state.operator_since or state.t
+    since = state.t if state.operator_since is None else state.operator_since
     if past is None or (past.since != since and not _is_recent(past, since)):
         past = beliefs.begin(since, start, most, *prediction)
     belief = beliefs.predict(past._replace(since=since, most=most), state.t, *prediction)

@@ -19,9 +19,9 @@ Everything else is as in simulate (tod-runner simulate --help): links=, which ma
 predictions=, windows=, duration_s=, since_s= (0 for numbers of the start), and what describes encoders, link and
 reports. output= has the table and the figures of each drive; figure= draws use against the wait in the queue.
 
-  tod-runner tune fps_max=15 vary='automatic.cap_by_link.start=[0.25,0.5,1]' predictions=right,noise,absent since_s=0
+  tod-runner tune fps_max=15 vary='automatic.follow_link.start=[0.25,0.5,1]' predictions=right,noise,absent since_s=0
   tod-runner tune fps_max=15 links=uplinks/a.csv,DRIVE left_out=uplinks/b.csv predictions=absent
-  tod-runner tune modes=steady vary='automatic.hold_upscaling automatic.cap_by_link.least_trust=0.25,0.75' figure=f.png
+  tod-runner tune modes=steady vary='automatic.hold_upscaling automatic.follow_link.reserve_kbps=0,200' figure=f.png
 """
 
 from __future__ import annotations

@@ -341,7 +341,19 @@ def _measured(chance: random.Random, _camera: str, _cameras: list[str], kbps: fl
         "loss": chance.choice((0, 0, 0.02, 0.2)),
         "rtt_ms": chance.choice((10, 60, 900)),
         "state": chance.choice(("clear", "clear", "clear", "filling", "filling", "draining", "stalled")),
+        "evidence": _evidence(chance, round(0.04 * kbps, 3)),
     }
+
+
+def _evidence(chance: random.Random, kbit: float) -> dict[str, Any]:
+    found = {
+        "kbit": kbit,
+        "wait_s": chance.choice((0, 0.012, 0.07, 0.4)),
+        "growth": chance.choice((-0.2, 0, 0, 0.5)),
+        "lost_kbit": chance.choice((0, 0, 0, 20)),
+    }
+    told = ({"busy_kbit": kbit, "busy_s": 0.04}, {"idle_kbit": kbit, "idle_s": 0.02, "idle": 2}, {"unqueued": 3})
+    return found | chance.choice(told) if kbit else {"silent_s": chance.choice((0, 0.2, 1))}
 
 
 _ON_A_LINK: Generators = {
