@@ -121,7 +121,7 @@ COMPOSED: Mapping[str, Mapping[str, Sequence[Edit]]] = {
             ("{start_kbps: 3000}", "{start_kbps: many}"),
             ("halve_every_s: 1 ", "halve_every_s: 0 "),
             ("  - share_by_demand: {}\n", ""),
-            ("  - total_from_prediction: {start_kbps: 3000}\n  - cap", "  - cap"),
+            ("  - total_from_prediction: {start_kbps: 3000}\n  - follow", "  - follow"),
         ]
     },
     "graph": {
