@@ -3,8 +3,8 @@
   sudo .venv/bin/python bench/false_cuts.py OUT                     10 minutes; less: --seconds 60
 
 A link that carries more than is sent, and loses 1 % of the packets on the way back, by which the reports travel. Prints
-how often the measured link lowered the total, and why. OUT keeps the drive; an existing one is not repeated. Run it on
-an otherwise idle machine: one that stalls delays reports, too.
+how often the total fell by more than 15 % within 0.2 s, and why. OUT keeps the drive; an existing one is not repeated.
+Run it on an otherwise idle machine: one that stalls delays reports, too.
 """
 
 from __future__ import annotations
@@ -12,13 +12,14 @@ from __future__ import annotations
 import argparse
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from uplinks import SETTLED_S, ensure_drive
 
 from runner.drive.read import read_drive
 from runner.records import DecisionMade, LinkSample
+from runner.simulation.figures import cuts
 
 KBPS, LOSS, ONE_WAY_MS = 3000, 0.01, 25
 DRIVE = (
@@ -26,7 +27,7 @@ DRIVE = (
     *("link=netns", "link.share=2", f"link.delay_ms={ONE_WAY_MS}"),
     f"link.reverse={{kbps: 20000, queue_ms: 300, delay_ms: {ONE_WAY_MS}, loss: {LOSS}}}",
 )
-LOWERED = re.compile(r"total \S+ -> \S+: ([^;]+)")  # in the reason of each camera
+WHY = re.compile(r"total \S+ -> \S+: ([^;,]+)")  # in the reason of each camera
 
 
 def main() -> None:
@@ -45,14 +46,12 @@ def main() -> None:
         print(f"  {count}: {why}")
 
 
-def _cuts(decisions: Iterable[DecisionMade]) -> Iterator[str]:
-    """Why the total was lowered, once for each time that it falls while or before it is lowered."""
-    before = float("inf")
-    for line in decisions:
-        lowered = LOWERED.search(next(iter(line.cameras.values())).reason)
-        if lowered and line.total_kbps < before:
-            yield lowered[1]
-        before = line.total_kbps
+def _cuts(decisions: Sequence[DecisionMade]) -> Iterator[str]:
+    """Why the total fell, for each cut."""
+    at = {line.t: line for line in decisions}
+    for t in cuts([(line.t, float(line.total_kbps)) for line in decisions]):
+        why = WHY.search(next(iter(at[t].cameras.values())).reason)
+        yield why[1] if why else "no reason"
 
 
 if __name__ == "__main__":

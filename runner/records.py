@@ -131,7 +131,7 @@ class VehicleState:
 
     cause       the event that triggered the decision
     asked_kbps  the total of the prediction or the operator; None in older logs
-    total_kbps  the same after rules have lowered it, such as the cap by the measured link
+    total_kbps  the same after all rules, such as what the measured link carries
     fault       why the rules could not decide, so that an earlier decision stays in force
     attention   of the driver; absent: the operator in control states none
     operator    id of the operator in control; absent: none

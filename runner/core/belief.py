@@ -14,8 +14,9 @@ from math import exp, inf, log, log1p
 from statistics import median
 from typing import NamedTuple
 
+from runner.core import history
 from runner.core.evidence import JITTER_S, REPORT_S, Evidence
-from runner.core.history import History, rate, recorded, value_at
+from runner.core.history import History, recorded, value_at
 from runner.core.learned import HORIZON_S, MEMORY_S, WRONG, Learned
 from runner.core.policer import Losses, Policer, police
 
@@ -218,7 +219,7 @@ def _losses(b: Belief, arrived: History[Arrived], dt: float) -> Losses:
 
 def _rate(arrived: History[Arrived], t: float, within_s: float) -> float:
     """Received in the last seconds, kbit/s; 0: too little is known."""
-    return rate(tuple((at, of.kbit) for at, of in arrived), t, within_s)
+    return history.rate(tuple((at, of.kbit) for at, of in arrived), t, within_s)
 
 
 def _is_stuck(b: Belief) -> bool:
@@ -286,8 +287,8 @@ def _weigh_busy(b: Belief, seen: Evidence, kbps: float) -> Belief:
     after = _update(b, surprise, seen.busy_kbit / kbps, seen.busy_s, 2, seen.backlog)
     is_steady = abs(seen.growth) * REPORT_S < JITTER_S and b.loss < LOSSY
     if surprise < 0 and is_steady:  # A longer path looks as busy, and as narrow as what is sent.
-        kbps = _rate(b.arrived, b.t, HORIZON_S)
-        least = min(b.m, log(kbps) + b.margin) if kbps else b.m
+        rate = _rate(b.arrived, b.t, HORIZON_S)
+        least = min(b.m, log(rate) + b.margin) if rate else b.m
         return after._replace(m=max(after.m, least))
     return after
 
@@ -301,10 +302,10 @@ def _weigh_trains(b: Belief, surprise: float, expected_s: float, seen_s: float, 
 def _send_more(b: Belief) -> Belief:
     """While no frame waits, the link carries more than is sent; the longer, the more."""
     since = b.t - b.waited
-    if since < HORIZON_S or not (kbps := _rate(b.arrived, b.t, HORIZON_S)):
+    if since < HORIZON_S or not (rate := _rate(b.arrived, b.t, HORIZON_S)):
         return b
     step = min(HIGHEST_STEP, OPTIMISM * since / HORIZON_S)
-    more = min(_highest(b.most), log(kbps) + b.margin + step) - b.m
+    more = min(_highest(b.most), log(rate) + b.margin + step) - b.m
     return b._replace(m=b.m + more, v=min(1.0, b.v + more * more)) if more > 0 else b
 
 

@@ -289,7 +289,7 @@ def keep_operator_settings(vehicle: Vehicle, state: State, draft: Draft, memory:
 
 @rule(needs=["total", "bitrate", "scaling"], gives=["bitrate", "scaling"], reads=["copies", "rois", "weights"])
 def fit_to_total(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
-    """Mode S under a cap: Eq. (2) in proportion to what the operator has set, with floors as in `share_above_floors`.
+    """Mode S with less: Eq. (2) in proportion to what the operator has set, with floors as in `share_above_floors`.
 
     Where the bitrate falls into a lower range of Eq. (4), the factor falls with it, never above the operator's own.
     The operator's settings are kept, and apply again once the total allows.
@@ -368,7 +368,7 @@ def follow_link(
         start=float(start * wire_kbps(cameras, asked)),
         most=float(wire_kbps(cameras, _of_all(state, _wanted(vehicle, state, draft)))),
         prediction=follow.predicted(state, cameras, after_s) if is_automatic else follow.NO_PREDICTION,
-        floors=float(_capped_floors(vehicle, state, draft, cameras, reserve_kbps)),
+        floors=float(_wire_floors(vehicle, state, draft, cameras, reserve_kbps)),
         ceiling=limit if has_limit else inf,
     )
     carried = video_kbps(cameras, max(wire_kbps(cameras, least), exact(round(belief.total, 1)) - reserve_kbps))
@@ -389,8 +389,8 @@ def _wanted(vehicle: Vehicle, state: State, draft: Draft) -> Mapping[str, Kbps]:
     return draft.bitrate or draft.demand or _demands(vehicle, state)
 
 
-def _capped_floors(vehicle: Vehicle, state: State, draft: Draft, cameras: tuple[Camera, ...], reserve: Kbps) -> Kbps:
-    """The cap, in tenths of a kbit/s, that leaves the floors of all cameras that are never given up; 0: no floors.
+def _wire_floors(vehicle: Vehicle, state: State, draft: Draft, cameras: tuple[Camera, ...], reserve: Kbps) -> Kbps:
+    """Floors of all cameras that are never given up, on the wire, in tenths of a kbit/s; 0: none.
 
     cameras  that are on, with repetitions for copies
     """
@@ -437,9 +437,9 @@ def hold_upscaling(vehicle: Vehicle, state: State, draft: Draft, memory: Memory,
 
 @rule(needs=["scaling"], gives=["scaling"], reads=["t"])
 def hold_while_capped(vehicle: Vehicle, state: State, draft: Draft, memory: Memory, *, for_s: Fraction) -> Step:
-    """As `hold_upscaling`, while the measured link caps the total: its rate is being probed, and new sizes cost bits.
+    """As `hold_upscaling`, while the measured link sets the total: its rate is being probed, and new sizes cost bits.
 
-    Memory: as there; empty while nothing caps the total.
+    Memory: as there; empty while it does not.
     """
     past: Mapping[str, _Hold] = memory.get("hold_while_capped", {})
     if draft.uncapped is None:

@@ -83,8 +83,8 @@ _values = attrgetter(*_FIELDS)
 def advance(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision) -> State:
     """The state after an event.
 
-    in_force  the decision in force when the event arrives, without the cap by the measured link: entering S or C starts
-              from it
+    in_force  the decision in force when the event arrives, as it would be without the measured link: entering S or
+              C starts from it
     raises    Refused
     """
     # As dataclasses.replace, in half the time.
@@ -157,7 +157,7 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
 def _manual(state: State, in_force: Decision, name: str, is_sent: bool) -> Mapping[str, Manual]:
     """The settings of mode single once a camera is sent or no longer sent.
 
-    One that is sent again in S gets its last values; in S these are the operator's, whatever cap applies.
+    One that is sent again in S gets its last values; in S these are the operator's, whatever the link carries.
     """
     kept = {} if is_sent or state.mode is Mode.SINGLE else keep(in_force, name)
     return {**state.manual, **kept} if kept else state.manual

@@ -82,7 +82,7 @@ def step(vehicle: Vehicle, run: Run, event: Event) -> Run:
 
 
 def _to_keep(vehicle: Vehicle, run: Run, event: Event) -> Decision:
-    """The decision whose settings outlast an event: without the cap by the measured link, which is temporary."""
+    """The decision whose settings outlast an event: as without the measured link, which is temporary."""
     if isinstance(event, (ModeSelected, CameraSwitched, SourceReported)) and run.decision.uncapped > run.decision.total:
         with suppress(rules.RuleFailed):
             return rules.decide_without_link(vehicle, run.state, run.memory)
