@@ -7,11 +7,12 @@ from math import exp, inf, isfinite, isnan, log
 from pathlib import Path
 
 import pytest
+from helpers import Drive
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from runner.core import belief
-from runner.core.evidence import Evidence, EvidenceMemory, LinkReport, ReceivedUnit, observe
+from runner.core.evidence import Evidence, EvidenceMemory, LinkReport, ReceivedUnit, observe, rounded
 from runner.core.learned import Learned
 from runner.core.policer import Losses, Policer, police
 from runner.drive.predictions import compared, worth
@@ -210,7 +211,19 @@ def test_no_sequence_of_reports_breaks_the_total(reports: list[tuple[Evidence, f
             belief.observe(belief.predict(b, t, prediction), t, evidence, 0.03), t, evidence.silent_s, 200, 9e3
         )
         assert 50 <= b.total <= 9e3
+        assert 0 < b.v <= 1
         assert all(isfinite(value) for value in (b.m, b.v, b.noise, b.best, b.queue, b.learned.bias, b.learned.error))
+
+
+@given(st.lists(st.tuples(evidences(), st.floats(0, 3), st.integers(0, 20_000)), max_size=20))
+@settings(max_examples=50, deadline=None)
+def test_no_report_takes_the_total_above_an_enforced_prediction(reports: list[tuple[Evidence, float, int]]) -> None:
+    drive, t = Drive("vehicle=delivery_robot", "modes.automatic.1.follow_link.ceiling=prediction"), 0.0
+    drive.accept("operator_connected")
+    for evidence, after_s, predicted in reports:
+        t += after_s
+        drive.accept("bitrate_predicted", t=t, kbps=predicted)
+        assert 0 <= drive.reports(t, 1000, **rounded(evidence)._asdict()) <= predicted
 
 
 def test_a_total_is_never_above_its_ceiling_nor_what_cameras_can_use() -> None:
