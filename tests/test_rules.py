@@ -254,6 +254,12 @@ def test_what_the_link_carries_is_known_until_another_operator_in_control_has_re
     assert list(totals(drive, 7.5)) == [3000], "it measures nothing"
 
 
+def test_an_operator_that_stops_reporting_is_one_that_measures_nothing() -> None:
+    drive = connected()
+    narrow(drive)
+    assert list(totals(drive, 7.3, 7.5)) == [pytest.approx(40, abs=10), 3000], "it last reported at 2.4 s"
+
+
 @pytest.mark.parametrize("reports, limit", [("followed", 1500), ("ignored", 3000)])
 def test_reports_can_be_ignored(reports: str, limit: float) -> None:
     rule = f"{{follow_link: {{reports: {reports}, start: 1}}}}"
