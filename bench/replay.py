@@ -44,7 +44,8 @@ def drive(count: int) -> Iterator[dict[str, Any]]:
             yield {"t": t, "event": "position_reported", "lat": 48.26, "lon": 11.66, "speed_mps": 8.3}
         else:
             link = {"kbps": 3200 + index % 7, "queue_ms": 3, "loss": 0, "state": "clear", "rtt_ms": 31}
-            yield {"t": t, "event": "link_measured", **link}
+            busy = {"busy_kbit": 120 + index % 7, "busy_s": 0.04, "kbit": 120 + index % 7, "wait_s": 0.003}
+            yield {"t": t, "event": "link_measured", **link, "evidence": busy}
 
 
 def seconds(modes: str, events: Path) -> float:

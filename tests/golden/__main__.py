@@ -163,7 +163,8 @@ def drives(pool: ProcessPoolExecutor) -> Texts:
             path = Path(directory, kept.name.removesuffix(".xz"))
             path.write_bytes(lzma.decompress(kept.read_bytes()))
             words += [["replay", f"input={path}"], ["replay", "modes=steady", f"input={path}"]]
-        return {name.replace(directory, ""): text for name, text in _outputs(pool, words).items()}
+        found = _outputs(pool, words)
+        return {name.replace(directory, ""): text.replace(directory, "") for name, text in found.items()}
 
 
 def validate(pool: ProcessPoolExecutor) -> Texts:
