@@ -37,7 +37,7 @@ AT_ONCE = 0.75  # share of a train: if so much of it passed at once, a longer on
 YIELDED = 1 / 3  # of the best capacity: competing traffic gets no more than the rest
 BEST_S = 60.0  # memory of the best capacity
 LOSSY, LOSS_S = 0.1, 0.5  # share of losses, in this time, that random loss does not reach
-MANY = 10
+MANY = 5
 STUCK_S = 2.0  # a queue that is constant for this long while the link is not busy is a longer path
 HALVE_S = 0.2  # in which the total is halved while nothing arrives
 ABSENT_S = 0.3  # without a report for longer, perhaps nothing arrives
@@ -77,7 +77,7 @@ class Belief(NamedTuple):
     busy        the rate of the link when it was last busy, kbit/s
     credit      kbit that an idle link passes at once
     trains      (kbit, s, number) of the trains of an idle link since `waited`
-    within      the rates of the trains of a busy link in the last STUCK_S, one for each report, kbit/s
+    within      the rates of the trains of a busy link in the last LOSS_S, one for each report, kbit/s
     """
 
     t: float
@@ -166,7 +166,8 @@ def decide(b: Belief, t: float, silent_s: float, floors: float = 0.0, ceiling: f
     # A queue that was there before the first frame is seen by its losses only.
     drain = YIELDED if b.loss > LOSSY else max(YIELDED, min(1.0, 1 - (b.queue - JITTER_S) / HORIZON_S))
     total = exp(b.m - b.margin) * drain
-    total = max(total, YIELDED * exp(b.best), min(floors, exp(b.best - THICK)))
+    link = _link(b)
+    total = max(total, YIELDED * exp(link), min(floors, exp(link - THICK)))
     total = min(total, b.policer.kbps * exp(-THIN))
     total = max(LOWEST, total * 2 ** (-silent_s / HALVE_S))
     limit = min(b.most, ceiling)
@@ -296,7 +297,8 @@ def _weigh_busy(b: Belief, seen: Evidence, kbps: float) -> Belief:
 def _weigh_trains(b: Belief, surprise: float, expected_s: float, seen_s: float, number: int, backlog: bool) -> Belief:
     b = _update(b, surprise, expected_s, seen_s, number, backlog)
     # Others send between frames, not within one: the link itself is narrower.
-    return b._replace(best=max(b.m, (b.best + b.m) / 2)) if surprise < 0 else b
+    is_narrow = surprise < 0 and _rate_within(b) is None
+    return b._replace(best=max(b.m, (b.best + b.m) / 2)) if is_narrow else b
 
 
 def _send_more(b: Belief) -> Belief:
@@ -333,16 +335,24 @@ def _update(b: Belief, surprise: float, expected_s: float, seen_s: float, pieces
 
 def _contend(b: Belief, seen: Evidence) -> Belief:
     """The best capacity is one of the link itself, of which competing traffic takes a part."""
-    dt = min(LONGEST_S, b.t - b.observed)
-    rates = b.within
     if seen.train_s:
-        rates = recorded(rates, b.t, seen.train_kbit / seen.train_s, STUCK_S)
-        b = b._replace(within=rates)
-    recent = [rate for at, rate in rates if at > b.t - STUCK_S]
-    if len(recent) > MANY:  # Others send between frames; what they send within one slows some trains.
-        return b._replace(best=max(b.m, min(b.best, log(median(recent)))))
-    # Without trains: the link is narrow while less is served than is sent.
+        b = b._replace(within=recorded(b.within, b.t, seen.train_kbit / seen.train_s, LOSS_S))
+    if _rate_within(b) is not None:
+        return b._replace(best=max(b.m, b.best))
+    # Without trains: the link itself is narrow while less is served than is sent.
+    dt = min(LONGEST_S, b.t - b.observed)
     slower = log1p(max(-0.9, seen.growth)) - log1p(-min(0.9, b.loss))
     is_narrow = slower > THICK and (b.queue > GOAL_S or b.loss > LOSSY)
     best = b.best - slower * dt / REPORT_S * is_narrow
     return b._replace(best=max(b.m, best - (best - b.m) * dt / BEST_S))
+
+
+def _link(b: Belief) -> float:
+    rate = _rate_within(b)
+    return b.best if rate is None else max(b.m, min(b.best, log(rate)))
+
+
+def _rate_within(b: Belief) -> float | None:
+    # Others send between frames; what they send within one slows some trains.
+    recent = [rate for at, rate in b.within if at > b.t - LOSS_S]
+    return median(recent) if len(recent) > MANY else None
