@@ -7,7 +7,9 @@ import math
 import time
 from collections.abc import Mapping
 from fractions import Fraction
+from math import log
 from pathlib import Path
+from statistics import median, stdev
 from typing import Any
 
 import jsonschema
@@ -437,5 +439,9 @@ def test_wrong_predictions() -> None:
     source = build_pqos(settings, [])
     made = [source.observe(ClockAdvanced(t=tenth / 10)) for tenth in range(21)]
     assert [(one.t, one.kbps) for one in made if one] == [(1.0, 1500), (1.5, 1500), (2.0, 1500)]
+    noisy = build_pqos(settings | {"wrong": {"noise": 0.35}}, [])
+    factors = [float(made.kbps) / 1000 for t in range(400) if (made := noisy.observe(ClockAdvanced(t=t)))]
+    assert stdev(map(log, factors)) == pytest.approx(0.35, abs=0.05)
+    assert 0.9 < median(factors) < 1.1
     silent = build_pqos(settings | {"wrong": {"silent": True}}, [])
     assert not any(silent.observe(ClockAdvanced(t=t)) for t in range(5))

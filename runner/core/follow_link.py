@@ -147,6 +147,8 @@ def _why(belief: Belief, believed: Believed, link: LinkMeasured | None) -> str:
         return f"nothing has arrived for {link.evidence.silent_s:.1f} s"
     if believed.policer_kbps is not None and believed.policer_kbps < believed.kbps:
         return f"the link drops what exceeds {believed.policer_kbps}"
+    if belief.total > belief.kbps:
+        return f"a share of the link, of which other traffic leaves {believed.kbps}"
     return f"capacity of the link, believed to be {believed.kbps}"
 
 

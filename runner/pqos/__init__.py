@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from random import Random
 from typing import TYPE_CHECKING, Any, Protocol
 
 from runner.core.events import BitratePredicted, Event
@@ -66,11 +67,12 @@ class WrongPqos:
 
     share   factor applied to the rate
     late_s  delay of every prediction, s
+    noise   deviation of the logarithm of another factor, drawn for each second; the same in every drive
     silent  predict nothing
     """
 
-    def __init__(self, source: Pqos, share: Kbps, late_s: float, silent: bool) -> None:
-        self._source, self._share, self._late_s, self._silent = source, share, late_s, silent
+    def __init__(self, source: Pqos, share: Kbps, late_s: float, noise: float, silent: bool) -> None:
+        self._source, self._share, self._late_s, self._noise, self._silent = source, share, late_s, noise, silent
         self._waiting: deque[BitratePredicted] = deque()
 
     @property
@@ -87,8 +89,12 @@ class WrongPqos:
             due = self._waiting.popleft()
         if due is None:
             return None
-        lower = None if due.lower_kbps is None else due.lower_kbps * self._share
-        return replace(due, t=event.t, kbps=due.kbps * self._share, lower_kbps=lower)
+        share = self._share * self._factor(int(due.t))
+        lower = None if due.lower_kbps is None else due.lower_kbps * share
+        return replace(due, t=event.t, kbps=due.kbps * share, lower_kbps=lower)
+
+    def _factor(self, second: int) -> Kbps:
+        return exact(round(Random(second).lognormvariate(0, self._noise), 4)) if self._noise else Kbps(1)
 
 
 def trace(path: Path, loop: bool, off_trace: Kbps | None, column: Column | None = None) -> Callable[[float], Kbps]:
@@ -125,7 +131,8 @@ def build_pqos(settings: Mapping[str, Any], bases: Sequence[Path]) -> Pqos:
     source, wrong = _source(settings, bases), settings.get("wrong")
     if not wrong:
         return source
-    return WrongPqos(source, exact(wrong.get("share", 1)), float(wrong.get("late_s", 0)), wrong.get("silent", False))
+    share, late_s, noise = exact(wrong.get("share", 1)), float(wrong.get("late_s", 0)), float(wrong.get("noise", 0))
+    return WrongPqos(source, share, late_s, noise, wrong.get("silent", False))
 
 
 def _source(settings: Mapping[str, Any], bases: Sequence[Path]) -> Pqos:
