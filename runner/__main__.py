@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from importlib import import_module
 
@@ -16,7 +16,10 @@ from runner.system import signals
 
 USAGE = """usage: tod-runner VERB [OVERRIDE ...] [ARGUMENT=VALUE ...]
 
-{verbs}
+{first}
+
+further verbs:
+{further}
 
 An OVERRIDE is Hydra's: vehicle=delivery_robot, modes=paper, cameras.front_left.weight=2.
 conf=DIR (or the environment variable TOD_CONF) names a directory of your own; its files shadow the packaged ones.
@@ -94,11 +97,20 @@ def _status(words: list[str]) -> int:  # noqa: PLR0911
         return 1
 
 
+def _usage() -> str:
+    from runner.verbs import FIRST_DAY, VERBS
+
+    def table(verbs: Iterable[str]) -> str:
+        return "\n".join(f"  {verb:11}{VERBS[verb].summary}" for verb in verbs)
+
+    return USAGE.format(first=table(FIRST_DAY), further=table(verb for verb in VERBS if verb not in FIRST_DAY))
+
+
 def _run(words: list[str]) -> int:
     from runner.verbs import VERBS, Arguments, unknown_flag
 
     if not words or words[0] in ("-h", "--help", "help"):
-        print(USAGE.format(verbs="\n".join(f"  {name:11}{verb.summary}" for name, verb in VERBS.items())))
+        print(_usage())
         return 0 if words else 2
     if words[0] == "--version":
         from importlib.metadata import version

@@ -139,6 +139,7 @@ VERBS = {
     "completion": Verb("the completion script for bash or zsh", "runner.verbs.completion", (), "SHELL", composes=False),
 }
 
+FIRST_DAY = ("demo", "print", "init", "validate", "vehicle", "operator")  # what --help shows first
 
 SWEPT = ("total_kbps",)  # arguments that -m sweeps like overrides; others may be paths that contain a comma
 # Flags of a Hydra application, and what replaces them here.
