@@ -1,4 +1,4 @@
-"""Bags as other programs write them: each kind was reported in public, see the table in docs/sources.md."""
+"""Bags as other programs write them: each kind was reported in public, see docs/sources.md."""
 
 from __future__ import annotations
 

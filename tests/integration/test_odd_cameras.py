@@ -1,4 +1,4 @@
-"""IP cameras as their makers build them: each habit was reported in public, see the table in docs/sources.md."""
+"""IP cameras as their makers build them: each habit was reported in public, see docs/sources.md."""
 
 from __future__ import annotations
 

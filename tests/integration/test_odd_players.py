@@ -1,4 +1,4 @@
-"""Players with habits that were reported in public, see the table in docs/sources.md, beside those of test_players."""
+"""Players with habits that were reported in public, see docs/sources.md, beside those of test_players."""
 
 from __future__ import annotations
 
