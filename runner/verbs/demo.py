@@ -6,9 +6,10 @@ in the terminal shows the same. Every camera runs at 3 Hz for each core, so that
 eight cameras without a GPU; to change this, give fps_max=40, or null for the cameras' own rates.
 
 With log=DIR both sides write their logs to DIR. With output=OUT a report is written at the end, as by the verb report
-(models= is passed to it); the drive is stored in OUT/drive, unless log= names another directory. An experiment
-defines the drives; one with several runs makes several drives and compares them. With link= a rate-limited link
-connects both sides. keys= names the directory with everyone's keys, see the verb keys.
+(models= is passed to it); the drive is stored in OUT/drive, unless log= names another directory. An experiment defines
+the drives; one with several runs makes several drives and compares them. With link= a rate-limited link connects both
+sides; without it, predictions limit the total, since the loopback of this machine does not. keys= names the directory
+with everyone's keys, see the verb keys.
 
 With -m, commas and range() define a sweep: each combination of values is a run. Runs follow one another, each as if
 started separately with output=OUT/0, OUT/1, ... and log=DIR/0, DIR/1, ...; all are checked before the first one starts.
@@ -180,6 +181,9 @@ def _prepare_run(
     if words:
         config = configuration(own.overrides, own.conf, runnable=False)
         link = config.link()
+    if link is None and (ceiling := _ceiling(config)):
+        own = replace(own, overrides=[*ceiling, *own.overrides])
+        config = configuration(own.overrides, own.conf, runnable=False)
     if link and directory is None:
         raise ArgumentError("link", link.kind, "needs a log to show its effect: give log=DIR or output=OUT")
     if link:
@@ -197,6 +201,13 @@ def _prepare_run(
     with progress_bar() as progress:
         render_missing(vehicle, progress)
     return _Run(name, own, vehicle, directory, link, config.document, duration_s, keys)
+
+
+def _ceiling(config: Configuration) -> list[str]:
+    """Overrides by which a prediction is a limit: this machine's loopback carries more than two cores can encode."""
+    rules = config.document["modes"]["automatic"]
+    numbers = (number for number, rule in enumerate(rules) if "follow_link" in rule)
+    return [f"++modes.automatic.{number}.follow_link.ceiling=prediction" for number in numbers]
 
 
 def _with_rate(arguments: Arguments) -> tuple[Arguments, Configuration]:
