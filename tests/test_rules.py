@@ -260,6 +260,20 @@ def test_an_operator_that_stops_reporting_is_one_that_measures_nothing() -> None
     assert list(totals(drive, 7.3, 7.5)) == [pytest.approx(40, abs=10), 3000], "it last reported at 2.4 s"
 
 
+def test_only_a_fall_that_lasts_makes_pictures_smaller() -> None:
+    drive = connected()
+    for report in range(100):
+        drive.reports(2 + 0.04 * report, 9000)
+    before, wide = drive.sent("front_center")
+    for report in range(100, 106):
+        drive.reports(2 + 0.04 * report, 1500)
+    short, factor = drive.sent("front_center")
+    assert (short < before / 2, factor) == (True, wide)
+    for report in range(106, 130):
+        drive.reports(2 + 0.04 * report, 1500)
+    assert drive["front_center"].scaling < wide
+
+
 @pytest.mark.parametrize("reports, limit", [("followed", 1500), ("ignored", 3000)])
 def test_reports_can_be_ignored(reports: str, limit: float) -> None:
     rule = f"{{follow_link: {{reports: {reports}, start: 1}}}}"

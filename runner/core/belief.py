@@ -39,6 +39,7 @@ BEST_S = 60.0  # memory of the best capacity
 LOSSY, LOSS_S = 0.1, 0.5  # share of losses, in this time, that random loss does not reach
 MANY = 5
 STUCK_S = 2.0  # a queue that is constant for this long while the link is not busy is a longer path
+LASTING_S = 1.0  # of a total that is worth new sizes: each begins with a key frame, several times as large as others
 HALVE_S = 0.2  # in which the total is halved while nothing arrives
 ABSENT_S = 0.3  # without a report for longer, perhaps nothing arrives
 LOWEST = 50.0  # kbit/s: with less nothing is measured
@@ -62,6 +63,7 @@ class Belief(NamedTuple):
     m, v        mean and variance of x
     most        kbit/s: nothing asks for more
     total       kbit/s on the wire that may be sent
+    totals      those of the last LASTING_S, one for each decision
     learned     of predictions
     innovation  what remained of the last surprise
     before      that of the previous report
@@ -104,9 +106,15 @@ class Belief(NamedTuple):
     trains: tuple[float, float, int] = NO_TRAINS
     policer: Policer = Policer()
     within: History[float] = ()
+    totals: History[float] = ()
     levels: History[float] = ()
     forwards: History[float] = ((-inf, 0.0),)
     arrived: History[Arrived] = ()
+
+    @property
+    def lasting(self) -> float:
+        """The usual total of the last LASTING_S, kbit/s: a short fall is not worth smaller pictures."""
+        return median(total for _, total in self.totals) if self.totals else self.total
 
     @property
     def kbps(self) -> float:
@@ -172,7 +180,9 @@ def decide(b: Belief, t: float, silent_s: float, floors: float = 0.0, ceiling: f
     total = max(LOWEST, total * 2 ** (-silent_s / HALVE_S))
     limit = min(b.most, ceiling)
     is_same = abs(total - b.total) < STEADY * b.total and max(total, b.total) <= limit
-    return b if is_same else b._replace(total=min(total, limit))
+    total = b.total if is_same else min(total, limit)
+    is_new = not b.totals or t > b.totals[-1][0]
+    return b._replace(total=total, totals=recorded(b.totals, t, total, LASTING_S) if is_new else b.totals)
 
 
 def _ln(kbps: float, most: float) -> float:

@@ -112,12 +112,13 @@ def _of_every_copy(state: State, evidence: Evidence) -> Evidence:
 
 
 def followed(
-    draft: Draft, total: Kbps, belief: Belief, cameras: tuple[Camera, ...], link: LinkMeasured | None
+    draft: Draft, total: Kbps, lasting: Kbps, belief: Belief, cameras: tuple[Camera, ...], link: LinkMeasured | None
 ) -> Draft:
-    """With this total, and the reason."""
+    """With this total, sizes for the one that lasts, and the reason."""
     before, believed = draft.total, _believed(belief, cameras)
     assert before is not None
-    limited = draft.replaced(believed=believed).limited(total, _why(belief, believed, link))
+    draft = draft.replaced(believed=believed, sized_for=None if lasting == total else lasting)
+    limited = draft.limited(total, _why(belief, believed, link))
     return limited if limited.total == before else limited.replaced(uncapped=max(before, total))
 
 

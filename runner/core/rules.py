@@ -244,10 +244,13 @@ def share_equally(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) 
 @rule(needs=["bitrate"], gives=["scaling"], reads=["rois"])
 def scaling_from_rate_quality(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
     """Eq. (4): the factor whose bitrate range contains the allocation, converted to the full image."""
-    # At the start, sizes are chosen for the larger total that follows.
-    later = draft.sized_for / draft.total if draft.sized_for and draft.total else None
-    factors, reasons = _scaled(vehicle, state.on, state.rois, draft.demand, draft.bitrate, later)
+    factors, reasons = _scaled(vehicle, state.on, state.rois, draft.demand, draft.bitrate, _lasting(draft))
     return draft.replaced(scaling=factors, reasons=reasons), memory
+
+
+def _lasting(draft: Draft) -> Fraction | None:
+    """The total for which sizes are chosen, in multiples of the present one; None: that one."""
+    return draft.sized_for / draft.total if draft.sized_for and draft.total else None
 
 
 @_Last
@@ -257,21 +260,23 @@ def _scaled(
     rois: Mapping[str, Roi],
     demand: Mapping[str, Kbps],
     bitrate: Mapping[str, Kbps],
-    later: Fraction | None,
+    lasting: Fraction | None,
 ) -> tuple[Mapping[str, Fraction], Mapping[str, str]]:
-    """Factor and reason by camera. later: the total that follows, in multiples of the present one."""
+    """Factor and reason by camera. lasting: see `_lasting`."""
     factors, reasons = {}, {}
     for name, camera in vehicle.cameras.items():
         if not on[name]:
             continue
         allocated, roi, full = bitrate[name], rois[name], camera.full_roi
-        kbps, sized_for = _whole(allocated), allocated if later is None else allocated * later
+        kbps, sized_for = _whole(allocated), allocated if lasting is None else allocated * lasting
         of_full = scaling.as_full_image(sized_for, roi, full)
         # A camera that cannot be sent gets the smallest factor, however few its pixels.
         factors[name], why = scaling.select_scaling(camera.rate_quality, of_full if kbps else allocation.ZERO)
         seen = ""
-        if kbps and (later is not None or (roi is not full and roi != full)):
-            seen = f", as {_whole(of_full)} for the full image" + ("" if later is None else " after the start")
+        if kbps and (lasting is not None or (roi is not full and roi != full)):
+            seen = f", as {_whole(of_full)} for the full image" + (
+                "" if lasting is None else " at the total that lasts"
+            )
         reasons[name] = f"{kbps} of {short(demand[name])} kbit/s{seen}, {why}"
     return factors, reasons
 
@@ -307,9 +312,9 @@ def fit_to_total(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -
         camera, roi = vehicle.cameras[name], state.rois[name]
         asked, fitted = (
             scaling.select_scaling(camera.rate_quality, scaling.as_full_image(kbps, roi, camera.full_roi))[0]
-            for kbps in (draft.bitrate[name], bitrates[name])
+            for kbps in (draft.bitrate[name], bitrates[name] * (_lasting(draft) or 1))
         )
-        if fitted < asked and draft.sized_for is None:
+        if fitted < asked:
             factors[name] = min(own, fitted)
         reasons[name] += f", sent with {_whole(bitrates[name])} kbit/s and {plain(factors[name])}"
     return draft.replaced(bitrate=bitrates, scaling=factors, reasons=reasons), memory
@@ -371,11 +376,16 @@ def follow_link(
         floors=float(_wire_floors(vehicle, state, draft, cameras, reserve_kbps)),
         ceiling=limit if has_limit else inf,
     )
-    carried = video_kbps(cameras, max(wire_kbps(cameras, least), exact(round(belief.total, 1)) - reserve_kbps))
+
+    def video(wire: float) -> Kbps:
+        if has_limit and wire >= min(limit, belief.most):
+            return asked
+        carried = video_kbps(cameras, max(wire_kbps(cameras, least), exact(round(wire, 1)) - reserve_kbps))
+        return min(asked, carried) if has_limit else carried
+
     draft = draft.replaced(measured=not has_limit and belief.learned.ln is None)
-    if has_limit:
-        carried = asked if belief.total >= min(limit, belief.most) else min(asked, carried)
-    return follow.followed(draft, carried, belief, cameras, link), {**memory, "follow_link": belief}
+    draft = follow.followed(draft, video(belief.total), video(belief.lasting), belief, cameras, link)
+    return draft, {**memory, "follow_link": belief}
 
 
 def sent_cameras(vehicle: Vehicle, state: State) -> tuple[Camera, ...]:
