@@ -91,11 +91,21 @@ def test_a_replay_measures_the_link_again_bit_for_bit(drive):
 )
 def test_frames_tell_the_rate_of_a_link_that_they_do_not_fill(kind, tmp_path):
     """Each as a train of packets, and by what the link carried since the frame before, if it was still busy then."""
+    for attempt in range(3):
+        trains, busy = rates(kind, tmp_path / str(attempt))
+        if len(busy) > 15:
+            break  # otherwise the cameras' phases, which chance decides, are apart
+    assert min(len(trains), len(busy)) > 15
+    assert (median(trains), median(busy)) == pytest.approx((4000, 4000), rel=0.1)
+
+
+def rates(kind, path):
+    """Of trains, and of frames that found the link busy, kbit/s, over a link of 4000."""
     words = ("fps_max=5", "modes=open_loop", "pqos.kbps=3200", f"link={kind}", "link.share=1.25", "duration_s=6")
     ports = (f"media.port={free_port()}", f"control.port={free_port()}")
-    done = run("demo", *ROBOT, *NOISE, *ports, *words, f"log={tmp_path}")
+    done = run("demo", *ROBOT, *NOISE, *ports, *words, f"log={path}")
     assert done.returncode == 0, done.stderr
-    reports = [line.report for line in read_drive(tmp_path).sides["vehicle"].of(ReceptionReported) if line.t > 2]
+    reports = [line.report for line in read_drive(path).sides["vehicle"].of(ReceptionReported) if line.t > 2]
     units = [(report.at - unit.ago_s, unit) for report in reports for unit in report.units]
     shortest = {name: min(u.delay_s - u.train_s for _, u in units if u.camera == name) for name in ROBOT_SIZES}
     trains = [kbps(u.train_packets, u.train_bytes, u.train_s) for _, u in units if u.whole and u.train_packets > 10]
@@ -104,8 +114,7 @@ def test_frames_tell_the_rate_of_a_link_that_they_do_not_fill(kind, tmp_path):
         for (before, _), (at, unit) in pairwise(units)
         if before > at - unit.delay_s + shortest[unit.camera] + 0.002 and at > before
     ]
-    assert min(len(trains), len(busy)) > 15
-    assert (median(trains), median(busy)) == pytest.approx((4000, 4000), rel=0.1)
+    return trains, busy
 
 
 def kbps(packets, size, seconds):
