@@ -52,10 +52,11 @@ function checkMonitors(now) {
   for (const [id, { status, at }] of reports) if (now - at >= SILENT_MS) onSilent(id, Object.keys(status));
 }
 
-/** A monitor has crashed: the driver is alerted once, and its pictures no longer count. */
+/** A monitor has crashed: the driver is alerted once, in the vehicle's order, and its pictures no longer count. */
 function onSilent(id, cameras) {
   reportProblem("a monitor no longer responds: reload it");
-  remind(keyOf(cameras), `MONITOR NOT RESPONDING ${cameras.map(displayName).join(", ")}`);
+  const mounted = (store.hello?.cameras ?? []).map(({ name }) => name).filter((name) => cameras.includes(name));
+  remind(keyOf(cameras), `MONITOR NOT RESPONDING ${mounted.map(displayName).join(", ")}`);
   for (const camera of cameras) publishStatus(id, camera, "lost");
   reports.delete(id);
 }
