@@ -37,7 +37,7 @@ AT_ONCE = 0.75  # share of a train: if so much of it passed at once, a longer on
 YIELDED = 1 / 3  # of the best capacity: competing traffic gets no more than the rest
 BEST_S = 60.0  # memory of the best capacity
 LOSSY, LOSS_S = 0.1, 0.5  # share of losses, in this time, that random loss does not reach
-MANY = 5
+MANY = 5  # reports with trains of a busy link, in LOSS_S: with more, their median tells the link's own rate
 STUCK_S = 2.0  # a queue that is constant for this long while the link is not busy is a longer path
 LASTING_S = 1.0  # of a total that is worth new sizes: each begins with a key frame, several times as large as others
 HALVE_S = 0.2  # in which the total is halved while nothing arrives
@@ -358,11 +358,13 @@ def _contend(b: Belief, seen: Evidence) -> Belief:
 
 
 def _link(b: Belief) -> float:
+    """x of the link itself: what its trains tell, or the best capacity."""
     rate = _rate_within(b)
     return b.best if rate is None else max(b.m, min(b.best, log(rate)))
 
 
 def _rate_within(b: Belief) -> float | None:
+    """The rate of recent trains of a busy link, kbit/s; None: there are too few."""
     # Others send between frames; what they send within one slows some trains.
     recent = [rate for at, rate in b.within if at > b.t - LOSS_S]
     return median(recent) if len(recent) > MANY else None

@@ -274,9 +274,8 @@ def _scaled(
         factors[name], why = scaling.select_scaling(camera.rate_quality, of_full if kbps else allocation.ZERO)
         seen = ""
         if kbps and (lasting is not None or (roi is not full and roi != full)):
-            seen = f", as {_whole(of_full)} for the full image" + (
-                "" if lasting is None else " at the total that lasts"
-            )
+            lasts = "" if lasting is None else " at the total that lasts"
+            seen = f", as {_whole(of_full)} for the full image{lasts}"
         reasons[name] = f"{kbps} of {short(demand[name])} kbit/s{seen}, {why}"
     return factors, reasons
 
