@@ -95,7 +95,7 @@ class RtspConnection:
 
         dscp  DiffServ code point of its packets; -1 leaves it to the system
         """
-        self.interleaved = True
+        self.interleaved, self._writable = True, time.monotonic()
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, USER_TIMEOUT_MS)
         if dscp < 0:
             return
