@@ -16,9 +16,10 @@ from hypothesis import strategies as st
 from runner.configuration.rule_lists import OWN_RULES, call_rule, check_order
 from runner.core import events as core_events
 from runner.core import rules
+from runner.core.decision import Decision
 from runner.core.events import Attention, BitratePredicted, parse
 from runner.core.model import Mode, ModelError, Roi, Vehicle, least_float
-from runner.core.rules import decide
+from runner.core.rules import decide, registry
 from runner.core.state import State
 from runner.core.step import Run, start, step
 
@@ -27,7 +28,7 @@ START = State.initial(TUM, Mode.AUTOMATIC)
 STEPS = [1320, 1650, 2200, 2970, 3300, 4400, 5225, 14850]  # computed from Table I
 
 
-def decided(total: Fraction | int | str, state: State = START) -> rules.Decision:
+def decided(total: Fraction | int | str, state: State = START) -> Decision:
     prediction = BitratePredicted(t=0, kbps=Fraction(total))
     return decide(TUM, replace(state, prediction=prediction), {})[0]
 
@@ -402,7 +403,7 @@ def reading_everything(vehicle: Vehicle) -> Vehicle:
     """The vehicle with rules that do not state what they read."""
 
     def call(of: Any) -> rules.RuleCall:
-        return replace(of, rule=replace(of.rule, reads=rules.EVERYTHING))
+        return replace(of, rule=replace(of.rule, reads=registry.EVERYTHING))
 
     return replace(vehicle, modes={mode: tuple(map(call, calls)) for mode, calls in vehicle.modes.items()})
 
@@ -431,14 +432,14 @@ def reasons(run: Run) -> list[str]:
 
 
 def test_a_rule_without_declared_reads_runs_on_every_change(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rules, "RULES", dict(rules.RULES))
+    monkeypatch.setattr(registry, "RULES", dict(registry.RULES))
 
     @rules.rule(needs=["total"], gives=["total"])
     def below_at_night(vehicle: Vehicle, state: State, draft: Any, memory: Any) -> Any:
         return draft.replaced(total=min(draft.total, 111) if state.t > 10 else draft.total), memory
 
     first, *others = TUM.modes[Mode.AUTOMATIC]
-    call = rules.RuleCall(rules.RULES["below_at_night"])
+    call = rules.RuleCall(registry.RULES["below_at_night"])
     drive = Drive("modes=paper")
     drive.vehicle = replace(TUM, modes={**TUM.modes, Mode.AUTOMATIC: (first, call, *others)})
     drive.accept("bitrate_predicted", t=1, kbps=5000)
@@ -451,7 +452,7 @@ def test_a_rule_without_declared_reads_runs_on_every_change(monkeypatch: pytest.
 
 
 def listed(*names: str) -> list[rules.RuleCall]:
-    return [rules.RuleCall(rules.RULES[name]) for name in names]
+    return [rules.RuleCall(registry.RULES[name]) for name in names]
 
 
 @pytest.mark.parametrize(
@@ -511,7 +512,7 @@ def test_a_users_rule_is_found_by_its_entry_point(monkeypatch: pytest.MonkeyPatc
     entry = EntryPoint("keep_below", "my.rules:keep_below", "tod_runner.rules")
     monkeypatch.setattr(EntryPoint, "load", load)
     monkeypatch.setattr("importlib.metadata.entry_points", lambda group, name: [entry] if name == entry.name else [])
-    monkeypatch.setattr(rules, "RULES", dict(rules.RULES))
+    monkeypatch.setattr(registry, "RULES", dict(registry.RULES))
     call = call_rule("keep_below", {"most_kbps": 1000})
     lists = {**TUM.modes, Mode.AUTOMATIC: (TUM.modes[Mode.AUTOMATIC][0], call, *TUM.modes[Mode.AUTOMATIC][1:])}
     assert check_order(Mode.AUTOMATIC, lists[Mode.AUTOMATIC]) == []

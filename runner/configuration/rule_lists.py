@@ -11,9 +11,8 @@ from enum import StrEnum
 from typing import Any
 
 from runner.configuration.replaced_rules import REPLACED, SUCCESSOR
-from runner.core import rules
 from runner.core.model import Mode, ModelError, exact, suggest
-from runner.core.rules import Rule, RuleCall
+from runner.core.rules import GIVEN, Rule, RuleCall, registry
 
 OWN_RULES = "; one of your own needs the entry point tod_runner.rules, see docs/rules.md"
 
@@ -23,7 +22,7 @@ def find_rule(name: str) -> Rule:
 
     raises  ModelError with a suggestion
     """
-    if name not in rules.RULES:
+    if name not in registry.RULES:
         from importlib.metadata import entry_points
 
         for entry in entry_points(group="tod_runner.rules", name=name):
@@ -34,9 +33,9 @@ def find_rule(name: str) -> Rule:
                 raise ModelError("", repr(name), rule) from None
     if name in REPLACED:
         raise ModelError("", repr(name), f"was replaced by {SUCCESSOR}, see docs/rules.md")
-    if name not in rules.RULES:
-        raise ModelError("", repr(name), f"unknown rule{suggest(name, rules.RULES)}{OWN_RULES}")
-    return rules.RULES[name]
+    if name not in registry.RULES:
+        raise ModelError("", repr(name), f"unknown rule{suggest(name, registry.RULES)}{OWN_RULES}")
+    return registry.RULES[name]
 
 
 def call_rule(name: str, parameters: Mapping[str, Any]) -> RuleCall:
@@ -81,7 +80,7 @@ def check_order(mode: Mode, calls: Sequence[RuleCall]) -> list[ModelError]:
             rule_name = repr(call.rule.name)
             problems.append(ModelError(f"{mode}[{index}]", rule_name, f"needs {part}, which no earlier rule gives"))
         given |= call.rule.gives
-    missing = [part for part in rules.GIVEN if part not in given]
+    missing = [part for part in GIVEN if part not in given]
     if missing:
         problems.append(ModelError(f"{mode}", [c.rule.name for c in calls], f"no rule gives {', '.join(missing)}"))
     return problems

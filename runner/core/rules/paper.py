@@ -1,0 +1,122 @@
+"""The paper's rules, and those that it is compared with: modes=paper, fixed and equal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from fractions import Fraction
+
+from runner.core import allocation, scaling
+from runner.core.decision import Draft, short
+from runner.core.model import Kbps, Roi, Vehicle, plain
+from runner.core.rules.registry import Last, Memory, Step, rule
+from runner.core.state import State
+
+
+@rule(gives=["total"], reads=["prediction"])
+def total_from_prediction(vehicle: Vehicle, state: State, draft: Draft, memory: Memory, *, start_kbps: Kbps) -> Step:
+    """Mode A: the total is the last prediction of pQoS; `start_kbps` until the first one arrives."""
+    return draft.replaced(total=start_kbps if state.prediction is None else state.prediction.kbps), memory
+
+
+@rule(gives=["total"], reads=["collective_total"])
+def total_from_operator(vehicle: Vehicle, state: State, draft: Draft, memory: Memory, *, start_kbps: Kbps) -> Step:
+    """Mode C: the total is the operator's; `start_kbps` if a run starts in C and none was set yet."""
+    return draft.replaced(total=start_kbps if state.collective_total is None else state.collective_total), memory
+
+
+@rule(gives=["total"], reads=[])
+def total_fixed(vehicle: Vehicle, state: State, draft: Draft, memory: Memory, *, kbps: Kbps) -> Step:
+    """The total is a constant, independent of the prediction; for comparison."""
+    return draft.replaced(total=kbps), memory
+
+
+@rule(gives=["demand"], reads=["on", "rois"])
+def demand_from_roi(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
+    """Eq. (1): each camera that is on asks in proportion to the pixels of its ROI."""
+    return draft.replaced(demand=demands(vehicle, state)), memory
+
+
+def demands(vehicle: Vehicle, state: State) -> dict[str, Kbps]:
+    """kbit/s by camera, Eq. (1); 0 when off."""
+    return {
+        name: allocation.demand(camera.rate_quality.b_full, state.rois[name], camera.full_roi)
+        if state.on[name]
+        else allocation.ZERO
+        for name, camera in vehicle.cameras.items()
+    }
+
+
+@rule(needs=["total", "demand"], gives=["bitrate"], reads=["weights"])
+def share_by_demand(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
+    """Eq. (2): the total is shared in proportion to demand times weight, no camera gets more than its demand."""
+    assert draft.total is not None
+    return draft.replaced(bitrate=allocation.allocate(draft.demand, draft.total, state.weights)), memory
+
+
+@rule(needs=["total", "demand"], gives=["bitrate"], reads=["weights"])
+def share_equally(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
+    """Each camera that is on gets the same, times its weight, but no more than its demand; for comparison."""
+    assert draft.total is not None
+    # Eq. (2) shares in proportion to weight times demand; this cancels the demand.
+    wanted = {name: demand for name, demand in draft.demand.items() if demand}
+    weights = {name: state.weights[name] / wanted.get(name, 1) for name in draft.demand}
+    return draft.replaced(bitrate=allocation.allocate(draft.demand, draft.total, weights)), memory
+
+
+@rule(needs=["bitrate"], gives=["scaling"], reads=["rois"])
+def scaling_from_rate_quality(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
+    """Eq. (4): the factor whose bitrate range contains the allocation, converted to the full image."""
+    factors, reasons = _scaled(vehicle, state.on, state.rois, draft.demand, draft.bitrate, lasting_share(draft))
+    return draft.replaced(scaling=factors, reasons=reasons), memory
+
+
+def lasting_share(draft: Draft) -> Fraction | None:
+    """The total for which sizes are chosen, in multiples of the present one; None: that one."""
+    return draft.sized_for / draft.total if draft.sized_for and draft.total else None
+
+
+@Last
+def _scaled(
+    vehicle: Vehicle,
+    on: Mapping[str, bool],
+    rois: Mapping[str, Roi],
+    demand: Mapping[str, Kbps],
+    bitrate: Mapping[str, Kbps],
+    lasting: Fraction | None,
+) -> tuple[Mapping[str, Fraction], Mapping[str, str]]:
+    """Factor and reason by camera. lasting: see `lasting_share`."""
+    factors, reasons = {}, {}
+    for name, camera in vehicle.cameras.items():
+        if not on[name]:
+            continue
+        allocated, roi, full = bitrate[name], rois[name], camera.full_roi
+        kbps, sized_for = whole(allocated), allocated if lasting is None else allocated * lasting
+        of_full = scaling.as_full_image(sized_for, roi, full)
+        # A camera that cannot be sent gets the smallest factor, however few its pixels.
+        factors[name], why = scaling.select_scaling(camera.rate_quality, of_full if kbps else allocation.ZERO)
+        seen = ""
+        if kbps and (lasting is not None or (roi is not full and roi != full)):
+            seen = f", as {whole(of_full)} for the full image" + ("" if lasting is None else " at the total that lasts")
+        reasons[name] = f"{kbps} of {short(demand[name])} kbit/s{seen}, {why}"
+    return factors, reasons
+
+
+@rule(needs=["demand"], gives=["total", "bitrate", "scaling"], reads=["copies", "manual", "on"])
+def keep_operator_settings(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
+    """Mode S: each camera is sent as the operator has set it; the total is the resulting sum."""
+    on = [name for name in vehicle.cameras if state.on[name]]
+    bitrates = {name: Kbps(state.manual[name].kbps) if name in on else allocation.ZERO for name in vehicle.cameras}
+    factors = {name: state.manual[name].scaling for name in on}
+    reasons = {name: f"{int(bitrates[name])} kbit/s and {plain(factors[name])} as set in mode single" for name in on}
+    total = of_all_copies(state, bitrates)
+    return draft.replaced(total=total, bitrate=bitrates, scaling=factors, reasons=reasons), memory
+
+
+def of_all_copies(state: State, kbps: Mapping[str, Kbps]) -> Kbps:
+    """The sum over all copies that leave the vehicle."""
+    return sum((own * state.copies.get(name, 1) for name, own in kbps.items()), allocation.ZERO)
+
+
+def whole(bitrate: Kbps) -> int:
+    """A bitrate rounded down."""
+    return bitrate.numerator // bitrate.denominator

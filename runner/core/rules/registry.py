@@ -1,0 +1,105 @@
+"""What a rule is, and the register of those that are known.
+
+A rule is a pure function `rule(vehicle, state, draft, memory, *, parameters) -> (draft, memory)`, registered by the
+decorator `rule`, which declares what it needs from earlier rules, what it gives, and which state fields it reads.
+Memory is frozen and keyed by rule; only rules that need history use it.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+from runner.core.decision import Draft
+from runner.core.model import Vehicle
+from runner.core.state import State
+
+Memory = Mapping[str, Any]
+Step = tuple[Draft, Memory]
+
+GIVEN = ("total", "demand", "bitrate", "scaling")  # parts that a mode's rules must give together
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """A rule and what it declares about itself.
+
+    needs  parts of the draft that earlier rules must have given
+    gives  parts of the draft that exist after it
+    reads  fields of the state whose change triggers a new decision
+    """
+
+    name: str
+    function: Callable[..., Step]
+    needs: frozenset[str]
+    gives: frozenset[str]
+    reads: frozenset[str]
+
+    @property
+    def parameters(self) -> Mapping[str, inspect.Parameter]:
+        every = inspect.signature(self.function).parameters
+        return {name: p for name, p in every.items() if p.kind is inspect.Parameter.KEYWORD_ONLY}
+
+
+@dataclass(frozen=True, slots=True)
+class RuleCall:
+    """A rule with its parameters from a modes file."""
+
+    rule: Rule
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        return self.rule.name
+
+    @property
+    def reads(self) -> frozenset[str]:
+        return self.rule.reads
+
+    def __call__(self, vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
+        return self.rule.function(vehicle, state, draft, memory, **self.parameters)
+
+
+RULES: dict[str, Rule] = {}
+
+
+EVERYTHING = frozenset(part.name for part in fields(State))
+
+
+def rule(
+    *, needs: Iterable[str] = (), gives: Iterable[str] = (), reads: Iterable[str] = EVERYTHING
+) -> Callable[[Callable[..., Step]], Callable[..., Step]]:
+    """Register a function as a rule under its own name.
+
+    reads   fields of the state that the rule depends on; default: all, so that any change triggers a new decision
+    raises  ValueError if `reads` names something other than a field of the state: the rule would miss its changes
+    """
+    read = frozenset(reads)
+    if unknown := sorted(read - EVERYTHING):
+        raise ValueError(
+            f"reads: {', '.join(unknown)}: unknown; expected fields of State: {', '.join(sorted(EVERYTHING))}"
+        )
+
+    def register(function: Callable[..., Step]) -> Callable[..., Step]:
+        name = function.__name__
+        RULES[name] = Rule(name, function, frozenset(needs), frozenset(gives), read)
+        return function
+
+    return register
+
+
+class Last:
+    """A pure function that remembers its last result: most events leave its arguments as they were."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function = function
+        self._last: tuple[tuple[Any, ...], Any] = ((), None)
+
+    def __call__(self, *arguments: Any) -> Any:
+        before, result = self._last  # one object, in case several threads decide
+        if arguments != before:
+            result = self._function(*arguments)
+            self._last = (arguments, result)
+        return result
