@@ -171,7 +171,7 @@ def measured(drive: Drive, begin: float, kbps: float, seconds: float = 2, **evid
 def test_the_total_is_what_the_link_carries_without_headers() -> None:
     drive = connected(kbps=6000)
     total, cameras = measured(drive, 0.1, 3000), tuple(drive.vehicle.cameras.values())
-    wire = Fraction(round(drive.run.memory["follow_link"].total, 1)).limit_denominator(10)
+    wire = Fraction(round(drive.run.memory["follow_link", "follow_link"]["belief"].total, 1)).limit_denominator(10)
     assert total == Fraction(int(10 * video_kbps(cameras, wire)), 10)
     assert 0.75 * 3000 < total < 3000
     assert "capacity of the link, believed to be" in drive[NAMES[0]].reason

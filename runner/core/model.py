@@ -80,11 +80,14 @@ def suggest(word: str, known: Iterable[str], most: int = 13) -> str:
 class ModeRule(Protocol):
     """A rule with its parameters, as a mode lists it, see `runner.core.rules`.
 
+    key    of its memory: names of the rule and of its entry in the modes file
     reads  fields of the state whose change triggers a new decision
     """
 
     @property
     def name(self) -> str: ...
+    @property
+    def key(self) -> tuple[str, str]: ...
     @property
     def reads(self) -> frozenset[str]: ...
     def __call__(self, vehicle: Vehicle, state: Any, draft: Any, memory: Mapping[str, Any], /) -> Any: ...
@@ -646,7 +649,7 @@ class RosSettings:
 class Vehicle:
     """Everything the runner needs to know, valid once built.
 
-    modes      the rule list of each mode
+    modes      the rules of each mode, in order
     pqos       the prediction source as defined in YAML, read by `runner.pqos`
     recording  how `record` stores the frames of every camera
     expires_s  age from which the vehicle drops a request, in addition to the round trip

@@ -12,7 +12,7 @@ from runner.core.commands import Command, KnobValues, after, difference
 from runner.core.decision import Decision
 from runner.core.events import CameraSwitched, Event, ModeSelected, SourceReported
 from runner.core.model import Mode, Vehicle
-from runner.core.rules import Memory
+from runner.core.rules import Memories
 from runner.core.state import Refused, State, advance, keep
 
 NOTHING: Mapping[str, KnobValues] = MappingProxyType({})
@@ -29,7 +29,7 @@ class Run:
     """
 
     state: State
-    memory: Memory
+    memory: Memories
     decision: Decision
     commanded: Mapping[str, KnobValues] = field(default_factory=lambda: NOTHING)
     commands: tuple[Command, ...] = ()

@@ -2,11 +2,12 @@
 
 from runner.core.rules import steady  # noqa: F401  (registers its rules; so do the modules below)
 from runner.core.rules.deciding import RuleFailed, decide, decide_without_link, reads
-from runner.core.rules.registry import GIVEN, Memory, Rule, RuleCall, Step, rule
+from runner.core.rules.registry import GIVEN, Memories, Memory, Rule, RuleCall, Step, rule
 from runner.core.rules.safe import follow_link
 
 __all__ = [
     "GIVEN",
+    "Memories",
     "Memory",
     "Rule",
     "RuleCall",

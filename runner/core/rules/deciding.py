@@ -9,10 +9,10 @@ from functools import cache
 from typing import Any
 
 from runner.core import allocation, scaling
-from runner.core.decision import Decision, Draft, Setting
+from runner.core.decision import NOTHING, Decision, Draft, Setting
 from runner.core.model import Mode, Roi, Vehicle
 from runner.core.rules.paper import whole
-from runner.core.rules.registry import Last, Memory
+from runner.core.rules.registry import Last, Memories
 from runner.core.rules.safe import follow_link
 from runner.core.state import State
 from runner.errors import RunError
@@ -25,7 +25,7 @@ class RuleFailed(RunError):
     """A rule raised an exception or gave a value that cannot be used; the text names rule and value."""
 
 
-def decide(vehicle: Vehicle, state: State, memory: Memory) -> tuple[Decision, Memory]:
+def decide(vehicle: Vehicle, state: State, memory: Memories) -> tuple[Decision, Memories]:
     """Pure core of the runner: run the rules of the mode in force, in order.
 
     To the rules, a camera that is lost is off: the others get its share.
@@ -35,13 +35,14 @@ def decide(vehicle: Vehicle, state: State, memory: Memory) -> tuple[Decision, Me
     draft, asked = Draft(), None
     seen = replace(state, on={**state.on, **dict.fromkeys(state.lost, False)}) if state.lost else state
     for call in vehicle.modes[state.mode]:
-        before = draft
+        before, own = draft, memory.get(call.key, NOTHING)
         try:
-            draft, memory = call(vehicle, seen, draft, memory)
+            draft, kept = call(vehicle, seen, draft, own)
         except (Exception, SystemExit) as error:
             raise RuleFailed(f"rule {call.name} failed: {type(error).__name__}: {error}") from error
         if problem := _draft_problem(seen, before, draft):
             raise RuleFailed(f"rule {call.name} failed: {problem}")
+        memory = memory if kept is own else {**memory, call.key: kept}
         asked = draft.total if asked is None else asked
     assert draft.total is not None and asked is not None
     settings = _settings(
@@ -56,12 +57,12 @@ def decide(vehicle: Vehicle, state: State, memory: Memory) -> tuple[Decision, Me
     return Decision(state.mode, draft.total, settings, asked, uncapped, draft.believed), memory
 
 
-def decide_without_link(vehicle: Vehicle, state: State, memory: Memory) -> Decision:
+def decide_without_link(vehicle: Vehicle, state: State, memory: Memories) -> Decision:
     """What the rules would decide if no operator measured the uplink.
 
     raises  RuleFailed
     """
-    unmeasured = {name: past for name, past in memory.items() if name != follow_link.__name__}
+    unmeasured = {key: past for key, past in memory.items() if key[0] != follow_link.__name__}
     return decide(vehicle, replace(state, link=None, operator_since=None), unmeasured)[0]
 
 

@@ -63,7 +63,7 @@ def share_equally(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) 
     return draft.replaced(bitrate=allocation.allocate(draft.demand, draft.total, weights)), memory
 
 
-@rule(needs=["bitrate"], gives=["scaling"], reads=["rois"])
+@rule(needs=["bitrate"], gives=["scaling"], reads=["rois"], uses=["sized_for"])
 def scaling_from_rate_quality(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
     """Eq. (4): the factor whose bitrate range contains the allocation, converted to the full image."""
     factors, reasons = _scaled(vehicle, state.on, state.rois, draft.demand, draft.bitrate, lasting_share(draft))

@@ -2,7 +2,7 @@
 
 A rule is a pure function `rule(vehicle, state, draft, memory, *, parameters) -> (draft, memory)`, registered by the
 decorator `rule`, which declares what it needs from earlier rules, what it gives, and which state fields it reads.
-Memory is frozen and keyed by rule; only rules that need history use it.
+Memory is frozen, and the rule's own: what rules share is a part of the draft. Only rules that need history use it.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from runner.core.state import State
 
 Memory = Mapping[str, Any]
 Step = tuple[Draft, Memory]
+MemoryKey = tuple[str, str]  # names of a rule and of its entry in the modes file
+Memories = Mapping[MemoryKey, Memory]
 
 GIVEN = ("total", "demand", "bitrate", "scaling")  # parts that a mode's rules must give together
 
@@ -29,6 +31,7 @@ class Rule:
     needs  parts of the draft that earlier rules must have given
     gives  parts of the draft that exist after it
     reads  fields of the state whose change triggers a new decision
+    uses   parts of the draft that it takes into account if earlier rules have given them
     """
 
     name: str
@@ -36,6 +39,7 @@ class Rule:
     needs: frozenset[str]
     gives: frozenset[str]
     reads: frozenset[str]
+    uses: frozenset[str] = frozenset()
 
     @property
     def parameters(self) -> Mapping[str, inspect.Parameter]:
@@ -45,14 +49,23 @@ class Rule:
 
 @dataclass(frozen=True, slots=True)
 class RuleCall:
-    """A rule with its parameters from a modes file."""
+    """A rule with its parameters from a modes file.
+
+    entry  name that the modes file gives it; empty: that of the rule
+    """
 
     rule: Rule
     parameters: Mapping[str, Any] = field(default_factory=dict)
+    entry: str = ""
 
     @property
     def name(self) -> str:
-        return self.rule.name
+        return self.entry or self.rule.name
+
+    @property
+    def key(self) -> MemoryKey:
+        """Modes share the memory of a rule where its name is the same."""
+        return self.rule.name, self.name
 
     @property
     def reads(self) -> frozenset[str]:
@@ -69,11 +82,18 @@ EVERYTHING = frozenset(part.name for part in fields(State))
 
 
 def rule(
-    *, needs: Iterable[str] = (), gives: Iterable[str] = (), reads: Iterable[str] = EVERYTHING
+    *,
+    needs: Iterable[str] = (),
+    gives: Iterable[str] = (),
+    reads: Iterable[str] = EVERYTHING,
+    uses: Iterable[str] = (),
 ) -> Callable[[Callable[..., Step]], Callable[..., Step]]:
     """Register a function as a rule under its own name.
 
+    needs   parts of the draft that earlier rules must have given
+    gives   parts of the draft that exist after it
     reads   fields of the state that the rule depends on; default: all, so that any change triggers a new decision
+    uses    parts of the draft that it takes into account if earlier rules have given them
     raises  ValueError if `reads` names something other than a field of the state: the rule would miss its changes
     """
     read = frozenset(reads)
@@ -84,7 +104,7 @@ def rule(
 
     def register(function: Callable[..., Step]) -> Callable[..., Step]:
         name = function.__name__
-        RULES[name] = Rule(name, function, frozenset(needs), frozenset(gives), read)
+        RULES[name] = Rule(name, function, frozenset(needs), frozenset(gives), read, frozenset(uses))
         return function
 
     return register

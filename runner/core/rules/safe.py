@@ -29,7 +29,7 @@ def share_above_floors(vehicle: Vehicle, state: State, draft: Draft, memory: Mem
     """
     total = draft.total
     assert total is not None
-    draft, given_up, memory = _give_up(vehicle, state, draft, draft.demand, memory, "share_above_floors")
+    draft, given_up, memory = _give_up(vehicle, state, draft, draft.demand, memory)
     wanted = _without(given_up, draft.demand)
     return draft.replaced(bitrate=_shared(vehicle, state, wanted, total)), memory
 
@@ -48,13 +48,10 @@ def _shared(vehicle: Vehicle, state: State, wanted: Mapping[str, Kbps], total: K
 
 
 def _give_up(
-    vehicle: Vehicle, state: State, draft: Draft, wanted: Mapping[str, Kbps], memory: Memory, key: str
+    vehicle: Vehicle, state: State, draft: Draft, wanted: Mapping[str, Kbps], memory: Memory
 ) -> tuple[Draft, tuple[str, ...], Memory]:
-    """The draft with a note of the cameras given up for the floors of others, these cameras, and the memory with them.
-
-    key  of the memory, where they are kept
-    """
-    before: tuple[str, ...] = memory.get(key, ())
+    """The draft with a note of the cameras given up for the floors of others, these cameras, the memory with them."""
+    before: tuple[str, ...] = memory.get("given_up", ())
     given_up: tuple[str, ...] = ()
     if order := _shed_order(vehicle):
         assert draft.total is not None
@@ -62,7 +59,7 @@ def _give_up(
         of_all = {name: own * state.copies.get(name, 1) for name, own in wanted.items()}
         given_up = allocation.shed(of_all, draft.total, floors, order, before)
     if given_up != before:
-        memory = {**memory, key: given_up}
+        memory = {"given_up": given_up}
     if given_up:
         draft = draft.noted(f"{', '.join(given_up)} given up for the floors of others")
     return draft, given_up, memory
@@ -85,7 +82,12 @@ def _shed_order(vehicle: Vehicle) -> tuple[str, ...]:
     return tuple(sorted(numbers, key=lambda name: numbers[name]))
 
 
-@rule(needs=["total", "bitrate", "scaling"], gives=["bitrate", "scaling"], reads=["copies", "rois", "weights"])
+@rule(
+    needs=["total", "bitrate", "scaling"],
+    gives=["bitrate", "scaling"],
+    reads=["copies", "rois", "weights"],
+    uses=["sized_for"],
+)
 def fit_to_total(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
     """Mode S with less: Eq. (2) in proportion to what the operator has set, with floors as in `share_above_floors`.
 
@@ -97,8 +99,8 @@ def fit_to_total(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -
     total = draft.total
     assert total is not None
     if total >= of_all_copies(state, draft.bitrate):
-        return draft, {**memory, "fit_to_total": ()} if memory.get("fit_to_total") else memory
-    draft, given_up, memory = _give_up(vehicle, state, draft, draft.bitrate, memory, "fit_to_total")
+        return draft, {} if memory else memory
+    draft, given_up, memory = _give_up(vehicle, state, draft, draft.bitrate, memory)
     bitrates = _shared(vehicle, state, _without(given_up, draft.bitrate), total)
     factors, reasons = dict(draft.scaling), dict(draft.reasons)
     for name, own in factors.items():
@@ -115,7 +117,7 @@ def fit_to_total(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -
 
 @rule(
     needs=["total"],
-    gives=["total"],
+    gives=["total", "uncapped", "sized_for"],
     reads=["copies", "link", "on", "operator_since", "prediction", "rois", "t"],
 )
 def follow_link(
@@ -147,7 +149,7 @@ def follow_link(
     asked = draft.total
     assert asked is not None
     cameras, is_automatic = sent_cameras(vehicle, state), state.mode is Mode.AUTOMATIC
-    past: Belief | None = memory.get("follow_link")
+    past: Belief | None = memory.get("belief")
     link = state.link if reports is Reports.FOLLOWED else None
     if not cameras or not follow.is_measured(state, link, past):
         if is_automatic:
@@ -175,7 +177,7 @@ def follow_link(
 
     draft = draft.replaced(measured=not has_limit and belief.learned.ln is None)
     draft = follow.followed(draft, video(belief.total), video(belief.lasting), belief, cameras, link)
-    return draft, {**memory, "follow_link": belief}
+    return draft, {"belief": belief}
 
 
 def sent_cameras(vehicle: Vehicle, state: State) -> tuple[Camera, ...]:

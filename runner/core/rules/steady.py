@@ -17,21 +17,21 @@ def hold_upscaling(vehicle: Vehicle, state: State, draft: Draft, memory: Memory,
 
     Memory: by camera, the factor in force and since when a larger one has been requested (None: it is not).
     """
-    draft, held = _hold_back(state, draft, memory.get("hold_upscaling", {}), for_s)
-    return draft, {**memory, "hold_upscaling": held}
+    draft, held = _hold_back(state, draft, memory.get("held", {}), for_s)
+    return draft, {"held": held}
 
 
-@rule(needs=["scaling"], gives=["scaling"], reads=["t"])
+@rule(needs=["scaling"], gives=["scaling"], reads=["t"], uses=["uncapped"])
 def hold_while_capped(vehicle: Vehicle, state: State, draft: Draft, memory: Memory, *, for_s: Fraction) -> Step:
     """As `hold_upscaling`, while the measured link sets the total: its rate is being probed, and new sizes cost bits.
 
     Memory: as there; empty while it does not.
     """
-    past: Mapping[str, _Hold] = memory.get("hold_while_capped", {})
+    past: Mapping[str, _Hold] = memory.get("held", {})
     if draft.uncapped is None:
-        return draft, {**memory, "hold_while_capped": {}} if past else memory
+        return draft, {} if past else memory
     draft, held = _hold_back(state, draft, past, for_s)
-    return draft, {**memory, "hold_while_capped": held}
+    return draft, {"held": held}
 
 
 _Hold = tuple[Fraction, float | None]
