@@ -370,6 +370,8 @@ def _explain(error: Any) -> Iterator[Finding]:
 def _rule(keyword: str, limit: Any, value: Any, schema: Mapping[str, Any]) -> str:  # noqa: PLR0911
     match keyword:
         case "type":
+            if isinstance(value, list) and "$comment" in schema:
+                return str(schema["$comment"])
             names = [_TYPES[name] for name in ([limit] if isinstance(limit, str) else limit)]
             # YAML reads a bare on, off, yes or no as true or false.
             quote = ', quote it: "on" or "off"' if isinstance(value, bool) and limit == "string" else ""

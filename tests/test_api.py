@@ -17,13 +17,21 @@ pytestmark = pytest.mark.slow  # builds and installs a wheel
 CHECKOUT = Path(__file__).resolve().parents[1]
 PACKAGE = CHECKOUT / "tests" / "rule_package"
 MODES = """
-defaults: [paper, _self_]
+single:
+  demand_from_roi: {}
+  keep_operator_settings: {}
 automatic:
-  - total_from_prediction: {start_kbps: 3000}
-  - night_cap: {cap_kbps: 1234}
-  - demand_from_roi: {}
-  - share_by_demand: {}
-  - scaling_from_rate_quality: {}
+  total_from_prediction: {start_kbps: 3000}
+  first_cap: {rule: night_cap, cap_kbps: 4000}
+  night_cap: {cap_kbps: 1234}
+  demand_from_roi: {}
+  share_by_demand: {}
+  scaling_from_rate_quality: {}
+collective:
+  total_from_operator: {start_kbps: 3000}
+  demand_from_roi: {}
+  share_by_demand: {}
+  scaling_from_rate_quality: {}
 """
 
 
@@ -81,7 +89,7 @@ def test_a_rule_of_an_installed_package_decides(installed: Path, tmp_path: Path)
     words = ("print", f"conf={tmp_path}", "modes=night", "source=test", "total_kbps=5000")
     printed = run(sys.executable, "-m", "runner", *words, PYTHONPATH=f"{installed}{os.pathsep}{CHECKOUT}")
     assert "total 1234 kbit/s" in printed.splitlines()[0]
-    assert "total 5000 -> 1234: night" in printed
+    assert "total 5000 -> 4000: night; total 4000 -> 1234: night" in printed
 
 
 def test_the_package_is_well_typed(tmp_path: Path) -> None:

@@ -218,7 +218,7 @@ def test_no_sequence_of_reports_breaks_the_total(reports: list[tuple[Evidence, f
 @given(st.lists(st.tuples(evidences(), st.floats(0, 3), st.integers(0, 20_000)), max_size=20))
 @settings(max_examples=50, deadline=None)
 def test_no_report_takes_the_total_above_an_enforced_prediction(reports: list[tuple[Evidence, float, int]]) -> None:
-    drive, t = Drive("vehicle=delivery_robot", "modes.automatic.1.follow_link.ceiling=prediction"), 0.0
+    drive, t = Drive("vehicle=delivery_robot", "modes.automatic.follow_link.ceiling=prediction"), 0.0
     drive.accept("operator_connected")
     for evidence, after_s, predicted in reports:
         t += after_s

@@ -9,10 +9,13 @@ from pathlib import Path
 import pytest
 from helpers import CONF, Command, UserConf, process, vehicle
 
+from runner.configuration.compose import RESTATED
 from runner.configuration.config import configuration
+from runner.configuration.overrides import MERGED
 from runner.configuration.rule_lists import OWN_RULES
 from runner.core.model import Mode
 from runner.errors import ConfigError, Problem, UserError
+from runner.schema import schema_document
 
 TOP_KEYS = "mode, fps_max, media, control, page, latency, log, name, cameras, modes, graph, source, pqos, ..."
 CAMERA_KEYS = (
@@ -46,6 +49,7 @@ TABLE_1 = {  # S, size in px, Hz, b_min,r and b_full in kbit/s
     "top_rear": (*TOP, "0 200 400", 3000),
 }
 
+NAMED = schema_document("modes")["$defs"]["rules"]["$comment"]  # names the form in place of a list
 RISING = "must start at 0 and be strictly increasing"
 
 
@@ -128,17 +132,69 @@ def test_a_user_can_add_files_of_every_group(conf: UserConf) -> None:
     assert camera.source.elements[0].properties == {"pattern": "ball"}
 
 
-def test_a_modes_file_builds_on_another(conf: UserConf) -> None:
-    conf.write(
-        "modes/own.yaml",
-        "defaults: [paper, _self_]\nautomatic:\n  - total_from_prediction: {start_kbps: 700}\n"
-        "  - demand_from_roi: {}\n  - share_by_demand: {}\n  - scaling_from_rate_quality: {}\n",
+def test_rules_are_changed_added_and_removed_by_name() -> None:
+    words = (
+        *("modes.automatic.total_from_prediction.start_kbps=700", "~modes.automatic.hold_while_capped"),
+        "modes.collective.later={rule: hold_while_capped, for_s: 9}",
     )
-    modes = configuration(["source=test", "modes=own"], conf.path).vehicle().modes
-    paper = vehicle("modes=paper").modes
+    modes, safe = vehicle(*words).modes, vehicle().modes
+    names = [call.name for call in safe[Mode.AUTOMATIC] if call.name != "hold_while_capped"]
+    assert [call.name for call in modes[Mode.AUTOMATIC]] == names
     assert modes[Mode.AUTOMATIC][0].parameters == {"start_kbps": 700}
-    assert modes[Mode.COLLECTIVE] == paper[Mode.COLLECTIVE]
-    assert len(modes[Mode.AUTOMATIC]) == len(paper[Mode.AUTOMATIC])
+    *others, last = modes[Mode.COLLECTIVE]
+    assert tuple(others) == safe[Mode.COLLECTIVE]
+    assert (last.name, last.rule.name, last.parameters) == ("later", "hold_while_capped", {"for_s": 9})
+
+
+@pytest.mark.parametrize(
+    "text, expected",
+    [
+        (
+            "defaults: [safe, _self_]\nautomatic: {total_fixed: {kbps: 1}}\ncollective: {total_fixed: {kbps: 1}}\n",
+            [f"{mode}: {RESTATED.format(first='conf/modes/safe.yaml')}" for mode in ("automatic", "collective")],
+        ),
+        (
+            "defaults: [safe, _self_]\nautomatic: [total_fixed: {kbps: 1}]\n",
+            [f'automatic: [{{"total_fixed": {{"kbps": 1}}}}]: {NAMED}'],
+        ),
+        (
+            "single: [demand_from_roi: {}]\nautomatic: []\ncollective: {a: {}}\n",
+            [
+                f'single: [{{"demand_from_roi": {{}}}}]: {NAMED}',
+                f"automatic: []: {NAMED}",
+                "collective.a: unknown rule; expected one of",
+            ],
+        ),
+    ],
+)
+def test_a_mode_is_stated_once_and_its_rules_are_named(
+    conf: UserConf, tod: Command, text: str, expected: list[str]
+) -> None:
+    conf.write("modes/mine.yaml", text)
+    found = problems(tod, conf, "modes=mine")
+    assert len(found) == len(expected)
+    for start in expected:
+        assert any(problem.startswith(f"~/modes/mine.yaml: {start}") for problem in found), found
+
+
+def test_an_experiment_changes_numbers_of_rules_but_adds_none(conf: UserConf, tod: Command) -> None:
+    text = "# @package _global_\nexperiment: {about: x, duration_s: 9}\nmodes: {automatic: {%s}}\n"
+    conf.write("experiment/mine.yaml", text % "follow_link: {reserve_kbps: 7}")
+    rules = configuration(["source=test", "experiment=mine"], conf.path).vehicle().modes[Mode.AUTOMATIC]
+    assert rules[1].parameters["reserve_kbps"] == 7
+    conf.write("experiment/mine.yaml", text % "hold_upscaling: {for_s: 7}")
+    refused = RESTATED.format(first="conf/modes/safe.yaml")
+    assert problems(tod, conf, "experiment=mine") == [f"~/experiment/mine.yaml: modes.automatic: {refused}"]
+
+
+def test_overrides_name_rules(tod: Command) -> None:
+    words = ("modes.automatic.1.follow_link.start=1", "modes.single.0=null", "modes.automatic={a: {}}")
+    numbered = "rules are named, not numbered: "
+    assert tod("print", *words).problems == [
+        f"command line: modes.automatic.1.follow_link.start: {numbered}modes.automatic.follow_link.start",
+        f"command line: modes.single.0: {numbered}modes.single.RULE.NUMBER",
+        f'command line: modes.automatic: {{"a": {{}}}}: {MERGED}',
+    ]
 
 
 def test_a_vehicle_builds_on_another(conf: UserConf) -> None:
@@ -199,9 +255,7 @@ def problems(tod: Command, conf: UserConf, *words: str) -> list[str]:
     return [problem.replace(str(conf.path), "~") for problem in found.problems]
 
 
-@pytest.mark.parametrize(
-    "word", ["modes.automatic.follow_link.reserve_kbps=200", "modes.automatic.x=1", "~graph.vehicle.0"]
-)
+@pytest.mark.parametrize("word", ["graph.vehicle.crop.element=x", "graph.vehicle.x=1", "~graph.vehicle.0"])
 def test_an_entry_of_a_list_is_named_by_its_number(tod: Command, word: str) -> None:
     found = tod("print", word)
     assert found.status == 2
@@ -240,8 +294,7 @@ def test_the_three_messages_of_the_style_guide(
     assert sorted(messages) == [
         "conf/cameras/rear_center.yaml: heigth_px: unknown key, did you mean height_px?",
         f"conf/cameras/rear_center.yaml: rate_quality.b_min_kbps: [0, 400, 400]: {RISING}",
-        "conf/modes/paper.yaml: automatic[2]: 'share_by_demnd': unknown rule, did you mean share_by_demand?"
-        + OWN_RULES,
+        "conf/modes/paper.yaml: automatic.share_by_demnd: unknown rule, did you mean share_by_demand?" + OWN_RULES,
     ]
     assert summary == "3 problems, nothing was started"
 
@@ -327,7 +380,7 @@ REAR, GRAPH, PAPER, ROBOT = (
         (
             PAPER,
             {"share_by_demand": "share_by_demnd"},
-            "automatic[2]: 'share_by_demnd': unknown rule, did you mean share_by_demand?" + OWN_RULES,
+            "automatic.share_by_demnd: unknown rule, did you mean share_by_demand?" + OWN_RULES,
         ),
         (PAPER, {"start_kbps: 3000": "start_kbp: 1"}, "start_kbp: 1: unknown parameter, did you mean start_kbps?"),
         (PAPER, {"start_kbps: 3000": ""}, "start_kbps: missing: required by this rule"),
@@ -335,8 +388,8 @@ REAR, GRAPH, PAPER, ROBOT = (
         (PAPER, {"collective:": "colective:"}, "colective: unknown key, did you mean collective?"),
         (
             PAPER,
-            {"  - keep_operator_settings: {}": "  - keep_operator_settings"},
-            "'keep_operator_settings': must be a mapping",
+            {"  keep_operator_settings: {}": "  keep_operator_settings: 1"},
+            "single.keep_operator_settings: 1: must be a mapping",
         ),
     ],
 )
@@ -441,11 +494,12 @@ def test_a_file_that_is_no_configuration(conf: UserConf, tod: Command, content: 
 def test_a_rule_list_in_the_wrong_order(conf: UserConf, tod: Command) -> None:
     conf.write(
         "modes/mine.yaml",
-        "defaults: [paper, _self_]\ncollective: [share_by_demand: {}, total_from_operator: {start_kbps: 1}]\n",
+        (CONF / PAPER).read_text().partition("collective:")[0]
+        + "collective: {share_by_demand: {}, total_from_operator: {start_kbps: 1}}\n",
     )
     assert problems(tod, conf, "modes=mine") == [
-        "~/modes/mine.yaml: collective[0]: 'share_by_demand': needs demand, which no earlier rule gives",
-        "~/modes/mine.yaml: collective[0]: 'share_by_demand': needs total, which no earlier rule gives",
+        "~/modes/mine.yaml: collective.share_by_demand: needs demand, which no earlier rule gives",
+        "~/modes/mine.yaml: collective.share_by_demand: needs total, which no earlier rule gives",
         '~/modes/mine.yaml: collective: ["share_by_demand", "total_from_operator"]: no rule gives demand, scaling',
     ]
 
@@ -608,7 +662,7 @@ def test_all_problems_are_reported_at_once_in_one_run(conf: UserConf, tod: Comma
             "~/cameras/top_view.yaml: rate_quality.b_full_kbps: 400: must be above the last b_min, 400",
             f"~/{GRAPH}: knobs.sending[0].element: 'gaet': no such element, did you mean gate?",
             f"~/{PAPER}: singel: unknown key, did you mean single?",
-            f"~/{PAPER}: automatic[2]: 'shareby_demand': unknown rule, did you mean share_by_demand?" + OWN_RULES,
+            f"~/{PAPER}: automatic.shareby_demand: unknown rule, did you mean share_by_demand?" + OWN_RULES,
             "command line: fps_max: -1: must be above 0",
             "command line: cameras.top_rear.weigth: unknown key, did you mean weight?",
             "command line: media.port: 99999: must be at most 65535",

@@ -125,24 +125,27 @@ def test_the_size_of_interpolations_is_limited(document: object, most: int, fits
 
 # --- blame ------------------------------------------------------------------------------------------------------------
 
-RULES = "  - demand_from_roi: {}\n  - share_by_demand: {}\n  - scaling_from_rate_quality: {}\n"
+RULES = "  demand_from_roi: {}\n  share_by_demand: {}\n  scaling_from_rate_quality: {}\n"
 
 
 def test_a_parameter_missing_in_a_list_of_ones_own(conf: UserConf, tod: Command) -> None:
-    head = "defaults: [safe, _self_]\nautomatic:\n  - total_from_prediction: {start_kbps: 1}\n"
-    conf.write("modes/mine.yaml", f"{head}  - pause_without_operator: {{}}\n  - cap_by_link: {{}}\n{RULES}")
+    others = "".join(
+        f"{mode}: {{demand_from_roi: {{}}, keep_operator_settings: {{}}}}\n" for mode in ("single", "collective")
+    )
+    own = "automatic:\n  total_from_prediction: {start_kbps: 1}\n  pause_without_operator: {}\n  cap_by_link: {}\n"
+    conf.write("modes/mine.yaml", f"{others}{own}{RULES}")
     problems = tod("print", "source=test", "modes=mine", conf.word).problems
     assert {problem.partition(": ")[0] for problem in problems} == {str(conf.path / "modes/mine.yaml")}
-    assert "automatic[1].pause_without_operator.after_s: missing: required by this rule" in problems[0]
-    assert "automatic[2]: 'cap_by_link': was replaced by follow_link, see docs/rules.md" in problems[1]
+    assert "automatic.pause_without_operator.after_s: missing: required by this rule" in problems[0]
+    assert "automatic.cap_by_link: was replaced by follow_link, see docs/rules.md" in problems[1]
 
 
 @pytest.mark.parametrize(
     "word, expected",
     [
         (
-            "modes.automatic=[{total_from_prediction: {}}]",
-            "modes.automatic[0].total_from_prediction.start_kbps: missing: required by this rule",
+            "modes.automatic.hold_upscaling={}",
+            "modes.automatic.hold_upscaling.for_s: missing: required by this rule",
         ),
         (
             "cameras.front_left.rate_quality.scaling=[0.5]",

@@ -188,7 +188,7 @@ MOUNTS = ("+graph@cameras.front.graph=h264_srt", "+source@cameras.rear.source=v4
             "cameras.front_left.rate_quality.b_min_kbps=[0,1,2]",
             "log={video: true}",
         ),
-        ("vehicle=delivery_robot", *MOUNTS, "~cameras.mast", "modes.automatic.1.follow_link.reserve_kbps=7"),
+        ("vehicle=delivery_robot", *MOUNTS, "~cameras.mast", "modes.automatic.follow_link.reserve_kbps=7"),
         ("experiment=bottleneck", "link=relay", "study=paper", "pqos=trace"),
         ("vehicle=delivery_robot", "graph=h264_jetson_rtsp", "latency={fixed_ms: 1e1}", "fps_max=12.5"),
     ],

@@ -178,14 +178,14 @@ def test_the_total_is_what_the_link_carries_without_headers() -> None:
 
 
 def test_a_reserve_is_left_to_others() -> None:
-    rule = "modes.automatic.1.follow_link.reserve_kbps=500"
+    rule = "modes.automatic.follow_link.reserve_kbps=500"
     totals = [measured(connected(*more, kbps=6000), 0.1, 3000) for more in ((), (rule,))]
     assert totals[0] - totals[1] == pytest.approx(500, rel=0.1)
 
 
 def test_a_prediction_is_a_limit_only_where_it_is_a_ceiling() -> None:
     """As in a slice that enforces it."""
-    rule = "modes.automatic.1.follow_link.ceiling=prediction"
+    rule = "modes.automatic.follow_link.ceiling=prediction"
     assert measured(connected(kbps=2000), 0.1, 4000) > 3000
     assert measured(connected(rule, kbps=2000), 0.1, 4000) == 2000
 

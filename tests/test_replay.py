@@ -14,6 +14,7 @@ import pytest
 from helpers import Command, UserConf, process, vehicle
 from shared_data import shared
 
+from runner.configuration.replaced_rules import with_successors
 from runner.core.events import BitratePredicted, to_json
 from runner.core.model import Vehicle
 from runner.pqos import Pqos, build_pqos
@@ -539,14 +540,25 @@ def test_a_drive_of_older_rules_is_replayed_with_the_rule_that_replaced_them(tod
     assert [json.loads(line)["total_kbps"] for line in again.out.splitlines()] == [3000, 1500, 1500, 500]
 
 
+def test_lists_of_rules_in_older_drives_become_mappings() -> None:
+    hold, pause = ({"hold_upscaling": {"for_s": 3}}, {"pause_without_operator": {"after_s": 1}})
+    config, replaced = with_successors({"modes": {"automatic": [hold, pause, {"hold_upscaling": {"for_s": 9}}]}})
+    again = {"hold_upscaling_2": {"rule": "hold_upscaling", "for_s": 9}}
+    assert replaced == []
+    assert list(config["modes"]["automatic"].items()) == [*hold.items(), *pause.items(), *again.items()]
+
+
 def _with_older_rules(log: list[str]) -> Iterator[str]:
     began = json.loads(log[0])
-    began["config"]["modes"]["automatic"][1:2] = [
+    modes = began["config"]["modes"] = {
+        mode: [{name: numbers} for name, numbers in rules.items()] for mode, rules in began["config"]["modes"].items()
+    }
+    modes["automatic"][1:2] = [
         {"cap_at_lower_bound": {}},
         {"cap_by_link": {"reserve_kbps": 0, "alone_after_s": 2, "least_trust": 0.5, "start": 0.5}},
         {"fade_when_stale": {"after_s": 2, "halve_every_s": 1, "floor_kbps": 500}},
     ]
-    began["config"]["modes"]["collective"][1] = {"cap_by_link": {"reserve_kbps": 0, "start": 0.5}}
+    modes["collective"][1] = {"cap_by_link": {"reserve_kbps": 0, "start": 0.5}}
     return (f"{line}\n" for line in (json.dumps(began), *log[1:]))
 
 

@@ -277,8 +277,7 @@ def test_only_a_fall_that_lasts_makes_pictures_smaller() -> None:
 
 @pytest.mark.parametrize("reports, limit", [("followed", 1500), ("ignored", 3000)])
 def test_reports_can_be_ignored(reports: str, limit: float) -> None:
-    rule = f"{{follow_link: {{reports: {reports}, start: 1}}}}"
-    drive = Drive("modes=safe", f"modes.automatic.1={rule}")
+    drive = Drive("modes=safe", f"modes.automatic.follow_link={{reports: {reports}, start: 1}}")
     drive.accept("bitrate_predicted", t=0, kbps=3000, valid_s=1000)
     drive.accept("operator_connected", t=1)
     narrow(drive)
@@ -448,6 +447,17 @@ def test_a_rule_without_declared_reads_runs_on_every_change(monkeypatch: pytest.
     assert drive.total == 111
 
 
+def test_a_rule_that_is_used_twice_has_a_memory_of_its_own_under_each_name() -> None:
+    drive = Drive("modes=steady", "modes.automatic.longer={rule: hold_upscaling, for_s: 4}")
+    drive.accept("bitrate_predicted", t=0, kbps=1000, valid_s=100)
+    drive.accept("bitrate_predicted", t=10, kbps=8000, valid_s=100)
+    factors = []
+    for t in (12.9, 13, 16.9, 17):  # 3 s of the first, then 4 s of the second
+        drive.accept("clock_advanced", t=t)
+        factors.append(drive["front_left"].scaling)
+    assert factors == [Fraction(1, 8)] * 3 + [Fraction(1, 2)]
+
+
 # --- rule lists -------------------------------------------------------------------------------------------------------
 
 
@@ -462,35 +472,50 @@ def listed(*names: str) -> list[rules.RuleCall]:
         (("demand_from_roi", "keep_operator_settings"), []),
         (
             ("total_from_prediction", "share_by_demand", "demand_from_roi", "scaling_from_rate_quality"),
-            ["automatic[1]: 'share_by_demand': needs demand, which no earlier rule gives"],
+            ["automatic.share_by_demand: needs demand, which no earlier rule gives"],
         ),
         (
             ("follow_link", "total_from_prediction", "demand_from_roi"),
             [
-                "automatic[0]: 'follow_link': needs total, which no earlier rule gives",
-                "automatic: ['follow_link', 'total_from_prediction', 'demand_from_roi']: "
-                "no rule gives bitrate, scaling",
+                "automatic.follow_link: needs total, which no earlier rule gives",
+                "automatic: no rule gives bitrate, scaling",
+            ],
+        ),
+        (
+            ("total_from_prediction", "demand_from_roi", "share_by_demand", "follow_link", "scaling_from_rate_quality"),
+            ["automatic.follow_link: gives total, must come before share_by_demand, which uses it"],
+        ),
+        (
+            (
+                *("total_from_prediction", "demand_from_roi", "share_by_demand", "scaling_from_rate_quality"),
+                *("hold_while_capped", "follow_link"),
+            ),
+            [
+                "automatic.follow_link: gives sized_for, must come before scaling_from_rate_quality, which uses it",
+                "automatic.follow_link: gives total, must come before share_by_demand, which uses it",
+                "automatic.follow_link: gives uncapped, must come before hold_while_capped, which uses it",
             ],
         ),
     ],
 )
 def test_a_list_in_the_wrong_order_is_refused(names: tuple[str, ...], problems: list[str]) -> None:
-    assert list(map(str, check_order(Mode.AUTOMATIC, listed(*names)))) == problems
+    found = check_order(Mode.AUTOMATIC, listed(*names))
+    assert [f"{problem.key}: {problem.rule}" for problem in found] == problems
 
 
 @pytest.mark.parametrize(
     "name, parameters, message",
     [
         ("share_by_demnd", {}, ": 'share_by_demnd': unknown rule, did you mean share_by_demand?" + OWN_RULES),
-        ("share_by_demand", {"x": 1}, "share_by_demand.x: 1: unknown parameter; share_by_demand takes none"),
-        ("hold_upscaling", {"fo_s": 1}, "hold_upscaling.fo_s: 1: unknown parameter, did you mean for_s?"),
-        ("hold_upscaling", {}, "hold_upscaling.for_s: missing: required by this rule"),
-        ("hold_upscaling", {"for_s": -1}, "hold_upscaling.for_s: -1: must be a number of 0 or more"),
-        ("hold_upscaling", {"for_s": "3"}, "hold_upscaling.for_s: '3': must be a number of 0 or more"),
-        ("hold_upscaling", {"for_s": True}, "hold_upscaling.for_s: True: must be a number of 0 or more"),
-        ("hold_upscaling", {"for_s": float("nan")}, "hold_upscaling.for_s: nan: must be a number of 0 or more"),
-        ("follow_link", {"halve_every_s": 0}, "follow_link.halve_every_s: 0: must be above 0"),
-        ("follow_link", {"reports": "no"}, "follow_link.reports: 'no': must be one of followed, ignored"),
+        ("share_by_demand", {"x": 1}, "x: 1: unknown parameter; share_by_demand takes none"),
+        ("hold_upscaling", {"fo_s": 1}, "fo_s: 1: unknown parameter, did you mean for_s?"),
+        ("hold_upscaling", {}, "for_s: missing: required by this rule"),
+        ("hold_upscaling", {"for_s": -1}, "for_s: -1: must be a number of 0 or more"),
+        ("hold_upscaling", {"for_s": "3"}, "for_s: '3': must be a number of 0 or more"),
+        ("hold_upscaling", {"for_s": True}, "for_s: True: must be a number of 0 or more"),
+        ("hold_upscaling", {"for_s": float("nan")}, "for_s: nan: must be a number of 0 or more"),
+        ("follow_link", {"halve_every_s": 0}, "halve_every_s: 0: must be above 0"),
+        ("follow_link", {"reports": "no"}, "reports: 'no': must be one of followed, ignored"),
     ],
 )
 def test_a_call_is_checked_against_the_rule(name: str, parameters: dict[str, Any], message: str) -> None:

@@ -10,7 +10,7 @@ from math import inf, nan
 from pathlib import Path
 
 import pytest
-from helpers import Command, UserConf
+from helpers import CONF, Command, UserConf
 
 from rig import children_named, until
 from runner.configuration.config import configuration
@@ -20,12 +20,12 @@ from runner.simulation.numbers import Modes, trials
 from runner.simulation.runs import Job, Result
 
 RULES: Modes = {
-    "automatic": [
-        {"total_from_prediction": {"start_kbps": 3000}},
-        {"follow_link": {"ceiling": "none", "reserve_kbps": 0, "start": 0.6, "after_s": 2, "halve_every_s": 1}},
-        {"demand_from_roi": {}},
-        {"hold_while_capped": {"for_s": 0.75}},
-    ]
+    "automatic": {
+        "total_from_prediction": {"start_kbps": 3000},
+        "follow_link": {"ceiling": "none", "reserve_kbps": 0, "start": 0.6, "after_s": 2, "halve_every_s": 1},
+        "demand_from_roi": {},
+        "calm": {"rule": "hold_while_capped", "for_s": 0.75},
+    }
 }
 SIMULATED = ("vehicle=delivery_robot", "fps_max=5", "links=saw", "predictions=right", "duration_s=4")
 SHORT = (*SIMULATED, "left_out=step")
@@ -38,11 +38,11 @@ def tried(vary: str | None) -> list[str]:
 
 def test_each_number_of_the_modes_file_is_halved_and_doubled() -> None:
     assert tried(None) == [
-        *("0.total_from_prediction.start_kbps=1500", "0.total_from_prediction.start_kbps=6000"),
-        "1.follow_link.start=0.3",  # twice as much would be more than all
-        *("1.follow_link.after_s=1", "1.follow_link.after_s=4"),
-        *("1.follow_link.halve_every_s=0.5", "1.follow_link.halve_every_s=2"),
-        *("3.hold_while_capped.for_s=0.375", "3.hold_while_capped.for_s=1.5"),
+        *("total_from_prediction.start_kbps=1500", "total_from_prediction.start_kbps=6000"),
+        "follow_link.start=0.3",  # twice as much would be more than all
+        *("follow_link.after_s=1", "follow_link.after_s=4"),
+        *("follow_link.halve_every_s=0.5", "follow_link.halve_every_s=2"),
+        *("calm.for_s=0.375", "calm.for_s=1.5"),
     ]
     zero = "automatic.follow_link.reserve_kbps is 0, which cannot be halved and doubled: vary= can give it values"
     assert trials(None, RULES, ["automatic"])[1] == [zero]
@@ -51,17 +51,17 @@ def test_each_number_of_the_modes_file_is_halved_and_doubled() -> None:
 @pytest.mark.parametrize(
     "vary, expected",
     [
-        ("automatic.follow_link.start=[0.25, 0.6, 1]", ["1.follow_link.start=0.25", "1.follow_link.start=1"]),
-        ("modes.automatic.1.follow_link.start=0.25,1", ["1.follow_link.start=0.25", "1.follow_link.start=1"]),
-        ("automatic.follow_link.after_s=range(1,4)", ["1.follow_link.after_s=1", "1.follow_link.after_s=3"]),
-        ("automatic.follow_link.floor_kbps=100", ["1.follow_link.floor_kbps=100"]),  # the file does not state it
+        ("automatic.follow_link.start=[0.25, 0.6, 1]", ["follow_link.start=0.25", "follow_link.start=1"]),
+        ("modes.automatic.follow_link.start=0.25,1", ["follow_link.start=0.25", "follow_link.start=1"]),
+        ("automatic.follow_link.after_s=range(1,4)", ["follow_link.after_s=1", "follow_link.after_s=3"]),
+        ("automatic.follow_link.floor_kbps=100", ["follow_link.floor_kbps=100"]),  # the file does not state it
         (
-            "automatic.follow_link.start automatic.hold_while_capped.for_s=2",
-            ["1.follow_link.start=0.3", "3.hold_while_capped.for_s=2"],
+            "automatic.follow_link.start automatic.calm.for_s=2",
+            ["follow_link.start=0.3", "calm.for_s=2"],
         ),
         (
-            "automatic.3 automatic.hold_while_capped",
-            ["3.hold_while_capped.for_s=0.375", "3.hold_while_capped.for_s=1.5"],
+            "automatic.follow_link.start=1 automatic.calm",
+            ["follow_link.start=1", "calm.for_s=0.375", "calm.for_s=1.5"],
         ),
     ],
 )
@@ -77,7 +77,8 @@ def test_wrong_names_and_values_are_reported_together() -> None:
         "single.follow_link": "no drive is in mode single: choose it with mode=single",
         "automatic.follow_link.ceiling": "is a word, not a number",
         "automatic.demand_from_roi": "demand_from_roi has no numbers",
-        "automatic.3.follow_link": "follow_link is entry 1 of mode automatic",
+        "automatic.1.follow_link": "mode automatic has no such rule; expected one of "
+        "total_from_prediction, follow_link, demand_from_roi, calm",
         "automatic.follow_link.start=[-1]": "-1: must be a number of 0 or more",
         "automatic.follow_link.halve_every_s=0": "0: must be above 0",
     }
@@ -123,7 +124,7 @@ def test_a_value_is_better_on_both_sets_or_the_one_in_force_stays(
 def test_the_table_has_a_row_for_each_value(tod: Command, tmp_path: Path) -> None:
     """The override that it names sets the value: a simulated drive under it has the same figures."""
     output, again = tmp_path / "tuned.json", tmp_path / "again.json"
-    override = "modes.automatic.0.total_from_prediction.start_kbps=600"
+    override = "modes.automatic.total_from_prediction.start_kbps=600"
     words = ("seeds=2", "since_s=0", "workers=1")
     result = tod("tune", *SHORT, *words, "vary=automatic.total_from_prediction.start_kbps=600", f"output={output}")
     assert result.status == 0 and "1 value and those in force, on 4 drives each" in result.err
@@ -180,15 +181,21 @@ def test_wrong_arguments(tod: Command, words: list[str], expected: str) -> None:
 
 
 def test_an_override_sets_the_number_that_it_names(conf: UserConf) -> None:
-    """Also in a modes file of one's own that states a rule twice."""
-    rules = "[total_fixed: {kbps: 900}, total_fixed: {kbps: 800}, demand_from_roi: {}, share_by_demand: {}, "
-    rules += "scaling_from_rate_quality: {}]"
-    conf.write("modes/twice.yaml", f"defaults: [paper, _self_]\nautomatic: {rules}\n")
+    """Also in a modes file of one's own in which a rule has two names."""
+    rules = (
+        "first: {rule: total_fixed, kbps: 900}, total_fixed: {kbps: 800}, demand_from_roi: {}, share_by_demand: {}, "
+    )
+    single, _, rest = (CONF / "modes/paper.yaml").read_text().partition("automatic:")
+    own = (
+        f"{single}automatic: {{{rules}scaling_from_rate_quality: {{}}}}\ncollective:{rest.partition('collective:')[2]}"
+    )
+    conf.write("modes/twice.yaml", own)
     modes = configuration(["modes=twice"], conf.path, runnable=False).document["modes"]
-    both = [trial.override for trial in trials("automatic.total_fixed.kbps=[700]", modes, ["automatic"])[0]]
-    assert both == ["modes.automatic.0.total_fixed.kbps=700", "modes.automatic.1.total_fixed.kbps=700"]
+    vary = "automatic.first.kbps=700 automatic.total_fixed.kbps=700"
+    both = [trial.override for trial in trials(vary, modes, ["automatic"])[0]]
+    assert both == ["modes.automatic.first.kbps=700", "modes.automatic.total_fixed.kbps=700"]
     changed = configuration(["modes=twice", both[1]], conf.path, runnable=False).document["modes"]["automatic"]
-    assert [entry["total_fixed"]["kbps"] for entry in changed[:2]] == [900, 700]
+    assert [changed[name]["kbps"] for name in ("first", "total_fixed")] == [900, 700]
 
 
 @pytest.mark.soak

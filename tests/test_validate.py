@@ -176,7 +176,7 @@ def test_problems_that_only_composition_shows(tod: Command, conf: UserConf) -> N
     conf.change("cameras/mast_1200p.yaml", {"[0, 300]": "[0, 0]"})
     conf.change("modes/paper.yaml", {"share_by_demand": "share_by_demnd"})
     assert sorted(problems(tod, conf, *one("modes")), reverse=True) == [
-        "~/modes/paper.yaml: automatic[2]: 'share_by_demnd': unknown rule, did you mean share_by_demand?" + OWN_RULES,
+        "~/modes/paper.yaml: automatic.share_by_demnd: unknown rule, did you mean share_by_demand?" + OWN_RULES,
         "~/cameras/mast_1200p.yaml: rate_quality.b_min_kbps: [0, 0]: must start at 0 and be strictly increasing",
     ]
 

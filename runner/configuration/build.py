@@ -15,7 +15,7 @@ from runner import schema
 from runner.clips import view
 from runner.configuration.origin import GRAPH_PARTS, Composed, Part
 from runner.configuration.resolve import is_determined, without
-from runner.configuration.rule_lists import call_rule, check_order
+from runner.configuration.rule_lists import call_entry, check_order
 from runner.core.commands import KnobValue
 from runner.core.model import (
     Camera,
@@ -114,7 +114,7 @@ class Builder:
         wrong = list(self._without_repeats([f for f in found if not set(f.path[:1]).intersection(self.fits)]))
         self.problems += [self.composed.problem(f.path, f.found, f.rule) for f in wrong]
         self.bad = {f.path for f in wrong} | {f.meant for f in wrong}
-        modes = {mode: self._rule_list(mode) for mode in Mode if self.is_valid("modes", mode)}
+        modes = {mode: self._rules(mode) for mode in Mode if self.is_valid("modes", mode)}
         mounted = document.get("cameras")
         cameras = {name: self._camera(name) for name in mounted} if isinstance(mounted, dict) else {}
         sections = ("media", "control", "page", "log", "latency", "keys", "insecure", "metrics", "ros", "strict")
@@ -244,11 +244,10 @@ class Builder:
 
     # --- parts --------------------------------------------------------------------------------------------------------
 
-    def _rule_list(self, mode: Mode) -> tuple[RuleCall, ...]:
+    def _rules(self, mode: Mode) -> tuple[RuleCall, ...]:
         calls = []
-        for index, entry in enumerate(self.composed.document["modes"][mode]):
-            ((name, parameters),) = entry.items()
-            call = self.attempt(("modes", mode.value, index), lambda n=name, p=parameters: call_rule(n, p))  # type: ignore[misc]
+        for name, entry in self.composed.document["modes"][mode].items():
+            call = self.attempt(("modes", mode.value, name), lambda n=name, e=entry: call_entry(n, e))  # type: ignore[misc]
             calls.append(call)
         known = tuple(call for call in calls if call)
         if len(known) == len(calls):

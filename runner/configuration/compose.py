@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any, cast
 from runner import schema
 from runner.configuration.files import GROUPS, bases_of, chosen_by, conf_directories, defaults, find_file, options
 from runner.configuration.origin import PICKED, Composed, Part, nested
-from runner.configuration.overrides import Override, choice_problems, parse_overrides
+from runner.configuration.overrides import Override, choice_problems, parse_overrides, rule_problems
 from runner.configuration.replaced_rules import with_successors
 from runner.configuration.resolve import resolved
 from runner.configuration.yaml_file import label, load_file, read
-from runner.core.model import suggest
+from runner.core.model import Mode, suggest
 from runner.errors import COMMAND_LINE, ConfigError, Problem
 from runner.resources import directory
 
@@ -25,6 +25,10 @@ if TYPE_CHECKING:
 KEPT_KEYS = (
     *("place", "pose", "weight", "floor_kbps", "shed", "graph", "source"),
     *("device", "address", "clip", "bag", "topic", "capture", "credentials"),
+)
+RESTATED = (
+    "is stated in {first}, too, and both would be merged, with the rules of that file in their old places; "
+    "write out all modes in one file, without the other in defaults; a single number: modes.MODE.RULE.NUMBER=VALUE"
 )
 WHOLE = ("vehicle", "experiment")  # groups whose files apply to the whole document
 PACKAGE_HEADER = "# @package _global_"  # a vehicle's file applies to the whole document
@@ -40,14 +44,17 @@ def compose(overrides: Sequence[str], user: Path | None = None) -> Composed:
 
     parsed = parse_overrides(overrides)
     directories = conf_directories(user)
-    problems = [p for override in parsed for p in choice_problems(override, directories)]
+    problems = [p for override in parsed for p in (*choice_problems(override, directories), *rule_problems(override))]
     if problems:
         raise ConfigError(problems)
     _check_headers({o.key: str(o.value) for o in parsed if o.key == "experiment"}, directories)
     config, choices = _compose(parsed, directories)
     _check_headers(choices, directories)
     parts = [_part(override) for override in reversed(parsed) if override.deletes or not override.choice]
-    parts += reversed(list(_file_parts(directories, choices)))
+    files = list(_file_parts(directories, choices))
+    if problems := list(_restated(files)):
+        raise ConfigError(problems)
+    parts += reversed(files)
     with open_dict(config):
         del config["hydra"]
     return resolved(config, parts)
@@ -76,7 +83,8 @@ def recompose(base: dict[str, Any], name: str, overrides: Sequence[str], user: P
     from omegaconf.errors import OmegaConfBaseException
 
     parsed = parse_overrides(overrides)
-    problems = [p for override in parsed for p in choice_problems(override, conf_directories(user))]
+    directories = conf_directories(user)
+    problems = [p for override in parsed for p in (*choice_problems(override, directories), *rule_problems(override))]
     if problems:
         raise ConfigError(problems)
     config = OmegaConf.create(base)
@@ -158,7 +166,7 @@ def _compose(overrides: Sequence[Override], directories: Sequence[Path]) -> tupl
         with initialize_config_dir(str(directories[-1]), version_base="1.3"), only_what_composing_needs():
             config = hydra_compose("config", words, return_hydra_config=True)
     except (HydraException, OmegaConfBaseException) as error:
-        raise ConfigError([_hydra_problem(error, directories)]) from None
+        raise ConfigError(_list_problems(error, directories) or [_hydra_problem(error, directories)]) from None
     except (TypeError, ValueError) as error:
         if "deletion value must be a string" in str(error):
             word = " ".join(o.text for o in overrides if o.deletes and repr(o.text) in str(error))
@@ -206,6 +214,17 @@ def _hydra_problem(error: Exception, directories: Sequence[Path]) -> Problem:
     return Problem(COMMAND_LINE, "", None, rule)
 
 
+def _list_problems(error: Exception, directories: Sequence[Path]) -> list[Problem]:
+    """The lists of a modes file that Hydra cannot merge with the mappings of the file that it builds on."""
+    found = re.search(r"In 'modes/([\w.-]+)': .*Cannot merge", str(error).replace("\n", " "))
+    path = find_file(directories, "modes", found[1]) if found else None
+    return [Problem(label(path), schema.dotted(f.path), f.found, f.rule) for f in _findings(path)] if path else []
+
+
+def _findings(path: Path) -> list[schema.Finding]:
+    return schema.findings(load_file(path), path.parent.name)
+
+
 def _place(name: str) -> tuple[str, str]:
     """Group and file of a name like vehicle/tum_q7."""
     group, _, file = name.rpartition("/")
@@ -243,6 +262,29 @@ def _file_parts(directories: Sequence[Path], choices: dict[str, str]) -> Iterato
             continue
         where = tuple(package.split(".")) if package else () if group in WHOLE else (group,)
         yield from _with_bases(find_file(directories, group, name), group, where, directories)
+
+
+def _restated(files: Sequence[Part]) -> Iterator[Problem]:
+    """Modes whose rules a file states again: Hydra would merge both, and keep the places of the earlier rules.
+
+    files  in the order in which Hydra merged them
+
+    A file of another group may change numbers of rules that the mode has, but not add rules.
+    """
+    stated: dict[schema.Path, tuple[str, set[str]]] = {}  # by place of a mode, the first file, and names of rules
+    for part in files:
+        is_modes = part.path is not None and part.path.parent.name == "modes"
+        place = part.package if is_modes else (*part.package, "modes")
+        content = part.content if is_modes else (part.content or {}).get("modes")
+        for mode in Mode if isinstance(content, dict) else ():
+            rules = content.get(mode)
+            if not isinstance(rules, dict):
+                continue
+            first, known = stated.setdefault((*place, mode), (part.file, set()))
+            if first != part.file and (is_modes or not rules.keys() <= known):
+                path = schema.dotted((*place, mode)[len(part.package) :])
+                yield Problem(part.file, path, None, RESTATED.format(first=first))
+            known.update(rules)
 
 
 def _with_bases(path: Path, group: str, package: schema.Path, directories: Sequence[Path]) -> Iterator[Part]:

@@ -22,6 +22,10 @@ if TYPE_CHECKING:
 OPTIONAL = ("link", "experiment")  # groups that need no choice
 LONGEST_WORD = 4096  # characters of an override, as for a path
 DEEPEST = 32  # brackets of one kind in an override
+MERGED = (
+    "would be merged with the rules that the mode has; set a number by modes.MODE.RULE.NUMBER=VALUE, remove a rule by "
+    "~modes.MODE.RULE, write others into a modes file"
+)
 MAX_RUNS = 1000  # of a sweep
 
 
@@ -153,6 +157,18 @@ def choice_problems(override: Override, directories: Sequence[Path]) -> Iterator
         if len(directories) == 1 and "did you mean" not in rule:
             rule += "; files of your own need conf=DIR"
         yield Problem(COMMAND_LINE, override.key, str(override.value), rule)
+
+
+def rule_problems(override: Override) -> Iterator[Problem]:
+    """The problem of an override that names a rule by its place, or states the rules of a mode as a whole."""
+    modes, mode, place, *rest = (*override.key.split("."), "", "")[: max(3, override.key.count(".") + 1)]
+    if modes != "modes" or override.choice:
+        return
+    if place.isdecimal():
+        meant = ".".join((modes, mode, *(rest or ("RULE", "NUMBER"))))
+        yield Problem(COMMAND_LINE, override.key, None, f"rules are named, not numbered: {meant}")
+    elif not place and isinstance(override.value, dict | list):
+        yield Problem(COMMAND_LINE, override.key, schema.shown(override.value), MERGED)
 
 
 def choosable(name: str) -> bool:

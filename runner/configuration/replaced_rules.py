@@ -1,8 +1,9 @@
-"""Rules of older versions: drives that were logged with them, and whoever still names them, get their successor."""
+"""Modes of drives that were logged by older versions: rules that have a successor, and lists in place of mappings."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import count
 from typing import Any
 
 from runner.core.rules import follow_link
@@ -12,13 +13,29 @@ SUCCESSOR = follow_link.__name__
 
 
 def with_successors(config: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
-    """The configuration of a drive, not yet checked, with `follow_link` in place of what it replaced; names found."""
+    """The configuration of a drive, not yet checked, with `follow_link` in place of what it replaced; names found.
+
+    Lists of rules become mappings.
+    """
     modes = config.get("modes")
-    lists = modes if isinstance(modes, Mapping) else {}
-    found = {name for calls in lists.values() for name in _replaced(calls)}
-    if not found:
+    if not isinstance(modes, Mapping):
         return dict(config), []
-    return {**config, "modes": {mode: _followed(calls) for mode, calls in lists.items()}}, sorted(found)
+    found = {name for calls in modes.values() for name in _replaced(calls)}
+    return {**config, "modes": {mode: _named(_followed(calls)) for mode, calls in modes.items()}}, sorted(found)
+
+
+def _named(calls: Any) -> Any:
+    """A list of rules as a mapping, in which the second of a rule gets a name of its own: hold_upscaling_2."""
+    if not isinstance(calls, list) or not all(isinstance(call, Mapping) for call in calls):
+        return calls
+    entries: dict[str, Any] = {}
+    for rule, parameters in (each for call in calls for each in call.items()):
+        if rule in entries and isinstance(parameters, Mapping):
+            number = next(n for n in count(2) if f"{rule}_{n}" not in entries)
+            entries[f"{rule}_{number}"] = {"rule": rule, **parameters}
+        else:
+            entries[rule] = parameters
+    return entries
 
 
 def _replaced(calls: Any) -> dict[str, Mapping[str, Any]]:

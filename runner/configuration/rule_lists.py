@@ -1,4 +1,4 @@
-"""Builds rule lists from a modes file: finds rules, and checks their parameters and order, once.
+"""Builds the rules of a mode from a modes file: finds them, and checks their parameters and order, once.
 
 Rules of other packages are found by the entry point group `tod_runner.rules`.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from enum import StrEnum
 from typing import Any
 
@@ -14,6 +15,7 @@ from runner.configuration.replaced_rules import REPLACED, SUCCESSOR
 from runner.core.model import Mode, ModelError, exact, suggest
 from runner.core.rules import GIVEN, Rule, RuleCall, registry
 
+RULE = "rule"  # key of an entry: the rule that it runs, where it has a name of its own
 OWN_RULES = "; one of your own needs the entry point tod_runner.rules, see docs/rules.md"
 
 
@@ -38,6 +40,29 @@ def find_rule(name: str) -> Rule:
     return registry.RULES[name]
 
 
+def call_entry(name: str, entry: Mapping[str, Any]) -> RuleCall:
+    """An entry of a mode: it runs the rule that it is named after, or the one that it states as `rule`.
+
+    raises  ModelError
+    """
+    rule = rule_of(name, entry)
+    try:
+        find_rule(rule)
+    except ModelError as error:
+        key, found = (RULE, error.found) if RULE in entry else ("", None)
+        raise ModelError(key, found, error.rule) from None
+    return replace(call_rule(rule, parameters_of(entry)), entry=name)
+
+
+def rule_of(name: str, entry: Mapping[str, Any]) -> str:
+    """Name of the rule that an entry of a mode runs."""
+    return str(entry.get(RULE, name))
+
+
+def parameters_of(entry: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in entry.items() if key != RULE}
+
+
 def call_rule(name: str, parameters: Mapping[str, Any]) -> RuleCall:
     """A rule with its parameters checked against the rule's own signature.
 
@@ -50,19 +75,19 @@ def call_rule(name: str, parameters: Mapping[str, Any]) -> RuleCall:
     for key, value in parameters.items():
         if key not in known:
             hint = suggest(key, known) if known else f"; {name} takes none"
-            raise ModelError(f"{name}.{key}", repr(value), f"unknown parameter{hint}")
+            raise ModelError(key, repr(value), f"unknown parameter{hint}")
         words = known[key].default
         if isinstance(words, StrEnum):
             if value not in list(type(words)):
-                raise ModelError(f"{name}.{key}", repr(value), f"must be one of {', '.join(type(words))}")
+                raise ModelError(key, repr(value), f"must be one of {', '.join(type(words))}")
             continue
         if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < float("inf"):
-            raise ModelError(f"{name}.{key}", repr(value), "must be a number of 0 or more")
+            raise ModelError(key, repr(value), "must be a number of 0 or more")
         if "_every_" in key and value == 0:
-            raise ModelError(f"{name}.{key}", value, "must be above 0")
+            raise ModelError(key, value, "must be above 0")
     for key, parameter in known.items():
         if key not in parameters and parameter.default is inspect.Parameter.empty:
-            raise ModelError(f"{name}.{key}", "missing", "required by this rule")
+            raise ModelError(key, "missing", "required by this rule")
     return RuleCall(found, {key: _value(known[key], value) for key, value in parameters.items()})
 
 
@@ -72,15 +97,23 @@ def _value(parameter: inspect.Parameter, value: Any) -> Any:
 
 
 def check_order(mode: Mode, calls: Sequence[RuleCall]) -> list[ModelError]:
-    """Problems of a rule list: a rule before what it needs, or a part of the decision that no rule gives."""
+    """Problems of the rules of a mode.
+
+    A rule before what it needs, or after a rule that has used what it gives; a part of the decision that no rule gives.
+    """
     given: set[str] = set()
+    used: dict[str, str] = {}  # by part, the rule that used it first
     problems = []
-    for index, call in enumerate(calls):
-        for part in sorted(call.rule.needs - given):
-            rule_name = repr(call.rule.name)
-            problems.append(ModelError(f"{mode}[{index}]", rule_name, f"needs {part}, which no earlier rule gives"))
-        given |= call.rule.gives
+    for call in calls:
+        where, rule = f"{mode}.{call.name}", call.rule
+        for part in sorted(rule.needs - given):
+            problems.append(ModelError(where, None, f"needs {part}, which no earlier rule gives"))
+        for part in sorted(rule.gives & used.keys()):
+            problems.append(ModelError(where, None, f"gives {part}, must come before {used[part]}, which uses it"))
+        # A rule that gives a part again passes it on: those after it use the new one.
+        used = {**dict.fromkeys((rule.needs & given | rule.uses) - rule.gives, call.name), **used}
+        given |= rule.gives
     missing = [part for part in GIVEN if part not in given]
     if missing:
-        problems.append(ModelError(f"{mode}", [c.rule.name for c in calls], f"no rule gives {', '.join(missing)}"))
+        problems.append(ModelError(f"{mode}", [call.name for call in calls], f"no rule gives {', '.join(missing)}"))
     return problems

@@ -10,24 +10,25 @@ from fractions import Fraction
 from typing import Any, NamedTuple
 
 from runner.configuration.overrides import parse_overrides, sweep
-from runner.configuration.rule_lists import call_rule, find_rule
+from runner.configuration.rule_lists import call_rule, find_rule, parameters_of, rule_of
 from runner.core.model import Mode, ModelError, exact, plain, suggest
 from runner.errors import COMMAND_LINE, ConfigError, Problem
 
-Modes = Mapping[str, Sequence[Mapping[str, Mapping[str, Any]]]]  # as in a modes file: by mode, rules with parameters
+Modes = Mapping[str, Mapping[str, Mapping[str, Any]]]  # as in a modes file: by mode and name, parameters
 BETWEEN = re.compile(r"\s+(?=[A-Za-z])")  # two words: a list of values may contain blanks
 UNIT = re.compile(r"(?:^|_)(?:s|ms|kbps|m|px)$")  # at the end of a name; a number without one is a share, at most 1
 
 
 class Number(NamedTuple):
-    """A number of the rule at a place of a mode's list.
+    """A number of a rule of a mode.
 
+    entry  name of the rule in the modes file
     given  the rule's parameters in the modes file
     value  in force; None: the rule has no number here unless one is given
     """
 
     mode: str
-    place: int  # in the list, from 0
+    entry: str
     rule: str
     key: str
     given: Mapping[str, Any]
@@ -35,7 +36,7 @@ class Number(NamedTuple):
 
     @property
     def name(self) -> str:
-        return f"{self.mode}.{self.rule}.{self.key}"
+        return f"{self.mode}.{self.entry}.{self.key}"
 
     @property
     def is_written(self) -> bool:
@@ -47,11 +48,8 @@ class Number(NamedTuple):
         call_rule(self.rule, {**self.given, self.key: value})
 
     def is_named(self, words: Sequence[str]) -> bool:
-        """Whether it is what the words name, or part of that; the place in the list may be left out."""
-        return any(
-            tuple(words) == path[: len(words)]
-            for path in ((self.mode, self.rule, self.key), (self.mode, str(self.place), self.rule, self.key))
-        )
+        """Whether it is what the words name, or part of that."""
+        return tuple(words) == (self.mode, self.entry, self.key)[: len(words)]
 
 
 class Trial(NamedTuple):
@@ -62,20 +60,19 @@ class Trial(NamedTuple):
 
     @property
     def override(self) -> str:
-        """The word of the command line that sets it: rules are addressed by their place in the list, from 0."""
-        number = self.number
-        return f"modes.{number.mode}.{number.place}.{number.rule}.{number.key}={self.value}"
+        """The word of the command line that sets it."""
+        return f"modes.{self.number.name}={self.value}"
 
 
 def numbers(modes: Modes, driven: Iterable[str]) -> list[Number]:
     """All numbers of the rules of the modes that are driven."""
     found = []
     for mode in driven:
-        for place, entry in enumerate(modes[mode]):
-            ((rule, given),) = entry.items()
+        for name, entry in modes[mode].items():
+            rule, given = rule_of(name, entry), parameters_of(entry)
             for key, parameter in find_rule(rule).parameters.items():
                 if not isinstance(parameter.default, StrEnum):
-                    found.append(Number(mode, place, rule, key, given, given.get(key, _default(parameter))))
+                    found.append(Number(mode, name, rule, key, given, given.get(key, _default(parameter))))
     return found
 
 
@@ -170,20 +167,19 @@ def _why_unknown(named: Sequence[str], known: Sequence[Number], modes: Modes, dr
     """Why words name no number of a rule in force."""
     mode, *rest = named
     if mode in driven:
-        return _why_no_number(mode, rest, known, [rule for entry in modes[mode] for rule in entry])
+        return _why_no_number(rest, mode, known, modes[mode])
     if mode in list(Mode):
         return f"no drive is in mode {mode}: choose it with mode={mode}"
     return f"must begin with the mode, MODE.RULE.NUMBER{suggest('.'.join(named), [one.name for one in known])}"
 
 
-def _why_no_number(mode: str, named: Sequence[str], known: Sequence[Number], rules: Sequence[str]) -> str:
-    place, *rest = named if named and named[0].isdecimal() else ("", *named)
-    rule, key = (*rest, "", "")[:2]
-    if rule not in rules:
-        return f"mode {mode} has no such rule{suggest(rule, rules)}"
-    if place and rules[int(place) : int(place) + 1] != [rule]:
-        return f"{rule} is entry {rules.index(rule)} of mode {mode}"
-    if key in find_rule(rule).parameters:
-        return "is a word, not a number" if len(rest) == 2 else f"must end with {key}"
-    own = [one.key for one in known if one.rule == rule]
-    return f"{rule} has no such number{suggest(key, own)}" if own else f"{rule} has no numbers"
+def _why_no_number(
+    named: Sequence[str], mode: str, known: Sequence[Number], entries: Mapping[str, Mapping[str, Any]]
+) -> str:
+    entry, key = (*named, "", "")[:2]
+    if entry not in entries:
+        return f"mode {mode} has no such rule{suggest(entry, entries)}"
+    if key in find_rule(rule_of(entry, entries[entry])).parameters:
+        return "is a word, not a number" if len(named) == 2 else f"must end with {key}"
+    own = [one.key for one in known if (one.mode, one.entry) == (mode, entry)]
+    return f"{entry} has no such number{suggest(key, own)}" if own else f"{entry} has no numbers"

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 from runner.configuration.config import Configuration, configuration
 from runner.configuration.files import conf_directories
+from runner.configuration.rule_lists import rule_of
 from runner.core.model import Kbps, Mode, ModelError, Vehicle, suggest
 from runner.errors import ArgumentError
 from runner.link.limit import Limit, OneWay
@@ -235,7 +236,7 @@ def rules_in_force(setup: Setup, wanted: Iterable[Job]) -> tuple[Mapping[str, An
     """
     configs = [_composed(setup, job)[0] for job in wanted]
     files = [config.document["modes"] for config in configs]
-    names = [{mode: [list(entry) for entry in file[mode]] for mode in Mode} for file in files]
+    names = [{mode: [(n, rule_of(n, entry)) for n, entry in file[mode].items()] for mode in Mode} for file in files]
     if any(rules != names[0] for rules in names):
         raise ArgumentError("experiment", None, "its runs follow different rules; name the rules and the links instead")
     requests = [request.event for config in configs for request in config.experiment().requests]

@@ -10,7 +10,7 @@ The modes file is never written.
 vary= names numbers as MODE.RULE.NUMBER, with values, each tried alone: automatic.follow_link.start=[0.25,0.5,1] or
 =range(1,4). Without values a number is halved and doubled; MODE or MODE.RULE stands for all its numbers. Several are
 separated by blanks. Without vary= each number that the modes file states for the mode in force (mode=) is halved and
-doubled, where the rule takes it. A rule that is twice in a list is named with its place: automatic.1.follow_link.start.
+doubled, where the rule takes it. RULE is the name in the modes file.
 
 left_out= are the links of the check (left_out: handover and shared), none of them in links=. Their seeds begin at 100.
 seeds= must be 2 or more: a difference has to exceed what they spread.

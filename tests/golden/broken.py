@@ -41,8 +41,8 @@ SCHEMA: Mapping[str, Sequence[Edit]] = {
     "modes/safe": [
         ("single:", "singel:"),
         ("single:\n", "single: demand_from_roi\nsolo:\n"),
-        ("  - share_by_demand: {}", "  - share_by_demand"),
-        ("  - share_by_demand: {}", "  - {share_by_demand: {}, other: {}}"),
+        ("  share_by_demand: {}", "  share_by_demand"),
+        ("  share_by_demand: {}", "  share_by_demand: [{other: {}}]"),
         ("{start_kbps: 3000}", "3000"),
     ],
     "graph/h264_rtsp": [
@@ -115,13 +115,13 @@ COMPOSED: Mapping[str, Mapping[str, Sequence[Edit]]] = {
     },
     "modes": {
         "modes/safe": [
-            ("  - share_by_demand: {}", "  - share_by_demnd: {}"),
+            ("  share_by_demand: {}", "  share_by_demnd: {}"),
             ("{start_kbps: 3000}", "{start: 3000}"),
             ("{start_kbps: 3000}", "{}"),
             ("{start_kbps: 3000}", "{start_kbps: many}"),
             ("halve_every_s: 1 ", "halve_every_s: 0 "),
-            ("  - share_by_demand: {}\n", ""),
-            ("  - total_from_prediction: {start_kbps: 3000}\n  - follow", "  - follow"),
+            ("  share_by_demand: {}\n", ""),
+            ("  total_from_prediction: {start_kbps: 3000}\n  follow", "  follow"),
         ]
     },
     "graph": {

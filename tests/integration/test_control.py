@@ -384,7 +384,7 @@ def test_a_rule_that_fails_or_hangs_does_not_end_the_vehicle(broker, ports, tmp_
     (package / "my_rules.py").write_text(RULES)
     (conf / "modes").mkdir(parents=True)
     safe = (CHECKOUT / "conf" / "modes" / "paper.yaml").read_text()
-    (conf / "modes" / "mine.yaml").write_text(safe.replace("start_kbps: 3000}", "start_kbps: 3000}\n  - mine: {}", 1))
+    (conf / "modes" / "mine.yaml").write_text(safe.replace("start_kbps: 3000}", "start_kbps: 3000}\n  mine: {}", 1))
     words = (
         *SMALL_ROBOT,
         "source=test",
