@@ -332,7 +332,7 @@ def test_memory_is_empty_under_the_paper_and_frozen_elsewhere() -> None:
     remembered = repr(before.memory)
     steady.accept("bitrate_predicted", t=1, kbps=3000)
     assert paper.run.memory == {}
-    assert set(steady.run.memory) == {"hold_upscaling"}
+    assert set(steady.run.memory) == {("hold_upscaling", "hold_upscaling")}
     assert repr(before.memory) == remembered
 
 
