@@ -1,9 +1,22 @@
-"""A mode is an ordered list of named rules; each adds to the draft of a decision, see `registry`."""
+"""A mode is a sequence of named rules; each adds to the draft of a decision. `registry` says what a rule is."""
 
-from runner.core.rules import steady  # noqa: F401  (registers its rules; so do the modules below)
-from runner.core.rules.deciding import RuleFailed, decide, decide_without_link, reads
-from runner.core.rules.registry import GIVEN, Memories, Memory, Rule, RuleCall, Step, rule
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from fractions import Fraction
+from functools import cache
+from typing import Any
+
+from runner.core import allocation, scaling
+from runner.core.decision import NOTHING, Decision, Draft, Setting
+from runner.core.model import Mode, Roi, Vehicle
+from runner.core.rules import steady  # noqa: F401  (registers its rules, as the imports below do theirs)
+from runner.core.rules.paper import whole
+from runner.core.rules.registry import GIVEN, Last, Memories, Memory, Rule, RuleCall, Step, rule
 from runner.core.rules.safe import follow_link
+from runner.core.state import State
+from runner.errors import RunError
 
 __all__ = [
     "GIVEN",
@@ -19,3 +32,118 @@ __all__ = [
     "reads",
     "rule",
 ]
+
+BITRATE_RULE = "must be kbit/s from 0 as an exact number (int or Fraction)"
+FACTOR_RULE = "must be a Fraction in ]0, 1]"
+
+
+class RuleFailed(RunError):
+    """A rule raised an exception or gave a value that cannot be used; the text names rule and value."""
+
+
+def decide(vehicle: Vehicle, state: State, memory: Memories) -> tuple[Decision, Memories]:
+    """Pure core of the runner: run the rules of the mode in force, in order.
+
+    To the rules, a camera that is lost is off: the others get its share.
+
+    raises  RuleFailed, since rules may be the user's own
+    """
+    draft, asked = Draft(), None
+    seen = replace(state, on={**state.on, **dict.fromkeys(state.lost, False)}) if state.lost else state
+    for call in vehicle.modes[state.mode]:
+        before, own = draft, memory.get(call.key, NOTHING)
+        try:
+            draft, kept = call(vehicle, seen, draft, own)
+        except (Exception, SystemExit) as error:
+            raise RuleFailed(f"rule {call.name} failed: {type(error).__name__}: {error}") from error
+        if problem := _draft_problem(seen, before, draft):
+            raise RuleFailed(f"rule {call.name} failed: {problem}")
+        memory = memory if kept is own else {**memory, call.key: kept}
+        asked = draft.total if asked is None else asked
+    assert draft.total is not None and asked is not None
+    settings = _settings(
+        vehicle,
+        state.on,
+        state.lost,
+        state.rois,
+        draft._replace(total=None, uncapped=None, measured=False, believed=None),
+    )
+    # Without a prediction there is only the measurement, so the total without it is unknown.
+    uncapped = draft.total if draft.uncapped is None or draft.measured else draft.uncapped
+    return Decision(state.mode, draft.total, settings, asked, uncapped, draft.believed), memory
+
+
+def decide_without_link(vehicle: Vehicle, state: State, memory: Memories) -> Decision:
+    """What the rules would decide if no operator measured the uplink.
+
+    raises  RuleFailed
+    """
+    unmeasured = {key: past for key, past in memory.items() if key[0] != follow_link.__name__}
+    return decide(vehicle, replace(state, link=None, operator_since=None), unmeasured)[0]
+
+
+def _draft_problem(state: State, before: Draft, draft: Any) -> str | None:
+    """Why the parts of the draft that a rule has changed cannot be used; None if they can."""
+    if not isinstance(draft, Draft):
+        return "it must return a Draft and the memory"
+    if draft is before:
+        return None
+    if draft.total is not before.total and not _is_bitrate(draft.total):
+        return f"total {draft.total!r}: {BITRATE_RULE}"
+    for part, fits, expected in PARTS:
+        values = getattr(draft, part)
+        if values is getattr(before, part):
+            continue
+        if not isinstance(values, Mapping):
+            return f"{part} {values!r}: must be a mapping by camera"
+        if values.keys() == state.on.keys() and all(map(fits, values.values())):
+            continue
+        for name, on in state.on.items():
+            if on and not fits(values.get(name)):
+                return f"{part} of {name} {values.get(name)!r}: {expected}"
+    return None
+
+
+def _is_bitrate(value: Any) -> bool:
+    """A float is rejected even if it is whole: rounding noise must never decide a bitrate on a bound."""
+    return type(value) in (Fraction, int) and value.numerator >= 0  # comparing fractions is slow
+
+
+def _is_factor(value: Any) -> bool:
+    return type(value) is Fraction and 0 < value.numerator <= value.denominator
+
+
+# Parts of a draft by camera, the check of their values, and its description.
+PARTS = (
+    ("demand", _is_bitrate, BITRATE_RULE),
+    ("bitrate", _is_bitrate, BITRATE_RULE),
+    ("scaling", _is_factor, FACTOR_RULE),
+)
+
+
+@cache
+def reads(vehicle: Vehicle, mode: Mode) -> frozenset[str]:
+    """Fields of the state whose change triggers a new decision."""
+    return frozenset({"mode", "on", "lost", "rois"}).union(*(call.reads for call in vehicle.modes[mode]))
+
+
+@Last
+def _settings(
+    vehicle: Vehicle, on: Mapping[str, bool], lost: Mapping[str, str], rois: Mapping[str, Roi], draft: Draft
+) -> Mapping[str, Setting]:
+    return {name: _setting(on[name], lost.get(name), rois[name], draft, name) for name in vehicle.cameras}
+
+
+def _setting(on: bool, lost: str | None, roi: Roi, draft: Draft, name: str) -> Setting:
+    if not on or lost is not None:
+        why = f"lost: {lost}" if on else "switched off"
+        return Setting(on, False, allocation.ZERO, 0, 0, None, roi, 0, 0, why)
+    kbps, factor = whole(draft.bitrate[name]), draft.scaling[name]
+    sending = draft.sending and kbps >= 1
+    width, height = scaling.output_size(roi, factor)
+    reason = draft.reasons.get(name, "")
+    if draft.sending and not sending:
+        reason += ", below 1 kbit/s: not sending"
+    if draft.notes:
+        reason = "; ".join((reason, *draft.notes))
+    return Setting(True, sending, draft.demand[name], kbps if sending else 0, kbps, factor, roi, width, height, reason)
