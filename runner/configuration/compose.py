@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from runner import schema
 from runner.configuration.files import GROUPS, bases_of, chosen_by, conf_directories, defaults, find_file, options
+from runner.configuration.interpolation import value_at
 from runner.configuration.origin import PICKED, Composed, Part, nested
 from runner.configuration.overrides import Override, choice_problems, parse_overrides, rule_problems
 from runner.configuration.replaced_rules import with_successors
@@ -275,9 +276,9 @@ def _restated(files: Sequence[Part]) -> Iterator[Problem]:
     for part in files:
         is_modes = part.path is not None and part.path.parent.name == "modes"
         place = part.package if is_modes else (*part.package, "modes")
-        content = part.content if is_modes else (part.content or {}).get("modes")
-        for mode in Mode if isinstance(content, dict) else ():
-            rules = content.get(mode)
+        stating = part.content if is_modes else value_at(part.content, ("modes",))
+        for mode in Mode:
+            rules = value_at(stating, (mode,))
             if not isinstance(rules, dict):
                 continue
             first, known = stated.setdefault((*place, mode), (part.file, set()))
