@@ -181,8 +181,9 @@ def _prepare_run(
     if words:
         config = configuration(own.overrides, own.conf, runnable=False)
         link = config.link()
-    if link is None and (ceiling := _ceiling(config)):
-        own = replace(own, overrides=[*ceiling, *own.overrides])
+    if link is None and "follow_link" in config.document["modes"]["automatic"]:
+        # A prediction is a limit here: this machine's loopback carries more than two cores can encode.
+        own = replace(own, overrides=["++modes.automatic.follow_link.ceiling=prediction", *own.overrides])
         config = configuration(own.overrides, own.conf, runnable=False)
     if link and directory is None:
         raise ArgumentError("link", link.kind, "needs a log to show its effect: give log=DIR or output=OUT")
@@ -201,13 +202,6 @@ def _prepare_run(
     with progress_bar() as progress:
         render_missing(vehicle, progress)
     return _Run(name, own, vehicle, directory, link, config.document, duration_s, keys)
-
-
-def _ceiling(config: Configuration) -> list[str]:
-    """Overrides by which a prediction is a limit: this machine's loopback carries more than two cores can encode."""
-    rules = config.document["modes"]["automatic"]
-    numbers = (number for number, rule in enumerate(rules) if "follow_link" in rule)
-    return [f"++modes.automatic.{number}.follow_link.ceiling=prediction" for number in numbers]
 
 
 def _with_rate(arguments: Arguments) -> tuple[Arguments, Configuration]:
