@@ -49,7 +49,7 @@ from runner.gst.timers import Guarded, every
 from runner.gst.video_files import VideoFile, VideoFiles
 from runner.gst.watched import WatchedSource
 from runner.inputs import input_problem
-from runner.records import Arrivals, SentFrame
+from runner.records import Arrivals, CameraReading, SentFrame
 
 if TYPE_CHECKING:
     from runner.gst.lanes import Encoded, OnDecoded, OnFrame
@@ -315,10 +315,6 @@ class VehicleSide:
             if pipeline:
                 pipeline.turn(values)
 
-    def copies(self) -> dict[str, int]:
-        """By camera, the number of viewers outside the vehicle: each is sent a copy of the stream."""
-        return self._server.copies() if self._server else {}
-
     def give_control(self, operator: str) -> None:
         """Set which operator is in control, "" for none: its viewers are always admitted, see `runner.gst.viewers`."""
         if self._server:
@@ -338,13 +334,10 @@ class VehicleSide:
             os.close(picture.memory)
         return pipeline is not None and pipeline.push_shared(picture)
 
-    def applied(self) -> dict[str, Mapping[str, KnobValue]]:
-        """By camera and knob, the values read back from the elements; empty for cameras without a pipeline."""
-        return {name: dict(p.knobs.applied) if (p := self._pipeline(name)) else {} for name in self._wanted}
-
-    def sent(self) -> dict[str, tuple[int, int]]:
-        """By camera, frames and bytes that its encoder has output since its pipeline was built."""
-        return {name: p.counters() if (p := self._pipeline(name)) else (0, 0) for name in self._wanted}
+    def read(self) -> dict[str, CameraReading]:
+        """By camera, what its elements say now. From any thread."""
+        lost, copies = self._lost.reasons(), self._server.copies() if self._server else {}
+        return {name: self._read(name, lost.get(name), copies.get(name, 0)) for name in self._wanted}
 
     def stages(self) -> dict[str, tuple[float, float]]:
         """By camera, latency from capture to the encoder, and through it, ms; unknown ones are omitted.
@@ -368,36 +361,6 @@ class VehicleSide:
             if name in self._wanted and (pipeline := self._pipeline(name)):
                 pipeline.send_key_frame()
 
-    def faults(self) -> list[str]:
-        """Values that elements rejected since the last call; each is a bug or an error in a graph."""
-        faults = []
-        for name in self._wanted:
-            pipeline = self._pipeline(name)
-            if pipeline:
-                faults += pipeline.knobs.faults
-                pipeline.knobs.faults.clear()
-        return faults
-
-    def sources(self) -> dict[str, str]:
-        """By camera, the fault of its source: it has failed, is awaited, refuses the login, or repeats a picture."""
-        pipelines = {name: self._pipeline(name) for name in self._wanted}
-        faults = {name: (p.source_fault if p else None) or self._refusal(name) for name, p in pipelines.items()}
-        return {name: fault for name, fault in faults.items() if fault}
-
-    def lost(self) -> dict[str, str]:
-        """By camera whose source cannot be opened, why."""
-        return self._lost.reasons()
-
-    def untimed(self) -> frozenset[str]:
-        """Cameras whose source does not know the capture time of its last picture."""
-        pipelines = ((name, self._pipeline(name)) for name in self._wanted)
-        return frozenset(name for name, pipeline in pipelines if pipeline and pipeline.untimed)
-
-    def slow(self) -> dict[str, int]:
-        """By camera, the rate of its pictures, Hz, if that has been well below its own for a while."""
-        pipelines = {name: pipeline for name in self._wanted if (pipeline := self._pipeline(name))}
-        return {name: slow for name, pipeline in pipelines.items() if (slow := pipeline.slow_fps)}
-
     def stop(self) -> None:
         self._lost.stop()
 
@@ -409,6 +372,13 @@ class VehicleSide:
                 self._server.stop()
 
         self._glib.end(stop)
+
+    def _read(self, name: str, lost: str | None, copies: int) -> CameraReading:
+        pipeline, refusal = self._pipeline(name), self._refusal(name)
+        if pipeline is None:
+            return CameraReading(fault=refusal, lost=lost, copies=copies)
+        fault, untimed, slow_fps = pipeline.source_fault or refusal, pipeline.untimed, pipeline.slow_fps
+        return CameraReading(dict(pipeline.knobs.applied), *pipeline.counters(), fault, lost, untimed, slow_fps, copies)
 
     def _on_found(self, name: str) -> None:
         """From the thread that tries again. A viewer makes the server open its camera."""

@@ -17,7 +17,7 @@ import msgspec
 from msgspec import UNSET, UnsetType
 
 from runner.core.commands import Command, KnobValues
-from runner.core.decision import Believed, Decision, Setting
+from runner.core.decision import NOTHING, Believed, Decision, Setting
 from runner.core.events import Attention, PositionReported
 from runner.core.model import Mode, Roi, plain
 
@@ -377,6 +377,28 @@ class SentFrame(NamedTuple):
     captured: float
     unsent: float
     sent: float
+
+
+class CameraReading(NamedTuple):
+    """What the elements of a camera on the vehicle say; without a pipeline, as the defaults.
+
+    applied        by knob, the values read back
+    frames, bytes  that its encoder has output since its pipeline was built
+    fault          of its source: it has failed, is awaited, refuses the login, or repeats a picture; None: none
+    lost           why its source cannot be opened; None: it can
+    untimed        whether its source does not know the capture time of its last picture
+    slow_fps       the rate of its pictures, Hz, if that has been well below its own for a while; else None
+    copies         viewers outside the vehicle: each is sent a copy of the stream
+    """
+
+    applied: KnobValues = NOTHING
+    frames: int = 0
+    bytes: int = 0
+    fault: str | None = None
+    lost: str | None = None
+    untimed: bool = False
+    slow_fps: int | None = None
+    copies: int = 0
 
 
 class Arrivals(NamedTuple):

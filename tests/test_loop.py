@@ -101,19 +101,18 @@ def test_a_step_that_fails_does_not_stop_the_others(monkeypatch: pytest.MonkeyPa
     def fail() -> None:
         raise OSError("no such device")
 
-    monkeypatch.setattr(watched.side, "copies", fail)
+    monkeypatch.setattr(watched.side, "read", fail)
     with watched.running():
         until(lambda: len(watched.of(Telemetry)) > 2)
         watched.breathe(0.3)
         until(lambda: "operator driver has been silent for 1 s" in watched.reports)
-    assert "copies_counted: OSError: no such device" in watched.reports
+    assert "cameras: OSError: no such device" in watched.reports
     assert watched.loop.errors > 2
 
 
-def test_cameras_that_are_lost_are_logged_and_stated_and_found_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cameras_that_are_lost_are_logged_and_stated_and_found_again() -> None:
     watched = Watched("modes=paper", "pqos.kbps=3000")
-    lost = {"mast": "no such device"}
-    monkeypatch.setattr(watched.side, "lost", lambda: dict(lost))
+    lost = watched.side.lost = {"mast": "no such device"}
 
     def camera(name: str) -> Any:
         return watched.of(VehicleState)[-1].cameras[name]
@@ -369,7 +368,7 @@ def test_a_repeated_request_is_not_answered_before_what_it_asks_for_is_applied(m
     with watched.running():
         mode = ask(event="mode_selected", mode="collective")
         until(lambda: mode)
-        until(lambda: watched.side.applied()["front"])
+        until(lambda: watched.side.read()["front"].applied)
         monkeypatch.setattr(watched.side, "turn", turn_others)
         first = ask(event="total_set", kbps=900)
         time.sleep(0.3)
@@ -433,10 +432,10 @@ def test_reports_of_a_revoked_operator_keep_nobody_present(tmp_path: Path, monke
         assert watched.loop.refused > refused
 
 
-def test_the_frames_that_an_operator_without_control_reports_are_not_logged() -> None:
+def test_the_frames_that_an_operator_without_control_reports_are_not_logged(monkeypatch: pytest.MonkeyPatch) -> None:
     watched, unit = Watched(), UnitReceived("front", 0.0, 0.1, 1000, True)
     logged: list[Any] = []
-    watched.loop.log.record = logged.append  # type: ignore[method-assign]
+    monkeypatch.setattr(watched.loop.listener, "record", logged.append)
     with watched.running():
         for operator in ("driver", "watcher"):
             watched.loop.take(Request(operator, {"event": "operator_connected"}))

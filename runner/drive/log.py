@@ -126,6 +126,12 @@ class Log:
         line = line_to_json(record)
         self._write(line if isinstance(record, WITHOUT_ADDRESSES) else redacted(line))
 
+    def on_step(self, before: Run, event: Event, after: Run) -> None:
+        """Write an event, and the decision if it changed; raises as `event`."""
+        self.event(event)
+        if after.commands or after.decision != before.decision:
+            self.record(DecisionMade.of(after.state.t, describe(event), after.decision, after.commands))
+
     def note(self, text: str) -> None:
         """Write a note for the user, with the current time."""
         self.record(Note(self.now(), text))
@@ -416,10 +422,3 @@ def _remove_abandoned(path: Path) -> None:
 
 def _refused(directory: Path, rule: str) -> UserError:
     return ArgumentError("log", directory, rule)
-
-
-def log_run(log: Log, event: Event, before: Run, after: Run) -> None:
-    """Log an event, and the decision if it changed."""
-    log.event(event)
-    if after.commands or after.decision != before.decision:
-        log.record(DecisionMade.of(after.state.t, describe(event), after.decision, after.commands))

@@ -25,17 +25,19 @@ class KnobPanel:
     could be empty in between, which ends the stream.
 
     on_turned  called, from any thread, after knobs were set; `applied` has the values read back
+    on_report  called, from any thread, with each value that an element rejected: a bug, or an error in a graph
     """
 
-    def __init__(self, pipeline: Gst.Bin, camera: Camera, on_turned: Callable[[], None]) -> None:
-        self._camera, self._on_turned = camera, on_turned
+    def __init__(
+        self, pipeline: Gst.Bin, camera: Camera, on_turned: Callable[[], None], on_report: Callable[[str], None]
+    ) -> None:
+        self._camera, self._on_turned, self._on_report = camera, on_turned, on_report
         self._elements = [pipeline.get_by_name(element.name) for element in camera.graph.vehicle]
         self._by_name = {element.get_name(): element for element in self._elements}
         # Reentrant: setting caps sends an event upstream through the probed pad, which calls the probe again.
         self._lock = threading.RLock()
         self._pending: dict[str, KnobValue] = {}
         self.applied: dict[str, KnobValue] = {}
-        self.faults: list[str] = []
         self._pace = 1.0
         self._between_frames = IdleProbe(self._apply_pending)
 
@@ -94,9 +96,10 @@ class KnobPanel:
             values, self._pending = self._pending, {}
             for knob, value in values.items():
                 faults = [fault for each in self._assignments(knob, value) if (fault := self._assign(each))]
-                self.faults += faults
                 if not faults:
                     self.applied[knob] = value
+                for fault in faults:
+                    self._on_report(fault)
         self._on_turned()
 
     def _assignments(self, knob: str, value: KnobValue) -> list[Assignment]:
@@ -110,7 +113,7 @@ class KnobPanel:
             element.set_property(key, _property(assignment))
             if self._differs(assignment):
                 actual = text(str(element.get_property(key)))
-                return f"{self._camera.name}: {name}.{key} is {actual} after it was set to {text(value)}"
+                return f"{name}.{key} is {actual} after it was set to {text(value)}"
         return None
 
     def _differs(self, assignment: Assignment) -> bool:

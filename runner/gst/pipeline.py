@@ -46,7 +46,7 @@ class CameraPipeline:
 
     wanted     returns the wanted knob values
     on_turned  called, from any thread, after knobs were set
-    on_report  called, from a streaming thread, with a fault of the source, and on its recovery
+    on_report  called, from any thread, with a fault of the source, its recovery, and values that elements reject
     source     the source, if it is watched
 
     untimed      whether the source does not know when the last picture was captured
@@ -66,7 +66,7 @@ class CameraPipeline:
         self._pipeline, self._plan, self._source = pipeline, plan, source
         self._wanted, self._first = wanted, wanted()
         self.untimed = False
-        self.knobs = KnobPanel(pipeline, plan.camera, on_turned)
+        self.knobs = KnobPanel(pipeline, plan.camera, on_turned, on_report)
         if plan.loops:
             loop_clip(pipeline, plan)
         if plan.bag and source is None:

@@ -130,7 +130,7 @@ class _Put(NamedTuple):
 class Recorder:
     """Writes down nothing."""
 
-    def step(self, event: Event, before: Run, after: Run) -> None: ...
+    def step(self, before: Run, event: Event, after: Run) -> None: ...
     def reported(self, reported: ReceptionReported) -> None: ...
     def frame(self, frame: Frame) -> None: ...
     def tick(self, t: float, simulation: Simulation) -> None: ...
@@ -201,12 +201,12 @@ class Simulation:
     def _at(self, t: float, work: Callable[[float, Any], None], what: Any) -> None:
         heapq.heappush(self._events, (t, next(self._order), work, what))
 
-    def _stepped(self, event: Event, before: Run, after: Run) -> None:
+    def _stepped(self, before: Run, event: Event, after: Run) -> None:
         if after.decision is not before.decision and after.decision.total != before.decision.total:
             self.done.totals.extend((event.t, float(after.decision.total)))
         if isinstance(event, BitratePredicted):
             self.done.predictions.extend((event.t, float(event.kbps)))
-        self.recorder.step(event, before, after)
+        self.recorder.step(before, event, after)
 
     # --- vehicle ---
 

@@ -12,7 +12,7 @@ from typing import Any
 from runner.core.events import BitratePredicted, Event, describe
 from runner.core.model import Vehicle, plain
 from runner.core.step import Run
-from runner.drive.log import Log, log_run
+from runner.drive.log import Log
 from runner.records import (
     CameraSample,
     CameraTelemetry,
@@ -77,8 +77,8 @@ class DriveFiles(Recorder):
         self._ticks = 0
         self._predicted: int | float | None = None
 
-    def step(self, event: Event, before: Run, after: Run) -> None:
-        log_run(self._logs["vehicle"], event, before, after)
+    def step(self, before: Run, event: Event, after: Run) -> None:
+        self._logs["vehicle"].on_step(before, event, after)
         if isinstance(event, BitratePredicted):
             self._predicted = plain(event.kbps)
         if after.commands or after.decision != before.decision:

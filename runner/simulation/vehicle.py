@@ -22,7 +22,7 @@ from runner.vehicle.uplink import MeasuredUplink
 OPERATOR = "operator"  # id of the only one
 LOOK_S = 0.02  # between two looks at what the payloaders have sent
 KEY_FRAME_S = 0.5  # between two key frames that repair a camera's pictures, as in runner.vehicle.loop
-OnStep = Callable[[Event, Run, Run], None]
+OnStep = Callable[[Run, Event, Run], None]
 
 
 @dataclass
@@ -88,7 +88,7 @@ class SimulatedVehicle:
             raise RunError(after.fault)
         for command in after.commands:
             self.encoders[command.camera].turn(command)
-        self.on_step(event, before, after)
+        self.on_step(before, event, after)
 
     def _note_presence(self, t: float) -> None:
         in_control = self._operators.in_control

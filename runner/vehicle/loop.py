@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from msgspec import UNSET
 
-from runner.core.commands import Command, KnobValues
+from runner.core.commands import Command
 from runner.core.events import (
     NAMES,
     OWN,
@@ -29,10 +29,10 @@ from runner.core.events import (
 )
 from runner.core.model import Vehicle, plain
 from runner.core.step import Run, start, step
-from runner.drive.log import Log, log_run
 from runner.mqtt.messages import APPLY_S
 from runner.pqos import Pqos
 from runner.records import (
+    CameraReading,
     CameraState,
     CameraTelemetry,
     Outcome,
@@ -77,18 +77,19 @@ class Applier(Protocol):
     """What the loop needs from the streaming side."""
 
     def turn(self, commands: Iterable[Command]) -> None: ...
-    def applied(self) -> Mapping[str, KnobValues]: ...
-    def sent(self) -> Mapping[str, tuple[int, int]]: ...
-    def faults(self) -> list[str]: ...
-    def sources(self) -> Mapping[str, str]: ...
-    def lost(self) -> Mapping[str, str]: ...
-    def untimed(self) -> Collection[str]: ...
-    def slow(self) -> Mapping[str, int]: ...
+    def read(self) -> Mapping[str, CameraReading]: ...
     def stages(self) -> Mapping[str, tuple[float, float]]: ...
     def sent_frames(self) -> Mapping[str, Iterable[SentFrame]]: ...
-    def copies(self) -> Mapping[str, int]: ...
     def give_control(self, operator: str) -> None: ...
     def send_key_frames(self, cameras: Iterable[str]) -> None: ...
+
+
+class Listener(Protocol):
+    """What hears of a drive, from the loop's thread: the log."""
+
+    def begin(self) -> None: ...
+    def on_step(self, before: Run, event: Event, after: Run) -> None: ...
+    def record(self, record: ReceptionReported | Telemetry) -> None: ...
 
 
 _Kind = tuple[type, str | None]  # of a request: its event, and the camera that it names
@@ -120,7 +121,7 @@ class ControlLoop:
     applier: Applier
     pqos: Pqos
     track: Track | None
-    log: Log
+    listener: Listener
     publish: Callable[[VehicleState | Telemetry | SpeedAdvice | SteeringAngle], bool]
     on_report: Callable[[str], None]
     access: Access = field(default_factory=Access)
@@ -147,6 +148,9 @@ class ControlLoop:
     _refusals: dict[str, int] = field(default_factory=dict)  # by sender, since the last tick
 
     def __post_init__(self) -> None:
+        self._cameras: Mapping[str, CameraReading] = dict.fromkeys(
+            self.vehicle.cameras, CameraReading()
+        )  # as last read
         self._operators = Operators(self.vehicle.expires_s, self.access.may_control)
         self._uplink, self._sending = MeasuredUplink(self.vehicle), SendingTimes()
         self._report_denial = LimitedReports(self.on_report)
@@ -214,9 +218,10 @@ class ControlLoop:
         raises  RuleFailed if the first decision cannot be made
         """
         self._began = self.beat = time.monotonic()
-        self.log.begin()
+        self.listener.begin()
         self._warned = 0
         self._run = start(self.vehicle)
+        self._guarded("cameras", self._read)
         self._guarded("sources", lambda: self._check_sources(0.0))
         self._guarded("start", lambda: self._take(ClockAdvanced(t=0.0)))
         next_tick, late = TICK_S, LateCheck(2 * TICK_S)
@@ -263,33 +268,29 @@ class ControlLoop:
             position_at = self.track.at
             self._guarded("position_reported", lambda: self._take(replace(position_at(t), t=t)))
         self._guarded("clock_advanced", lambda: self._take(ClockAdvanced(t=t)))
+        self._guarded("cameras", self._read)
         self._guarded("sources", lambda: self._check_sources(t))
         self._guarded("copies_counted", lambda: self._count_copies(t))
-        self._guarded("faults", self._report_faults)
         if self._ticks % TELEMETRY_TICKS == 0:
             self._guarded("telemetry", lambda: self._publish_measured(t))
         self._guarded("operators", lambda: self._watch_operators(t))
         self._guarded("advice", lambda: self._advise(t))
 
+    def _read(self) -> None:
+        self._cameras = self.applier.read()
+
     def _count_copies(self, t: float) -> None:
-        copies = {name: count for name, count in self.applier.copies().items() if count > 1}
+        copies = {name: camera.copies for name, camera in self._cameras.items() if camera.copies > 1}
         if copies != self._run.state.copies:
             self._take(CopiesCounted(t=t, copies=copies))
 
     def _check_sources(self, t: float) -> None:
         """Let the rules know which cameras cannot be opened."""
-        now, known = self.applier.lost(), self._run.state.lost
-        for name in known.keys() - now.keys():
-            self._take(SourceReported(t=t, camera=name, works=True))
-            self.on_report(f"{name}: found again")
-        for name, why in now.items():
-            if known.get(name) != why:
-                self._take(SourceReported(t=t, camera=name, works=False, reason=why))
-                self.on_report(f"{name}: lost: {why}; trying again")
-
-    def _report_faults(self) -> None:
-        for fault in self.applier.faults():
-            self.on_report(fault)
+        known = self._run.state.lost
+        for name, why in ((name, camera.lost) for name, camera in self._cameras.items()):
+            if why != known.get(name):
+                self._take(SourceReported(t=t, camera=name, works=why is None, reason=why))
+                self.on_report(f"{name}: lost: {why}; trying again" if why else f"{name}: found again")
 
     def _take_request(self, request: Request) -> None:
         try:
@@ -343,7 +344,7 @@ class ControlLoop:
         is_rival = self._uplink.is_rival(reported)
         if reported.in_control and not is_rival:
             reported = self._with_lateness(reported)
-        self.log.record(reported if reported.in_control else replace(reported, report=_totals(reported.report)))
+        self.listener.record(reported if reported.in_control else replace(reported, report=_totals(reported.report)))
         link = self._uplink.take(reported)
         if is_rival:
             self._report_once(f"{item.sender}: two processes of this operator send reception reports; one is ignored")
@@ -480,9 +481,9 @@ class ControlLoop:
             self.applier.turn(after.commands)
         except Exception:
             self._run = replace(after, commanded=before.commanded)  # the next event repeats the commands
-            log_run(self.log, event, before, after)  # decided all the same, as a replay will decide
             raise
-        log_run(self.log, event, before, after)
+        finally:
+            self.listener.on_step(before, event, after)  # decided all the same, as a replay will decide
         if isinstance(event, PositionReported):
             self._position = event
         if isinstance(event, SteeringReported):
@@ -520,12 +521,14 @@ class ControlLoop:
 
     def _publish_state(self) -> None:
         """Publish the decided and the applied values if either has changed; answer requests that are now applied."""
-        applied = self.applier.applied()
         due = self._published is None or self._now() - self._published.t >= STATE_S or bool(self._pending)
-        state = self._state(applied) if due or self._publish_again else None
-        if state and self._is_news(state) and self.publish(state):
+        if not due and not self._publish_again:
+            return
+        self._read()
+        state = self._state()
+        if self._is_news(state) and self.publish(state):
             self._publish_again, self._published = False, state
-        self._pending = [pending for pending in self._pending if not self._answered(pending, applied)]
+        self._pending = [pending for pending in self._pending if not self._answered(pending)]
 
     def _is_news(self, state: VehicleState) -> bool:
         """Whether to publish a state. Changed reasons or beliefs alone, which change all the time, are not urgent."""
@@ -537,21 +540,19 @@ class ControlLoop:
         interval_s = REASONS_S if self._operators.present else UNSEEN_REASONS_S
         return state.t - last.t >= interval_s or _without_reasons(state) != _without_reasons(last)
 
-    def _state(self, applied: Mapping[str, KnobValues]) -> VehicleState:
-        decision, weights = self._run.decision, self._run.state.weights
+    def _state(self) -> VehicleState:
+        decision = self._run.decision
         # A source that is awaited says for what; the rules know only that it does not open.
-        faults, untimed = {**self._run.state.lost, **self.applier.sources()}, self.applier.untimed()
-        slow = self.applier.slow()
         cameras = {
             name: CameraState.at(
-                setting,
-                plain(weights[name]),
-                applied_to_json(name, applied[name]),
-                faults.get(name),
-                name in untimed,
-                slow.get(name),
+                decision.settings[name],
+                plain(self._run.state.weights[name]),
+                applied_to_json(name, camera.applied),
+                camera.fault or camera.lost,
+                camera.untimed,
+                camera.slow_fps,
             )
-            for name, setting in decision.settings.items()
+            for name, camera in self._cameras.items()
         }
         fault = self._run.fault
         total, asked = plain(decision.total), plain(decision.asked)
@@ -566,9 +567,10 @@ class ControlLoop:
             believed=decision.believed or UNSET,
         )
 
-    def _answered(self, pending: _PendingReply, applied: Mapping[str, KnobValues]) -> bool:
+    def _answered(self, pending: _PendingReply) -> bool:
         """Answer a request if all its knob values are applied or it has timed out; returns whether it is answered."""
         now, commanded = self._now(), self._run.commanded
+        applied = {name: camera.applied for name, camera in self._cameras.items()}
         settings = self._run.decision.settings  # what is not sent keeps the other values
         relevant = [(name, knob) for name, knob in pending.knobs if knob == "sending" or settings[name].sending]
         watched = [(name, knob) for name, knob in relevant if applied[name]]
@@ -588,19 +590,22 @@ class ControlLoop:
 
     def _publish_measured(self, t: float) -> None:
         """Publish what was read back from the elements, and what the encoders have output so far."""
-        sent, stages = self.applier.sent(), self.applier.stages()
+        stages = self.applier.stages()
         cameras = {
             name: CameraTelemetry(
-                applied_to_json(name, knobs), *sent[name], *(round(ms, 2) for ms in stages.get(name, ()))
+                applied_to_json(name, camera.applied),
+                camera.frames,
+                camera.bytes,
+                *(round(ms, 2) for ms in stages.get(name, ())),
             )
-            for name, knobs in self.applier.applied().items()
+            for name, camera in self._cameras.items()
         }
         prediction = self._run.state.prediction
         predicted = plain(prediction.kbps) if prediction else None
         position = self._current_position(t)
         factor = self._speed_factor(t)
         telemetry = Telemetry(t, predicted, position, cameras, self.refused, self.errors, factor)
-        self.log.record(telemetry)
+        self.listener.record(telemetry)
         self.publish(telemetry)
 
     def _current_position(self, t: float) -> Position | None:

@@ -55,7 +55,7 @@ from runner.core.decision import Decision
 from runner.core.events import NAMES, BitratePredicted, Event, LinkMeasured, PositionReported, parse, to_json
 from runner.core.model import Vehicle
 from runner.core.step import Run, start, step
-from runner.drive.log import FILES, Log, check_free, log_run
+from runner.drive.log import FILES, Log, check_free
 from runner.drive.read import OTHER_KINDS, REPORTS, check_began, is_log, read_line, read_lines, text_lines
 from runner.errors import ArgumentError, UserError, os_errors_as
 from runner.records import KINDS, Began, ClockSet, ReceptionReported, decision_to_json, line_from_json
@@ -247,7 +247,7 @@ def replay(
     for document, event in inputs if pqos is None else _with_predictions(inputs, pqos):
         before, now = now, step(vehicle, now, event)
         if log:
-            log_run(log, event, before, now)
+            log.on_step(before, event, now)
         yield answers.line(document, now)
 
 

@@ -415,6 +415,11 @@ def streaming(
         side.stop()
 
 
+def rejected(reported: Sequence[str]) -> list[str]:
+    """The reports of values that elements rejected."""
+    return [line for line in reported if " after it was set to " in line]
+
+
 class Client:
     """Receives and decodes one camera; keeps the size of each frame and, if requested, the last picture.
 

@@ -9,9 +9,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from runner.apply import Reception
-from runner.core.commands import Command, KnobValue, KnobValues
+from runner.core.commands import Command, KnobValue
 from runner.graph import Plan
-from runner.records import Arrivals, SentFrame
+from runner.records import Arrivals, CameraReading, SentFrame
 
 FRAMES = 5  # delivered by a sending camera between two samples
 FRAME_BYTES = 1000
@@ -23,6 +23,7 @@ class RecordingVehicle:
     watched     cameras that have a pipeline: their commands count as applied
     commands    all that were received, in order
     key_frames  cameras whose encoder was to start anew, in order
+    lost        by camera whose source cannot be opened, why
     """
 
     def __init__(self, plans: Sequence[Plan], *_: Any) -> None:
@@ -34,6 +35,7 @@ class RecordingVehicle:
         self.commands: list[Command] = []
         self.controller = ""
         self.key_frames: list[str] = []
+        self.lost: dict[str, str] = {}
         self.on_turned: Callable[[], None] = lambda: None
 
     @property
@@ -51,37 +53,20 @@ class RecordingVehicle:
                 self._wanted[command.camera][command.knob] = command.value
         self.on_turned()
 
-    def applied(self) -> dict[str, KnobValues]:
+    def read(self) -> dict[str, CameraReading]:
         with self._lock:
-            return {name: dict(knobs) if name in self.watched else {} for name, knobs in self._wanted.items()}
-
-    def sent(self) -> dict[str, tuple[int, int]]:
-        for name, knobs in self.applied().items():
+            applied = {name: dict(knobs) if name in self.watched else {} for name, knobs in self._wanted.items()}
+        for name, knobs in applied.items():
             self._sent[name] += FRAMES if knobs.get("sending") else 0
-        return {name: (frames, FRAME_BYTES * frames) for name, frames in self._sent.items()}
-
-    def faults(self) -> list[str]:
-        return []
-
-    def sources(self) -> dict[str, str]:
-        return {}
-
-    def lost(self) -> dict[str, str]:
-        return {}
-
-    def untimed(self) -> frozenset[str]:
-        return frozenset()
-
-    def slow(self) -> dict[str, int]:
-        return {}
+        return {
+            name: CameraReading(knobs, self._sent[name], FRAME_BYTES * self._sent[name], lost=self.lost.get(name))
+            for name, knobs in applied.items()
+        }
 
     def stages(self) -> dict[str, tuple[float, float]]:
         return {}
 
     def sent_frames(self) -> dict[str, list[SentFrame]]:
-        return {}
-
-    def copies(self) -> dict[str, int]:
         return {}
 
     def send_key_frames(self, cameras: Iterable[str]) -> None:

@@ -149,9 +149,9 @@ def test_a_camera_that_is_unplugged_comes_back_when_it_is_plugged_in_again(tmp_p
             turn(side, sending=True, size=(480, 260), bitrate=500)
             until(lambda: len(client.sizes) > 10)
             until_unplugged.close()
-            until(side.sources)
+            until(lambda: side.read()[CAMERA].fault)
             with plugged_in(socket):
-                until(lambda: not side.sources())
+                until(lambda: side.read()[CAMERA].fault is None)
                 before = len(client.sizes)
                 until(lambda: len(client.sizes) > before + 10)
                 assert client.errors == []

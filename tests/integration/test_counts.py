@@ -78,8 +78,8 @@ def test_a_frame_costs_no_call_into_python_on_the_vehicle(calls, streaming):
     # The operator's side, also in this process, inspects each arriving frame and packet.
     viewing = {name for name in calls if name.startswith(("Receiver", "RepairBuffer"))}
     assert viewing
-    before, sent = Counter(calls), side.sent()
-    until(lambda: all(frames > sent[name][0] + FRAMES for name, (frames, _) in side.sent().items()))
+    before, sent = Counter(calls), side.read()
+    until(lambda: all(camera.frames > sent[name].frames + FRAMES for name, camera in side.read().items()))
     during = calls - before
     assert {name: count for name, count in during.items() if name not in viewing} == {}
     assert sum(during.values()) > FRAMES  # the counters work
@@ -92,7 +92,7 @@ def test_a_change_sets_only_what_differs(streaming, writes):
         """A single property is set immediately, by the thread that turns the knob."""
         writes.clear()
         side.turn(Command(name, knob, value) for name in vehicle.cameras)
-        until(lambda: all(knobs.get(knob) == value for knobs in side.applied().values()))
+        until(lambda: all(camera.applied.get(knob) == value for camera in side.read().values()))
         return Counter(key for key in writes if key.partition(".")[0] in own)
 
     # A viewer's jitter buffers are set as well, whenever the library adds one.

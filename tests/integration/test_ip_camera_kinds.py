@@ -115,7 +115,7 @@ def test_cameras_of_gstreamer_are_shown(media):
     """Over UDP; their servers start sending all media at the same time."""
     with ip_camera(free_port(), media=launched(*media)) as (address, _), robot(address) as (side, plan, reported):
         shown(plan, frames=30)
-        assert side.sources() == {}
+        assert side.read()["rear"].fault is None
         assert reported.count("rear: pipeline built") == 1  # slow answers may be reported, but no attempt fails
 
 
@@ -151,11 +151,11 @@ def test_a_camera_that_answers_slowly_is_awaited(monkeypatch, method, delay_s):
     monkeypatch.setattr("runner.gst.server.OPEN_S", 0.3)  # as long as a viewer waits
     with mini_camera(delays_s={method: delay_s}) as camera, robot(camera.address) as (side, plan, reported):
         refused(plan)
-        waiting = until(side.sources)["rear"]
+        waiting = until(lambda: side.read()["rear"].fault)
         assert re.fullmatch(rf"waiting for the camera: {method}, [12] s", waiting)
         assert refused(plan) < 0.3
         shown(plan)
-        assert side.sources() == {}
+        assert side.read()["rear"].fault is None
         assert camera.connections == 1
         assert reported[1:3] == [f"rear: {waiting}", f"rear: the camera answered {method} after {delay_s:.0f} s"]
 
@@ -163,7 +163,7 @@ def test_a_camera_that_answers_slowly_is_awaited(monkeypatch, method, delay_s):
 def test_a_vehicle_stops_while_a_camera_does_not_answer():
     with mini_camera(delays_s={"DESCRIBE": 20}) as camera:
         with robot(camera.address) as (side, plan, _), watching(plan):
-            until(side.sources)
+            until(lambda: side.read()["rear"].fault)
             began = time.monotonic()
         assert time.monotonic() - began < 3
 
@@ -190,12 +190,12 @@ def test_a_refused_login_is_tried_again_when_its_file_changes(credentials, login
             refused(plan)
         assert len(camera.logins) == logins
         why = f"the camera refuses the user or the password of {credentials}"
-        assert side.sources() == {"rear": why}
+        assert side.read()["rear"].fault == why
         assert f"rear: {why}; next attempt after 60 s, or once this file has changed" in reported
         credentials.write_text("viewer:right\n")
         if login == "basic":
             shown(plan)
-            assert side.sources() == {}
+            assert side.read()["rear"].fault is None
         else:
             until(lambda: refused(plan) and len(camera.logins) > logins)
             assert len(camera.logins) == 2
@@ -265,7 +265,7 @@ def test_a_camera_that_only_knows_sha_256_is_named(credentials):
     with mini_camera(login="sha256") as camera, robot(camera.address, *words) as (side, plan, reported):
         refused(plan)
         until(lambda: f"rear: {demands}" in reported)
-        assert side.sources() == {"rear": demands}
+        assert side.read()["rear"].fault == demands
         assert len(camera.logins) == 1
         vehicle = configuration([*REAR, f'source.address="{camera.address}"', *words]).vehicle()
         found = list(_ip_cameras(vehicle))
@@ -317,7 +317,7 @@ def test_a_decoder_that_delivers_nothing_is_left_out(after):
         shown(plan, frames=after + 10)
         silent = "decoder vendordec: no picture within 2 s; the next attempt leaves it out"
         assert [line for line in reported if silent in line]
-        assert side.sources() == {}
+        assert side.read()["rear"].fault is None
 
 
 @pytest.mark.soak

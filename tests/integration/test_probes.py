@@ -237,7 +237,7 @@ def test_a_pipeline_that_is_built_again_makes_no_callback(source, made):
                 client.read()
                 until(lambda c=client: c.frames > 5)
                 side.turn([Command(camera, "bitrate", 600), Command(camera, "size", (320, 180))])
-                until(lambda c=client: side.applied()[camera]["size"] == (320, 180))
+                until(lambda c=client: side.read()[camera].applied["size"] == (320, 180))
             until(lambda n=number: reported.count("pipeline stopped") == n)
         assert not made
     finally:

@@ -9,7 +9,7 @@ from rig import SMALL_ROBOT, streaming, until, watching
 
 SHAPE = (240 * 3 // 2, 424)  # I420
 WORDS = (*SMALL_ROBOT, "source=appsrc", "+source.repeated_s=1")
-FAULT = {"rear": "source: repeats the same picture"}
+FAULT = "source: repeats the same picture"
 
 
 def play(side, picture, done, seconds=20):
@@ -40,14 +40,14 @@ def test_a_source_that_repeats_a_picture_is_at_fault_until_its_pictures_change()
     with streaming(*WORDS, cameras=("rear",)) as (side, _, (plan,), reported), watching(plan) as client:
         play(side, dark, lambda: len(client.sizes) > 5)
         play(side, dark, passed(2))
-        assert side.sources() == {}
+        assert side.read()["rear"].fault is None
         still = dark(1)
         began = time.monotonic()
-        play(side, lambda number: still, side.sources)
-        assert side.sources() == FAULT
+        play(side, lambda number: still, lambda: side.read()["rear"].fault)
+        assert side.read()["rear"].fault == FAULT
         assert time.monotonic() - began >= 1
-        play(side, dark, lambda: not side.sources())
-    begins = reported.index(f"rear: {FAULT['rear']}")
+        play(side, dark, lambda: side.read()["rear"].fault is None)
+    begins = reported.index(f"rear: {FAULT}")
     assert reported[begins + 1].startswith("rear: works again after ")
 
 
@@ -60,7 +60,7 @@ def test_a_rare_picture_is_not_mistaken_for_a_repeated_one():
             side.push("rear", still)
             side.stages()
             time.sleep(0.6)
-        assert side.sources() == {}
+        assert side.read()["rear"].fault is None
 
 
 def test_pictures_are_not_compared_where_a_still_scene_gives_identical_ones():
@@ -70,4 +70,4 @@ def test_pictures_are_not_compared_where_a_still_scene_gives_identical_ones():
         still = dark(1)
         play(side, lambda number: still, lambda: len(client.sizes) > 5)
         play(side, lambda number: still, passed(2))
-        assert side.sources() == {}
+        assert side.read()["rear"].fault is None

@@ -43,11 +43,11 @@ class Vehicle:
 
     def turn(self, camera=CAMERA, **knobs):
         self.side.turn([Command(camera, knob, value) for knob, value in knobs.items()])
-        if self.side.applied()[camera]:
-            until(lambda: self.side.applied()[camera].items() >= knobs.items())
+        if self.side.read()[camera].applied:
+            until(lambda: self.side.read()[camera].applied.items() >= knobs.items())
 
     def frames(self, camera=CAMERA):
-        return self.side.sent()[camera][0]
+        return self.side.read()[camera].frames
 
     def pipelines(self, camera=CAMERA):
         return self.reported.count(f"{camera}: pipeline built")
@@ -206,15 +206,15 @@ def test_a_viewer_whose_time_is_up_does_not_count_a_camera_as_lost_that_has_just
     with serving("source=appsrc") as vehicle:
         with RtspClient(vehicle.url()) as client:
             assert client.open() == [503]
-        assert CAMERA in vehicle.side.lost()
+        assert vehicle.side.read()[CAMERA].lost
         server = vehicle.side._server
         camera = server._cameras[CAMERA]
         until(lambda: vehicle.side.push(CAMERA, bytes(480 * 260 * 3 // 2)))
         until(lambda: camera.is_open)
-        until(lambda: not vehicle.side.lost())
+        until(lambda: not vehicle.side.read()[CAMERA].lost)
         assert camera.opening  # until a viewer holds it
         server._note_slow(camera)
-        assert vehicle.side.lost() == {}
+        assert not vehicle.side.read()[CAMERA].lost
 
 
 @pytest.mark.parametrize("udp", [True, False], ids=["udp", "tcp"])
@@ -268,7 +268,7 @@ def test_a_player_that_opens_a_paused_camera_does_not_disturb_others(transport):
         vehicle.turn(sending=False)
         words = ["ffmpeg", "-v", "error", "-rtsp_transport", transport, "-i", vehicle.url(), "-f", "null", "-"]
         with subprocess.Popen(words, stderr=subprocess.DEVNULL) as player:
-            until(lambda: vehicle.side.applied()[CAMERA])
+            until(lambda: vehicle.side.read()[CAMERA].applied)
             with RtspClient(vehicle.url()) as viewer:
                 assert viewer.open() == [200, 200, 200]
                 viewer.read()
@@ -446,12 +446,12 @@ def test_a_reader_that_is_slow_is_closed():
         vehicle.turn(SMALL_CAMERA, size=(640, 480), bitrate=2000)
         untouched = stack.enter_context(watched(vehicle, UNTOUCHED))
         viewers = [stack.enter_context(watched(vehicle, SMALL_CAMERA, udp=udp)) for udp in (True, False)]
-        began, sent = time.monotonic(), vehicle.side.sent()[SMALL_CAMERA][1]
+        began, sent = time.monotonic(), vehicle.side.read()[SMALL_CAMERA].bytes
         slow = stack.enter_context(RtspClient(vehicle.url(SMALL_CAMERA), small=True))
         assert slow.open() == [200, 200, 200]
         taken, closed = 0, False
         while not closed:
-            half = (vehicle.side.sent()[SMALL_CAMERA][1] - sent) / 2
+            half = (vehicle.side.read()[SMALL_CAMERA].bytes - sent) / 2
             time.sleep(0.01)
             try:
                 data = slow.tcp.recv(2048) if taken < half else b"nothing yet"
@@ -483,7 +483,7 @@ def test_a_silent_viewer_over_udp_is_sent_nothing_after_its_session_ends():
         assert silent.open(udp=True) == [200, 200, 200]
         assert "timeout=1" in silent.head
         silent.read()
-        until(lambda: not vehicle.side.applied()[CAMERA])  # the library adds 5 s to the timeout
+        until(lambda: not vehicle.side.read()[CAMERA].applied)  # the library adds 5 s to the timeout
         seen = len(silent.packets)
         time.sleep(1)
         assert len(silent.packets) == seen
@@ -520,7 +520,7 @@ def test_a_session_ends_although_its_last_setup_was_refused():
         assert client.open(udp=True) == [200, 200, 200]
         again = client.ask("SETUP", f"{vehicle.url()}/stream=0", Transport="RTP/AVP/TCP;unicast;interleaved=0-1")
         assert again == 455
-        until(lambda: not vehicle.side.applied()[CAMERA])
+        until(lambda: not vehicle.side.read()[CAMERA].applied)
 
 
 def test_a_play_request_that_fails_leaves_no_second_copy():

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from rig import NOISE, free_port, until, watching
+from rig import NOISE, free_port, rejected, until, watching
 from runner.configuration.config import configuration
 from runner.core.commands import Command
 from runner.errors import ConfigError
@@ -55,37 +55,37 @@ def sending(conf: Path):
 
     vehicle = configuration([*WORDS, f"media.port={free_port()}"], conf, check=check_plan).vehicle()
     (plan,) = (plan for plan in compile_plans(vehicle) if plan.camera.name == "rear")
-    side = VehicleSide([plan], vehicle.media, lambda camera, what: None)
+    reported: list[str] = []
+    side = VehicleSide([plan], vehicle.media, lambda camera, what: reported.append(what))
     try:
-        yield side, plan
+        yield side, plan, reported
     finally:
         side.stop()
 
 
 def kbps(side, frames=20):
     """The encoder's output bitrate at 15 Hz."""
-    first, before = side.sent()["rear"]
-    until(lambda: side.sent()["rear"][0] >= first + frames)
-    last, after = side.sent()["rear"]
-    return 8 * (after - before) / 1000 / ((last - first) / 15)
+    before = side.read()["rear"]
+    after = until(lambda: (camera := side.read()["rear"]).frames >= before.frames + frames and camera)
+    return 8 * (after.bytes - before.bytes) / 1000 / ((after.frames - before.frames) / 15)
 
 
 def test_a_property_that_may_change_though_the_element_does_not_declare_it(conf):
     conf.write("graph/vp8.yaml", GRAPH + MUTABLE)
-    with sending(conf.path) as (side, plan):
+    with sending(conf.path) as (side, plan, reported):
         side.turn([Command("rear", knob, value) for knob, value in {"size": (424, 240), "bitrate": 1500}.items()])
         with watching(plan) as client:
             until(lambda: len(client.sizes) > 15)
             high = kbps(side)
             side.turn([Command("rear", "bitrate", 300)])
-            until(lambda: side.applied()["rear"]["bitrate"] == 300)
+            until(lambda: side.read()["rear"].applied["bitrate"] == 300)
             kbps(side)  # the rate control settles
             low = kbps(side)
             side.turn([Command("rear", "bitrate", 1500)])
             kbps(side)
             again = kbps(side)
             assert client.errors == []
-            assert side.faults() == []
+            assert not rejected(reported)
     assert low < 1.3 * 300
     assert high > 2 * low
     assert again > 2 * low
