@@ -444,6 +444,19 @@ class UnitReceived(NamedTuple):
     carried_packets: int = 0
     carried_bytes: int = 0
 
+    @classmethod
+    def of(
+        cls, camera: str, frame: Arrival, at: float, base_s: float, train: tuple[int, int], carried: tuple[int, int]
+    ) -> UnitReceived:
+        """As a report made at a time says it; delays are less by base_s."""
+        ago_s, delay_s = round(at - frame.arrived, 4), round(frame.arrived - frame.captured - base_s, 4)
+        train_s = 0.0 if frame.first is None else round(frame.arrived - frame.first, 5)
+        return cls(camera, ago_s, delay_s, frame.bytes, frame.whole, train_s, *train, *carried)
+
+    def captured(self, at: float) -> float:
+        """When it was captured, if the report was made then."""
+        return at - self.ago_s - self.delay_s
+
 
 @dataclass(frozen=True, slots=True)
 class ReceptionReport:

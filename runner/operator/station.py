@@ -288,11 +288,14 @@ class Station:
             self._delay_s = frames[0][1].arrived - frames[0][1].captured
         base = self._delay_s or 0.0
         self._packets.add(arrivals.arrived)
-        received = tuple(self._unit(name, frame, now, base) for name, frame in frames)
+        received = []
+        for name, frame in frames:  # in order of arrival, as `carried` needs them
+            train = self._packets.between(frame.first or frame.arrived, frame.arrived)
+            received.append(UnitReceived.of(name, frame, now, base, train, self._packets.carried(frame.arrived)))
         if not self._may_reach_vehicle(now):
             return
         counts = (arrivals.packets, arrivals.lost)
-        report = ReceptionReport(round(now, 4), self._vehicle_now(now), received, *counts, run=self._run)
+        report = ReceptionReport(round(now, 4), self._vehicle_now(now), tuple(received), *counts, run=self._run)
         if received:
             report = replace(report, offset_s=round(base, 4))
         if arrivals.damaged:
@@ -306,21 +309,6 @@ class Station:
                 self._clock_requests.append(sent)
             report = replace(report, sent=sent)
         self.link.publish(self._receptions, to_json(report), behind=True)  # its arrivals are in no other report
-
-    def _unit(self, name: str, frame: Arrival, now: float, base: float) -> UnitReceived:
-        """A frame as it is reported; to be called in order of arrival. base: delays are less by it, s."""
-        at = frame.arrived
-        first = at if frame.first is None else frame.first
-        return UnitReceived(
-            name,
-            round(now - at, 4),
-            round(at - frame.captured - base, 4),
-            frame.bytes,
-            frame.whole,
-            round(at - first, 5),
-            *self._packets.between(first, at),
-            *self._packets.carried(at),
-        )
 
     def _worst_latency_ms(self, now: float) -> float | None:
         """Upper bound of the latency of the slowest displayed picture, ms; None: unknown, or nothing is displayed.

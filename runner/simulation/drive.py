@@ -18,7 +18,7 @@ from runner.core.step import Run
 from runner.link.limit import TcpFlows
 from runner.link.losses import LossModel
 from runner.pqos import Pqos
-from runner.records import ReceptionReported
+from runner.records import Arrival, ReceptionReported
 from runner.simulation.control import ControlMessages, segments
 from runner.simulation.encoder import Encoder, EncoderModel
 from runner.simulation.operator import REORDER_S, RETRY_S, TAIL_S, Frame, Loss, Operator
@@ -274,7 +274,7 @@ class Simulation:
         self.done.waits.extend((t, put.last_left - t))
         self.done.frames.extend((last, put.carried))
         whole, ended = not put.missing, self.operator.arrived
-        frame = Frame(name, captured, first, last, put.bytes, whole, put.begun, ended, put.packets)
+        frame = Frame(name, Arrival(last, captured, put.bytes, whole, first), put.begun, ended, put.packets)
         self.recorder.frame(frame)
         self.operator.frame(frame, last + TAIL_S if put.tail else last)
         if not whole:

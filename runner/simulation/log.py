@@ -14,6 +14,7 @@ from runner.core.model import Vehicle, plain
 from runner.core.step import Run
 from runner.drive.log import Log
 from runner.records import (
+    Arrival,
     CameraSample,
     CameraTelemetry,
     LinkSample,
@@ -35,19 +36,19 @@ class _Received:
     """What has arrived of one camera. frames: that are on their way, or have arrived since the last sample."""
 
     def __init__(self) -> None:
-        self.coming: deque[Frame] = deque()
+        self.coming: deque[Arrival] = deque()
         self.recent: deque[tuple[float, int]] = deque()
         self.frames = self.bytes = 0
         self.latency_ms: float | None = None
 
-    def arrivals(self, t: float) -> list[Frame]:
+    def arrivals(self, t: float) -> list[Arrival]:
         """Frames that have arrived since the last call."""
         found = []
-        while self.coming and self.coming[0].last <= t:
+        while self.coming and self.coming[0].arrived <= t:
             frame = self.coming.popleft()
             found.append(frame)
             self.frames, self.bytes = self.frames + 1, self.bytes + frame.bytes
-            self.recent.append((frame.last, frame.bytes))
+            self.recent.append((frame.arrived, frame.bytes))
             self.latency_ms = _latency_ms(frame)
         while self.recent and self.recent[0][0] <= t - RATE_S:
             self.recent.popleft()
@@ -88,7 +89,7 @@ class DriveFiles(Recorder):
         self._logs["vehicle"].record(reported)
 
     def frame(self, frame: Frame) -> None:
-        self._received[frame.camera].coming.append(frame)
+        self._received[frame.camera].coming.append(frame.arrival)
 
     def tick(self, t: float, simulation: Simulation) -> None:
         counters = simulation.link.queue.counters(t)
@@ -122,7 +123,7 @@ class DriveFiles(Recorder):
         decision, damaged = simulation.vehicle.run.decision, simulation.operator.damaged_s(t)
         cameras = {}
         for name, received in self._received.items():
-            arrivals = tuple((round(frame.last, 4), _latency_ms(frame)) for frame in received.arrivals(t))
+            arrivals = tuple((round(frame.arrived, 4), _latency_ms(frame)) for frame in received.arrivals(t))
             setting, seconds = decision.settings[name], min(t, RATE_S)
             cameras[name] = CameraSample(
                 fps=round(len(received.recent) / seconds, 1),
@@ -145,5 +146,5 @@ class DriveFiles(Recorder):
         return Sample(t, self._predicted, allocated, actual, None, 0, cameras, 0, 0.0, EXACT_MS)
 
 
-def _latency_ms(frame: Frame) -> float:
-    return round(1000 * (frame.last - frame.captured), 2)
+def _latency_ms(frame: Arrival) -> float:
+    return round(1000 * (frame.arrived - frame.captured), 2)

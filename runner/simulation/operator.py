@@ -10,12 +10,12 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import count
-from operator import itemgetter
+from operator import attrgetter
 from typing import NamedTuple
 
 from msgspec import UNSET
 
-from runner.records import ReceptionReport, UnitReceived
+from runner.records import Arrival, ReceptionReport, UnitReceived
 
 RUN = 1  # of the operator's side
 # As in runner.gst.arriving and runner.gst.repair, which this package cannot import.
@@ -28,18 +28,12 @@ RETRY_S = 0.04  # rtpjitterbuffer's rtx-min-retry-timeout: a repetition that has
 class Frame(NamedTuple):
     """A frame as it has arrived.
 
-    first, last    arrival of its first and its last packet, s
-    bytes          of video
     begun, ended   (packets, bytes) of all cameras that had arrived with the first, and with the last of its packets
     packets        that arrived
     """
 
     camera: str
-    captured: float
-    first: float
-    last: float
-    bytes: int
-    whole: bool
+    arrival: Arrival
     begun: tuple[int, int]
     ended: tuple[int, int]
     packets: int
@@ -157,7 +151,7 @@ class Operator:
         arrival, sent = self._vehicle_s or (t, t)
         if t - self._counted_at >= COUNTED_S:
             self._count(t)
-        frames.sort(key=itemgetter(3))
+        frames.sort(key=attrgetter("arrival.arrived"))
         return ReceptionReport(
             round(t, 4),
             round(sent + t - arrival, 6),
@@ -171,24 +165,13 @@ class Operator:
 
     def _units(self, t: float, frames: Sequence[Frame]) -> tuple[UnitReceived, ...]:
         if frames and self._base_s is None:
-            self._base_s = frames[0].last - frames[0].captured
+            self._base_s = frames[0].arrival.arrived - frames[0].arrival.captured
         base, units = self._base_s or 0.0, []
-        for camera, captured, first, last, size, whole, begun, ended, _ in frames:
+        for camera, arrival, begun, ended, _ in frames:
             before = self._ended or ended
-            units.append(
-                UnitReceived(
-                    camera,
-                    round(t - last, 4),
-                    round(last - captured - base, 4),
-                    size,
-                    whole,
-                    round(last - first, 5),
-                    ended[0] - begun[0],
-                    ended[1] - begun[1],
-                    max(0, ended[0] - before[0]),
-                    max(0, ended[1] - before[1]),
-                )
-            )
+            train = (ended[0] - begun[0], ended[1] - begun[1])
+            carried = (max(0, ended[0] - before[0]), max(0, ended[1] - before[1]))
+            units.append(UnitReceived.of(camera, arrival, t, base, train, carried))
             self._ended = max(before, ended)
         return tuple(units)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from msgspec import UNSET
 
@@ -73,7 +73,10 @@ class SimulatedVehicle:
         """A reception report arrives."""
         self._operators.message_received(OPERATOR, t)
         self._note_presence(t)
-        reported = self._with_lateness(ReceptionReported(t, OPERATOR, True, report))
+        while self._sent and self._sent[0][1].sent <= t // LOOK_S * LOOK_S:
+            name, frame = self._sent.popleft()
+            self._sending.add({name: (frame,)})
+        reported = self._sending.judge(ReceptionReported(t, OPERATOR, True, report), report.as_of)
         self.on_report(reported)
         if measured := self._uplink.take(reported):
             self.take(measured)
@@ -97,21 +100,6 @@ class SimulatedVehicle:
             self.take(ControlPassed(t=t, operator=in_control))
         if bool(self._operators.present) != (self.run.state.operator_since is not None):
             self.take(OperatorConnected(t=t) if self._operators.present else OperatorDisconnected(t=t))
-
-    def _with_lateness(self, reported: ReceptionReported) -> ReceptionReported:
-        """As in `runner.vehicle.loop`: with what this side knows of its own delays."""
-        report, seen = reported.report, reported.t // LOOK_S * LOOK_S
-        while self._sent and self._sent[0][1].sent <= seen:
-            name, frame = self._sent.popleft()
-            self._sending.add({name: (frame,)})
-        if not report.units:
-            return replace(reported, all_received=self._sending.is_all_received(report.as_of) or UNSET)
-        assert report.offset_s is not UNSET
-        captured = report.at - report.offset_s
-        late_s = tuple(
-            round(self._sending.late_s(unit.camera, captured - unit.ago_s - unit.delay_s), 4) for unit in report.units
-        )
-        return replace(reported, late_s=late_s if any(late_s) else UNSET)
 
     def _due(self, damaged: tuple[str, ...], t: float) -> Iterator[str]:
         """Cameras that need a key frame now."""

@@ -343,7 +343,8 @@ class ControlLoop:
         reported = ReceptionReported(t, item.sender, item.sender == self._operators.in_control, item.report)
         is_rival = self._uplink.is_rival(reported)
         if reported.in_control and not is_rival:
-            reported = self._with_lateness(reported)
+            self._sending.add(self.applier.sent_frames())
+            reported = self._sending.judge(reported, time.time() - (t - item.report.as_of))
         self.listener.record(reported if reported.in_control else replace(reported, report=_totals(reported.report)))
         link = self._uplink.take(reported)
         if is_rival:
@@ -357,21 +358,6 @@ class ControlLoop:
             self._take(link)
         if reported.in_control and item.report.damaged is not UNSET:
             self._repair(item.report.damaged, t)
-
-    def _with_lateness(self, reported: ReceptionReported) -> ReceptionReported:
-        """The report, with what this side knows of its own delays."""
-        report = reported.report
-        self._sending.add(self.applier.sent_frames())
-        if not report.units:
-            made_at = time.time() - (reported.t - report.as_of)
-            return replace(reported, all_received=self._sending.is_all_received(made_at) or UNSET)
-        if report.offset_s is UNSET:
-            return reported
-        captured = report.at - report.offset_s
-        late_s = tuple(
-            round(self._sending.late_s(unit.camera, captured - unit.ago_s - unit.delay_s), 4) for unit in report.units
-        )
-        return replace(reported, late_s=late_s if any(late_s) else UNSET)
 
     def _goes_on(self, goodbye: Request, t: float) -> bool:
         """Whether another process of the operator that says goodbye still sends reports."""

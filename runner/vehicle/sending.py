@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import takewhile
 from math import inf
 from operator import attrgetter
 
-from runner.records import SentFrame
+from msgspec import UNSET
+
+from runner.records import ReceptionReported, SentFrame
 
 BUSY_S = 0.04  # between two looks at a payloader, twice the usual time
 KEPT_S = 5.0  # a frame that arrives later is not looked up, and one that has not arrived by then is lost
@@ -89,6 +91,17 @@ class SendingTimes:
             return 0.0
         camera.add_arrived(captured)
         return camera.late_s(captured)
+
+    def judge(self, reported: ReceptionReported, made_at: float) -> ReceptionReported:
+        """A report, with what this side knows of its own delays. made_at: when it was made, by the vehicle's clock."""
+        report = reported.report
+        if not report.units:
+            return replace(reported, all_received=self.is_all_received(made_at) or UNSET)
+        if report.offset_s is UNSET:
+            return reported
+        at = report.at - report.offset_s
+        late_s = tuple(round(self.late_s(unit.camera, unit.captured(at)), 4) for unit in report.units)
+        return replace(reported, late_s=late_s if any(late_s) else UNSET)
 
     def is_all_received(self, at: float) -> bool:
         """Whether nothing is on its way that was sent before this time: each frame, or a newer one, has arrived.

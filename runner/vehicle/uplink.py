@@ -79,7 +79,7 @@ def _unit(graph: Graph, at: float, unit: UnitReceived, late: float) -> ReceivedU
     header = header_bytes(graph)
     return ReceivedUnit(
         unit.camera,
-        at - unit.ago_s - unit.delay_s,
+        unit.captured(at),
         at - unit.ago_s,
         on_the_wire(graph, unit.bytes),
         unit.whole,
