@@ -148,7 +148,7 @@ def test_a_drive_with_both_sides(tmp_path: Path) -> None:
 
 
 def test_sizes_are_listed_in_the_order_of_their_factors(tmp_path: Path) -> None:
-    camera = statistics(series(read_drive(write_drive(tmp_path / "drive")))).cameras["front_left"]
+    camera = statistics(series(read_drive(write_drive(tmp_path / "drive", seconds=5)))).cameras["front_left"]
     reordered = replace(camera, factors={0.25: 0.2, 0.5: 0.8}, sizes={(960, 540): 0.8, (480, 270): 0.2})
     headings, (row,) = camera_rows(SimpleNamespace(metric=None, cameras={"front": reordered}))
     assert row[headings.index("factor: time")] == "0.25: 20%\n0.5: 80%"

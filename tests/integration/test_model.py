@@ -492,7 +492,8 @@ def test_a_camera_of_the_users_own_is_not_overwritten(tod, clip, tmp_path):
     assert (status, err.count("command line: output: '/proc/models': cannot be written to: ")) == (2, 1)
 
 
-def test_a_missing_tool_and_a_missing_scheduler_are_reported(clip, tmp_path, cache):
+def test_a_missing_tool_and_a_missing_scheduler_are_reported(clip, tmp_path, cache, monkeypatch):
+    monkeypatch.setattr("runner.rate_quality.workers.SCHEDULER_S", 1)
     words = ("camera=front_center", f"sequence={clip}", f"output={tmp_path / 'out'}", *SMALL)
     done = model(*words, "metric=vmaf", cache={**cache, "TOD_FFMPEG": "/bin/true"})
     assert done.returncode == 1
