@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import subprocess
-from typing import Any, cast
+from typing import cast
 
-import pytest
-
-from runner.system.children import VerbProcess, end
-from runner.verbs.demo import _end
+from runner.system.children import end
 
 
 class _Blocked:
@@ -27,28 +24,7 @@ class _Blocked:
         self.killed = True
 
 
-class _Side:
-    """Stands in for a side of a demo."""
-
-    def __init__(self, name: str) -> None:
-        self.name, self.process, self.asked = name, _Blocked(), False
-        self.poll = self.process.poll
-
-    def request_end(self) -> None:
-        self.asked = True
-
-
 def test_a_process_that_cannot_be_killed_is_not_waited_for() -> None:
     process = _Blocked()
     assert not end(cast("subprocess.Popen[bytes]", process), 0.0)
     assert process.killed
-
-
-def test_a_demo_reports_a_side_that_cannot_be_killed_and_ends_the_other(capsys: pytest.CaptureFixture[str]) -> None:
-    sides: Any = [_Side("the vehicle's side"), _Side("the operator's side")]
-    _end(cast("list[VerbProcess]", sides))
-    assert all(side.asked and side.process.killed for side in sides)
-    lines = capsys.readouterr().err.splitlines()
-    assert [line.partition("s side ")[2] for line in lines] == [
-        "did not end within 2.2 s and was killed but still runs, blocked in the kernel"
-    ] * 2

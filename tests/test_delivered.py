@@ -2,14 +2,13 @@
 
 from pathlib import Path
 
-import numpy as np
 from drives import EPOCH, Lines, write_drive
 from helpers import vehicle
 from hypothesis import given
 from hypothesis import strategies as st
 
 from runner.drive.captures import SAME_NS, RecordedVideo, UnitTimes, arrivals, matched, unfiled
-from runner.drive.delivered import _nearest, _thumbnail, displayed_units, measure
+from runner.drive.delivered import displayed_units, measure
 from runner.drive.read import read_drive
 from runner.h264.access_unit import coded_picture
 
@@ -119,14 +118,3 @@ def test_parameter_sets_and_start_codes_do_not_distinguish_pictures() -> None:
     assert coded_picture(sent, "h264") == coded_picture(arrived, "h264") != b""
     assert coded_picture(sent.replace(b"\x9b", b"\x9c"), "h264") != coded_picture(arrived, "h264")
     assert coded_picture(b"\0\0\1\x67\x42", "h264") == b""
-
-
-def test_a_coarse_copy_is_found_among_the_pictures_of_a_clip() -> None:
-    noise = np.random.default_rng(1)
-    street = noise.integers(0, 256, (270, 1000)).astype(np.uint8)
-    street = np.repeat(np.repeat(street[::10, ::10], 10, 0), 10, 1)
-    clip = [street[:, 4 * n : 4 * n + 480] for n in range(60)]
-    candidates = [_thumbnail(picture) for picture in clip]
-    for number in (0, 17, 59):
-        coarse = clip[number] // 64 * 64 + noise.integers(0, 32, clip[number].shape).astype(np.uint8)
-        assert _nearest(candidates, _thumbnail(coarse)) == number

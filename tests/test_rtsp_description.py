@@ -2,9 +2,26 @@
 
 from __future__ import annotations
 
+import socket
+import threading
+
 import pytest
 
-from runner.system.rtsp import Description, _parsed, describe
+from runner.system.rtsp import Description, describe
+
+
+def described(answer):
+    """What is known of a camera that answers this."""
+
+    def serve():
+        camera, _ = listening.accept()
+        with camera:
+            camera.recv(1000)
+            camera.sendall(answer.encode())
+
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        threading.Thread(target=serve, daemon=True).start()
+        return describe(f"rtsp://127.0.0.1:{listening.getsockname()[1]}/", 5)
 
 
 def refused(*challenges):
@@ -24,7 +41,7 @@ def refused(*challenges):
     ],
 )
 def test_the_logins_of_a_camera_are_named(challenges, logins, demands):
-    found = _parsed(refused(*challenges))
+    found = described(refused(*challenges))
     assert found.status == 401
     assert found.logins == (logins or ("Digest SHA-256", "Digest MD5"))
     assert found.unknown_login == (f"the camera demands {demands}; this GStreamer knows MD5" if demands else None)
@@ -32,7 +49,7 @@ def test_the_logins_of_a_camera_are_named(challenges, logins, demands):
 
 def test_video_media_are_counted():
     body = "v=0\r\nm=audio 0 RTP/AVP 8\r\nm=video 0 RTP/AVP 96\r\nm=video 0 RTP/AVP 26\r\n"
-    assert _parsed(f"RTSP/1.0 200 OK\r\nCSeq: 1\r\n\r\n{body}") == Description(200, (), 2)
+    assert described(f"RTSP/1.0 200 OK\r\nCSeq: 1\r\n\r\n{body}") == Description(200, (), 2)
 
 
 @pytest.mark.parametrize("address", ["http://camera/stream", "/dev/video0", "rtsp:///stream"])
@@ -43,4 +60,4 @@ def test_other_addresses_are_refused(address):
 
 def test_other_answers_are_refused():
     with pytest.raises(ValueError, match="no answer of RTSP"):
-        _parsed("HTTP/1.1 400 Bad Request\r\n\r\n")
+        described("HTTP/1.1 400 Bad Request\r\n\r\n")

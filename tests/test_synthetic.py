@@ -173,14 +173,15 @@ def test_a_signal_is_noticed_while_workers_compile(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(synthetic.signals, "check", check)
-    with pytest.raises(KeyboardInterrupt):
-        synthetic._distribute([FORWARD], SECONDS, tmp_path, world, lambda *_: pytest.fail("a worker has reported"))
+    with built(world), pytest.raises(KeyboardInterrupt):
+        render([FORWARD], SECONDS, tmp_path, lambda _, share: share and pytest.fail("a worker has reported"))
 
 
 @pytest.mark.gst
-def test_failing_worker(tmp_path: Path) -> None:
+def test_failing_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("runner.synthetic.world.build_world", lambda seconds, file: None)
     with pytest.raises(RuntimeError, match="rendering the drive: FileNotFoundError"):
-        synthetic._distribute([FORWARD], SECONDS, tmp_path, tmp_path / "no world", nothing)
+        render([FORWARD], SECONDS, tmp_path, nothing)
 
 
 UNGUARDED = """
@@ -225,9 +226,8 @@ def test_progress_rises_to_one(cache: tuple[Path, list[tuple[str, float]]]) -> N
 
 
 @pytest.mark.gst
-def test_second_call_does_nothing(cache: tuple[Path, list[tuple[str, float]]], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_second_call_does_nothing(cache: tuple[Path, list[tuple[str, float]]]) -> None:
     folder, _ = cache
-    monkeypatch.setattr(synthetic, "_render_missing", lambda *args: pytest.fail("rendered again"))
     before = {path: path.stat().st_mtime_ns for path in folder.glob("*.mp4")}
     reports: list[tuple[str, float]] = []
     render([TOP, FORWARD], SECONDS, folder, lambda what, share: reports.append((what, share)))
