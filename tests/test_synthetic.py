@@ -160,10 +160,6 @@ def test_an_interrupt_ends_the_workers_and_leaves_no_partial_clip(world: Path, t
         render([FORWARD, LEFT], SECONDS, tmp_path, interrupt)
     assert not multiprocessing.active_children()
     assert [path.name for path in tmp_path.iterdir()] == ["lock"]
-    (tmp_path / "drive-0.mp4.part").write_bytes(b"of a run that was killed")
-    with built(world):
-        render([TOP], SECONDS, tmp_path, nothing)
-    assert {path.name for path in tmp_path.iterdir()} == {"lock", clip_path(TOP, SECONDS, tmp_path).name}
 
 
 def test_a_signal_is_noticed_while_workers_compile(
