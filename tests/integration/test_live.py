@@ -256,7 +256,8 @@ def seconds_short_of_frames(graph, tmp_path):
     return short
 
 
-def test_an_experiment_is_driven_over_a_limited_link_and_reported(tmp_path):
+@pytest.mark.usefixtures("unprinted")
+def test_an_experiment_is_driven_over_a_limited_link_and_reported(tod, tmp_path):
     """Two drives one after the other, their logs of all three sides, one report of both."""
     mine = tmp_path / "conf" / "experiment" / "mine.yaml"
     mine.parent.mkdir(parents=True)
@@ -264,16 +265,16 @@ def test_an_experiment_is_driven_over_a_limited_link_and_reported(tmp_path):
         "# @package _global_\n"
         "defaults: [{override /vehicle: delivery_robot}, {override /source: test}, {override /link: relay}, _self_]\n"
         "link: {share: 0.7}\n"
-        "experiment: {about: x, duration_s: 6, runs: {equal: [modes=equal], paper: [modes=paper]},"
+        "experiment: {about: x, duration_s: 5, runs: {equal: [modes=equal], paper: [modes=paper]},"
         " requests: [{at_s: 2, request: {event: camera_switched, camera: mast, 'on': false}},"
         " {at_s: 100, request: {event: camera_switched, camera: mast, 'on': true}}]}\n"
     )
     ports = ("page.serve=false", "fps_max=10", f"media.port={free_port()}", f"control.port={free_port()}")
     words = (f"conf={tmp_path / 'conf'}", "experiment=mine", *ports, f"output={tmp_path / 'out'}")
-    done = run("demo", *words)
-    assert done.returncode == 0, done.stderr
-    assert "was not applied" not in done.stdout
-    assert done.stdout.count("the request at 100 s was not made: the drive ended before") == 2
+    done = tod("demo", *words)
+    assert done.status == 0, done.err
+    assert "was not applied" not in done.out
+    assert done.out.count("the request at 100 s was not made: the drive ended before") == 2
     for name in ("equal", "paper"):
         drive = read_drive(tmp_path / "out" / name)
         assert (sorted(drive.sides), drive.warnings) == (["link", "operator", "vehicle"], [])
@@ -286,9 +287,9 @@ def test_an_experiment_is_driven_over_a_limited_link_and_reported(tmp_path):
         assert link[-1].dropped > 0  # more was sent than it carries
     page = (tmp_path / "out" / "index.html").read_text()
     assert "equal" in page and "paper" in page
-    again = run("demo", *words)
-    assert again.returncode == 2
-    assert again.stderr.startswith(f"command line: output: '{tmp_path / 'out'}': must be a new or empty directory")
+    again = tod("demo", *words)
+    assert again.status == 2
+    assert again.err.startswith(f"command line: output: '{tmp_path / 'out'}': must be a new or empty directory")
 
 
 @pytest.mark.soak
