@@ -21,7 +21,7 @@ from shared_data import shared
 from rig import streaming
 from runner.configuration.config import configuration
 from runner.core.commands import Command
-from runner.core.model import Roi
+from runner.core.model import BagTopic, Roi
 from runner.graph import launch
 from runner.gst import Gst
 from runner.gst.pictures import luma_of
@@ -30,7 +30,6 @@ from runner.plans import compile_plans
 from runner.rate_quality.cache import Cache
 from runner.rate_quality.metrics import find_metric
 from runner.rate_quality.sequence import FEWEST_FRAMES, decoding, survey
-from runner.verbs.model import _topics
 
 pytestmark = pytest.mark.gst
 
@@ -192,8 +191,9 @@ def test_distances_are_measured_as_white_as_the_source_says(tmp_path):
     bag = write_bag(tmp_path / "bag", "mcap", {"/front": list(_messages("16UC1", frames))})
 
     def detail(*words: str) -> float:
-        vehicle = configuration(["source=bag", f"source.bag={bag}", "source.topic=/front", *words]).vehicle()
-        return survey(_topics(bag, vehicle, [CAMERA])[CAMERA], Cache(tmp_path / "cache", print), print).si
+        words = ("source=bag", f"source.bag={bag}", "source.topic=/front", *words)
+        camera = configuration(words).vehicle().cameras[CAMERA]
+        return survey(BagTopic(str(bag), "/front", camera.source.depth_m), Cache(tmp_path / "cache", print), print).si
 
     far = detail()
     assert detail("source.depth_m=5") == pytest.approx(4 * far, rel=0.02)
