@@ -32,11 +32,12 @@ from rig import Operator, answers, free_port, until
 from runner.apply import check_plan
 from runner.configuration.config import configuration
 from runner.core.commands import wanted
-from runner.core.model import Endpoint, Vehicle, exact
+from runner.core.model import exact
 from runner.core.scaling import output_size
 from runner.graph import assignments, launch, turn_elements
 from runner.mqtt.broker import private_broker
 from runner.plans import compile_plans
+from runner.settings import Endpoint, Setup
 from runner.verbs.print import decide
 
 WORDS = ("vehicle=delivery_robot", "source=test", "mode=single", "modes=open_loop", "pqos=constant", "pqos.kbps=3000")
@@ -108,10 +109,10 @@ def rows(pairs: int = 5, seconds: float = 15, words: Sequence[str] = ()) -> list
 
 def _bare(words: Sequence[str], seconds: float) -> Cost:
     port = free_port()
-    vehicle = _vehicle([*words, f"media.port={port}"])
-    decision = decide(vehicle, None)
+    setup = _setup([*words, f"media.port={port}"])
+    decision = decide(setup.vehicle, None)
     lines = {}
-    for plan in compile_plans(vehicle):
+    for plan in compile_plans(setup):
         knobs = wanted(decision.settings[plan.camera.name])
         lines[plan.camera.name] = f"( {launch(turn_elements(plan.camera, (*plan.source, *plan.vehicle), knobs))} )"
     began = time.time()
@@ -120,22 +121,22 @@ def _bare(words: Sequence[str], seconds: float) -> Cost:
         write_line(server.stdin, lines)
 
         def resize(name: str, scaling: float) -> None:
-            camera = vehicle.cameras[name]
+            camera = setup.vehicle.cameras[name]
             size = output_size(camera.full_roi, exact(scaling))
             for element, key, value in assignments(camera, "size", size):
                 write_line(server.stdin, [name, element, key, str(value)])  # type: ignore[arg-type]
 
-        return _measured(vehicle, server.pid, began, seconds, resize)
+        return _measured(setup, server.pid, began, seconds, resize)
 
 
 def _own(words: Sequence[str], seconds: float) -> Cost:
     media, broker = free_port(), Endpoint("127.0.0.1", free_port())
     words = [*words, f"media.port={media}", f"control.port={broker.port}"]
-    vehicle = _vehicle(words)
+    setup = _setup(words)
     with private_broker(broker):
         began = time.time()
         with child_of(["-m", "runner", "vehicle", *words]) as side:
-            operator = Operator(broker, vehicle.name)
+            operator = Operator(broker, setup.vehicle.name)
             operator.state(lambda state: state["online"])
             numbers = count()
 
@@ -143,17 +144,17 @@ def _own(words: Sequence[str], seconds: float) -> Cost:
                 reply = operator.ask(f"{next(numbers)}", event="camera_configured", camera=name, scaling=scaling)
                 assert reply["result"] == "applied", reply
 
-            return _measured(vehicle, side.pid, began, seconds, resize)
+            return _measured(setup, side.pid, began, seconds, resize)
 
 
 # --- measuring --------------------------------------------------------------------------------------------------------
 
 
-def _measured(vehicle: Vehicle, pid: int, began: float, seconds: float, resize: Any) -> Cost:
-    names = list(vehicle.cameras)
-    urls = [f"rtsp://127.0.0.1:{vehicle.media.port}/{name}" for name in names]
+def _measured(setup: Setup, pid: int, began: float, seconds: float, resize: Any) -> Cost:
+    names = list(setup.vehicle.cameras)
+    urls = [f"rtsp://127.0.0.1:{setup.media.port}/{name}" for name in names]
     frames: list[Frame] = []
-    until(lambda: answers(vehicle.media.port), WAIT_S, every_s=0.005)
+    until(lambda: answers(setup.media.port), WAIT_S, every_s=0.005)
     with child_of([HERE / "bare.py", "watch", *urls], stdout=subprocess.PIPE) as client:
         threading.Thread(target=read_frames, args=(client.stdout, frames), daemon=True).start()
         until(lambda: {frame.stream for frame in list(frames)} == set(range(len(names))), WAIT_S, every_s=0.005)
@@ -165,7 +166,7 @@ def _measured(vehicle: Vehicle, pid: int, began: float, seconds: float, resize: 
         received = [frame for frame in list(frames) if start <= frame.t < start + took_s]
         memory = memory_mb(pid)
         reaction = _reaction(names, frames, resize)
-    due = sum(float(camera.fps) for camera in vehicle.cameras.values()) * took_s
+    due = sum(float(camera.fps) for camera in setup.vehicle.cameras.values()) * took_s
     ages = [frame.age_ms for frame in received if frame.age_ms is not None]
     return Cost(cores, memory, median(ages), max(first.values()) - began, reaction, len(received) / due)
 
@@ -195,8 +196,8 @@ def read_frames(lines: IO[str], frames: list[Frame]) -> None:
         frames.append(Frame(*json.loads(line)))
 
 
-def _vehicle(words: Sequence[str]) -> Vehicle:
-    return configuration(words, check=check_plan).vehicle()
+def _setup(words: Sequence[str]) -> Setup:
+    return configuration(words, check=check_plan).setup()
 
 
 @contextmanager

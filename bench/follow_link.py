@@ -15,9 +15,9 @@ from matplotlib.figure import Figure
 from runner.drive.colours import NAMED
 from runner.simulation.drive import Drive
 from runner.simulation.picture import write_figure
-from runner.simulation.runs import Job, Setup, run_job
+from runner.simulation.runs import Common, Job, run_job
 
-SETUP = Setup(("fps_max=15", "modes=safe"), None, duration_s=35)
+SETUP = Common(("fps_max=15", "modes=safe"), None, duration_s=35)
 
 
 class Part(NamedTuple):

@@ -42,7 +42,7 @@ def main() -> None:
     options = parser.parse_args()
     Gst.init(None)
     words = [*CAMERA, *(word.format(px) for word, px in zip(SIZED, FULL, strict=True)), *options.set]
-    (plan,) = compile_plans(configuration(words, runnable=False).vehicle())
+    (plan,) = compile_plans(configuration(words, runnable=False).setup())
     before, after = cut(plan)
     encoder = Encoder(plan.camera, launch((*before, *after[: [e.name for e in after].index("sent")])))
     print(

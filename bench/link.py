@@ -12,10 +12,10 @@ import time
 
 from table import Row, show, spread
 
-from runner.core.model import Endpoint
 from runner.mqtt.broker import private_broker
 from runner.mqtt.link import ControlLink
 from runner.mqtt.messages import OFFLINE, OPERATOR_GONE, MqttMessage, topic
+from runner.settings import Endpoint
 
 ROUNDS = 1000
 

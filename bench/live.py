@@ -14,7 +14,6 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -24,11 +23,11 @@ from table import Row, show, spread
 from runner.apply import VehicleSide, check_plan
 from runner.configuration.config import configuration
 from runner.core.commands import Command
-from runner.core.model import Vehicle
 from runner.gst import Gst, knobs
 from runner.gst.caps import structure
 from runner.gst.receiver import capture_time
 from runner.plans import compile_plans, render_missing
+from runner.settings import Setup
 
 PORT = 18554
 Sample = tuple[float, int, int, int, float | None]  # time, width, height, bytes, capture time
@@ -51,33 +50,33 @@ def rows(source: Sequence[str] = ("source=synthetic",), rounds: int = 60) -> lis
 
 def command_latency(source: Sequence[str], rounds: int) -> Iterator[Row]:
     """From a decision for all cameras to the last encoder that applies it; eight cameras as the demo runs them."""
-    vehicle = _vehicle([*source, "fps_max=15"])
-    with _streaming(vehicle) as side, _operator([*source, "fps_max=15"]):
+    setup = _setup([*source, "fps_max=15"])
+    with _streaming(setup) as side, _operator([*source, "fps_max=15"]):
         _until(lambda: all(camera.frames > 30 for camera in side.read().values()))
         for what, sizes in (("bitrate", []), ("bitrate and size", [(960, 520), (480, 260)])):
             last, each = [], []
             for n in range(rounds):
-                commands = [Command(name, "bitrate", 500 + n % 7 * 40) for name in vehicle.cameras]
+                commands = [Command(name, "bitrate", 500 + n % 7 * 40) for name in setup.vehicle.cameras]
                 if sizes:
-                    commands += [Command(name, "size", sizes[n % 2]) for name in vehicle.cameras]
+                    commands += [Command(name, "size", sizes[n % 2]) for name in setup.vehicle.cameras]
                 began = time.perf_counter()
                 with _recorded() as applied:
                     side.turn(commands)
-                    _until(lambda seen=applied: len(seen) >= len(vehicle.cameras), 2)
+                    _until(lambda seen=applied: len(seen) >= len(setup.vehicle.cameras), 2)
                 waits = sorted(1000 * (at - began) for at in applied)
                 last.append(waits[-1])
                 each += waits
                 time.sleep(0.137)
             yield spread(f"{what}: command to encoder", each, "ms")
-            yield spread(f"{what}: command to the last of {len(vehicle.cameras)} encoders", last, "ms")
+            yield spread(f"{what}: command to the last of {len(setup.vehicle.cameras)} encoders", last, "ms")
 
 
 def size_change(source: Sequence[str], rounds: int) -> Iterator[Row]:
     """One camera at 40 Hz: from a new size to its first decoded frame, and the longest gap between frames."""
-    vehicle = _one_camera(source, 40)
+    setup = _one_camera(source, 40)
     sizes = [(960, 520), (480, 260), (240, 130)]
     waits: list[float] = []
-    with _streaming(vehicle) as side, _client(vehicle) as (samples, errors):
+    with _streaming(setup) as side, _client(setup) as (samples, errors):
         _until(lambda: len(samples) > 40)
         start = len(samples)
         for n in range(rounds):
@@ -97,9 +96,9 @@ def size_change(source: Sequence[str], rounds: int) -> Iterator[Row]:
 
 def bitrate_step(source: Sequence[str], fps: int) -> Iterator[Row]:
     """4000 -> 1000 kbit/s, with and without a change of factor: bitrate on the wire, as a multiple of the new one."""
-    vehicle = _one_camera(source, fps)
+    setup = _one_camera(source, fps)
     for what, size in (("same factor", (960, 520)), ("factor 0.5 -> 0.25", (480, 260))):
-        with _streaming(vehicle) as side, _client(vehicle) as (samples, _):
+        with _streaming(setup) as side, _client(setup) as (samples, _):
             side.turn([Command("front_left", "size", (960, 520)), Command("front_left", "bitrate", 4000)])
             time.sleep(5)
             side.turn([Command("front_left", "size", size), Command("front_left", "bitrate", 1000)])
@@ -113,9 +112,9 @@ def bitrate_step(source: Sequence[str], fps: int) -> Iterator[Row]:
 
 def latency(source: Sequence[str], fps: int) -> Iterator[Row]:
     """From the capture of a picture to its decoded frame, by the transport of its packets."""
-    vehicle = _one_camera(source, fps)
+    setup = _one_camera(source, fps)
     for transport in ("udp", "tcp"):
-        with _streaming(vehicle) as side, _client(vehicle, transport) as (samples, _):
+        with _streaming(setup) as side, _client(setup, transport) as (samples, _):
             side.turn([Command("front_left", "size", (960, 520)), Command("front_left", "bitrate", 2000)])
             _until(lambda samples=samples: len(samples) > fps)
             start = len(samples)
@@ -127,20 +126,20 @@ def latency(source: Sequence[str], fps: int) -> Iterator[Row]:
 # --- parts ------------------------------------------------------------------------------------------------------------
 
 
-def _vehicle(overrides: Sequence[str]) -> Vehicle:
-    vehicle = configuration([*overrides, f"media.port={PORT}"], check=check_plan).vehicle()
-    render_missing(vehicle, lambda what, done: print(f"\r{what} {done:4.0%}", end="", file=sys.stderr))
-    return vehicle
+def _setup(overrides: Sequence[str]) -> Setup:
+    setup = configuration([*overrides, f"media.port={PORT}"], check=check_plan).setup()
+    render_missing(setup.vehicle, lambda what, done: print(f"\r{what} {done:4.0%}", end="", file=sys.stderr))
+    return setup
 
 
-def _one_camera(source: Sequence[str], fps: int) -> Vehicle:
-    vehicle = _vehicle([*source, f"fps_max={fps}"])
-    return replace(vehicle, cameras={"front_left": vehicle.cameras["front_left"]})
+def _one_camera(source: Sequence[str], fps: int) -> Setup:
+    setup = _setup([*source, f"fps_max={fps}"])
+    return setup.with_cameras({"front_left": setup.vehicle.cameras["front_left"]})
 
 
 @contextmanager
-def _streaming(vehicle: Vehicle) -> Iterator[VehicleSide]:
-    side = VehicleSide(compile_plans(vehicle), vehicle.media, lambda *_: None)
+def _streaming(setup: Setup) -> Iterator[VehicleSide]:
+    side = VehicleSide(compile_plans(setup), setup.media, lambda *_: None)
     try:
         yield side
     finally:
@@ -154,7 +153,7 @@ def _operator(overrides: Sequence[str]) -> Iterator[None]:
         "import sys, time; from runner.apply import OperatorSide;"
         "from runner.configuration.config import configuration;"
         "from runner.plans import compile_plans;"
-        "side = OperatorSide(compile_plans(configuration(sys.argv[1:]).vehicle()), lambda *_: None); time.sleep(600)"
+        "side = OperatorSide(compile_plans(configuration(sys.argv[1:]).setup()), lambda *_: None); time.sleep(600)"
     )
     command = [sys.executable, "-c", code, *overrides, f"media.port={PORT}"]
     with subprocess.Popen(command) as child:
@@ -165,9 +164,9 @@ def _operator(overrides: Sequence[str]) -> Iterator[None]:
 
 
 @contextmanager
-def _client(vehicle: Vehicle, transport: str = "udp+tcp") -> Iterator[tuple[list[Sample], list[str]]]:
+def _client(setup: Setup, transport: str = "udp+tcp") -> Iterator[tuple[list[Sample], list[str]]]:
     """Decodes the one camera and records each frame; bytes are those of the access unit before it."""
-    (plan,) = compile_plans(vehicle)
+    (plan,) = compile_plans(setup)
     pipeline = Gst.parse_launch(plan.receiver)
     Gst.util_set_object_arg(pipeline.get_by_name(plan.operator[0].name), "protocols", transport)
     samples: list[Sample] = []

@@ -28,10 +28,10 @@ from rig import free_port
 from runner.apply import check_plan
 from runner.configuration.config import configuration
 from runner.core.commands import wanted
-from runner.core.model import Endpoint
 from runner.graph import launch, turn_elements
 from runner.mqtt.broker import private_broker
 from runner.plans import compile_plans
+from runner.settings import Endpoint
 from runner.verbs.print import decide
 
 RUNS = 3
@@ -64,9 +64,9 @@ def _vehicle(words: Sequence[str], runs: int) -> list[Row]:
 
 
 def _elements(words: Sequence[str], runs: int) -> list[Row]:
-    vehicle = configuration(words, check=check_plan).vehicle()
-    plan = compile_plans(vehicle)[0]
-    knobs = wanted(decide(vehicle, None).settings[plan.camera.name])
+    setup = configuration(words, check=check_plan).setup()
+    plan = compile_plans(setup)[0]
+    knobs = wanted(decide(setup.vehicle, None).settings[plan.camera.name])
     elements = turn_elements(plan.camera, (*plan.source, *plan.vehicle), knobs)
     rows, before = [], 0.0
     for count, element in enumerate(elements, start=1):

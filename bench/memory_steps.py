@@ -42,14 +42,14 @@ def vehicle(*words: str) -> None:
     steps.measure("GStreamer and its bindings")
     from runner.configuration.config import configuration
 
-    described = configuration(words, check=check_vehicle).vehicle()
+    described = configuration(words, check=check_vehicle).setup()
     steps.measure("configuration composed, plugins loaded")
     with ExitStack() as stack:
         live = stack.enter_context(live_vehicle(words, say=lambda _: None))
         live.start()
         time.sleep(SETTLE_S)
         steps.measure("server, control loop and link")
-        for name in described.cameras:
+        for name in described.vehicle.cameras:
             stack.enter_context(_viewer(f"rtsp://127.0.0.1:{described.media.port}/{name}"))
             time.sleep(SETTLE_S)
             steps.measure(f"camera {name}, watched")

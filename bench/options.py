@@ -105,8 +105,8 @@ def decoded(clip: Path) -> Iterator[Raw]:
 
 def elements(raw: Raw, words: Sequence[str], scaling: Fraction, roi: Roi | None = None) -> tuple[Element, ...]:
     """What the vehicle runs for a camera of the clip's size, from its gate to its payloader."""
-    vehicle = configuration(("source=test", *words)).vehicle()
-    camera: Camera = replace(vehicle.cameras[CAMERA], width=raw.width, height=raw.height, native=None, crop=None)
+    setup = configuration(("source=test", *words)).setup()
+    camera: Camera = replace(setup.vehicle.cameras[CAMERA], width=raw.width, height=raw.height, native=None, crop=None)
     roi = roi or camera.full_roi
     knobs: dict[str, KnobValue] = {
         "sending": True,
@@ -114,7 +114,7 @@ def elements(raw: Raw, words: Sequence[str], scaling: Fraction, roi: Roi | None 
         "size": output_size(roi, scaling),
         "bitrate": KBPS,
     }
-    return turn_elements(camera, compile_graph(camera, vehicle.media).vehicle, knobs)
+    return turn_elements(camera, compile_graph(camera, setup.media).vehicle, knobs)
 
 
 def spent(raw: Raw, line: str) -> Spent:

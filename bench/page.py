@@ -34,9 +34,9 @@ from usage import processor_s
 
 from rig import CHROMIUM_FLAGS, Operator, answers, free_port, process, repeating, until
 from runner.configuration.config import configuration
-from runner.core.model import Endpoint
 from runner.mqtt.broker import private_broker
 from runner.plans import render_missing
+from runner.settings import Endpoint
 
 STAGES = ("capture -> operator", "operator -> page", "page -> decoded", "decoded -> drawn")
 SETTLE_S = 5

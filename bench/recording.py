@@ -83,7 +83,7 @@ def measure(name: str, encode: str, source: str, raw: Path, frame_bytes: int, *,
 
 def main() -> None:
     candidates = {
-        name: launch(configuration([f"recording={name}"], runnable=False).vehicle().recording.elements)
+        name: launch(configuration([f"recording={name}"], runnable=False).setup().recording.elements)
         for name in ("x264", "ffv1")
     }
     with tempfile.TemporaryDirectory(dir="/dev/shm") as directory:

@@ -18,11 +18,11 @@ from uplinks import row
 from runner.apply import OperatorSide, VehicleSide, check_plan
 from runner.configuration.config import configuration
 from runner.core.commands import Command
-from runner.core.model import Endpoint
 from runner.gst.receiver import Reception
 from runner.link import Limit, limited_link
 from runner.link.limit import OneWay
 from runner.plans import compile_plans
+from runner.settings import Endpoint
 
 CAMERA = "rear"
 KBPS = (3000, 6000, 8000)
@@ -52,7 +52,7 @@ def main() -> None:
 
 def drive(kbps: int, round_trip_ms: int, loss: float, seconds: float) -> tuple[Reception, Reception]:
     """What had been received when the stream had settled, and at the end."""
-    vehicle = configuration(WORDS, check=check_plan).vehicle()
+    setup = configuration(WORDS, check=check_plan).setup()
     delay_ms = round_trip_ms / 2
     limit = Limit(
         lambda _t: WIDE_KBPS,
@@ -62,14 +62,14 @@ def drive(kbps: int, round_trip_ms: int, loss: float, seconds: float) -> tuple[R
         reverse=OneWay(lambda _t: WIDE_KBPS, queue_ms=500, delay_ms=delay_ms),
     )
     with ExitStack() as stack:
-        plans = [plan for plan in compile_plans(vehicle) if plan.camera.name == CAMERA]
-        side = VehicleSide(plans, vehicle.media, lambda *_: None)
+        plans = [plan for plan in compile_plans(setup) if plan.camera.name == CAMERA]
+        side = VehicleSide(plans, setup.media, lambda *_: None)
         stack.callback(side.stop)
         side.turn([Command(CAMERA, knob, value) for knob, value in {"sending": True, "bitrate": kbps}.items()])
         link = stack.enter_context(
-            limited_link("relay", limit, vehicle.media, Endpoint("127.0.0.1", 18883), lambda _sample: None)
+            limited_link("relay", limit, setup.media, Endpoint("127.0.0.1", 18883), lambda _sample: None)
         )
-        reached = configuration([*WORDS, *link.operator_overrides], check=check_plan).vehicle()
+        reached = configuration([*WORDS, *link.operator_overrides], check=check_plan).setup()
         operator = OperatorSide(
             [plan for plan in compile_plans(reached) if plan.camera.name == CAMERA], lambda *_: None
         )

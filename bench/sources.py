@@ -33,8 +33,8 @@ from usage import processor_s
 
 from rig import answers, children_named, free_port, passes, until
 from runner.configuration.config import configuration
-from runner.core.model import Endpoint
 from runner.mqtt.broker import private_broker
+from runner.settings import Endpoint
 
 HERE = Path(__file__).parent
 CAMERA, KBPS = "front_center", 5000

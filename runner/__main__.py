@@ -121,7 +121,7 @@ def _run(words: list[str]) -> int:
     if name.startswith("-"):
         raise unknown_flag(name)
     if name not in VERBS:
-        from runner.core.model import suggest
+        from runner.errors import suggest
 
         raise ArgumentError("", name, f"unknown verb{suggest(name, VERBS, len(VERBS))}")
     verb = VERBS[name]

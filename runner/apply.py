@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Any
 
 from runner.core.commands import Command, KnobValue
 from runner.core.decision import NOTHING
-from runner.core.model import Camera, Media, suggest
-from runner.errors import RunError
+from runner.core.model import Camera
+from runner.errors import RunError, suggest
 from runner.graph import Plan, launch, may_lack_parameter_sets
 from runner.gst import TYPELIBS, GLib, Gst, load_types
 from runner.gst.aside import settle
@@ -50,6 +50,7 @@ from runner.gst.video_files import VideoFile, VideoFiles
 from runner.gst.watched import WatchedSource
 from runner.inputs import input_problem
 from runner.records import Arrivals, CameraReading, SentFrame
+from runner.settings import Media
 
 if TYPE_CHECKING:
     from runner.gst.lanes import Encoded, OnDecoded, OnFrame

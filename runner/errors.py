@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copyreg import __newobj__  # type: ignore[attr-defined]
 from dataclasses import dataclass
+from difflib import get_close_matches
 from typing import Any
 
 from runner.redact import printable
@@ -80,6 +81,19 @@ def os_errors_as(reported: Callable[[str], BaseException]) -> Iterator[None]:
         yield
     except OSError as error:
         raise reported(reason(error)) from None
+
+
+def suggest(word: str, known: Iterable[str], most: int = 13) -> str:
+    """Suffix for a message about an unknown word: the closest known word, otherwise a list of known words.
+
+    most  words to list
+    """
+    known = list(known)
+    near = get_close_matches(word, known, 1)
+    shown = [*known[:most], "..."] if len(known) > most else known
+    if near:
+        return f", did you mean {near[0]}?"
+    return f"; expected {'one of ' if len(shown) > 1 else ''}{', '.join(shown)}" if shown else ""
 
 
 class MissingBindings(ImportError):

@@ -10,29 +10,11 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 
 from runner.core.commands import KnobValue
-from runner.core.model import (
-    PLACEHOLDER,
-    BagTopic,
-    Camera,
-    Capture,
-    Element,
-    Endpoint,
-    Graph,
-    Media,
-    ModelError,
-    Recording,
-    Roi,
-    Source,
-    Value,
-    suggest,
-)
+from runner.core.model import PLACEHOLDER, BagTopic, Camera, Capture, Element, Graph, ModelError, Roi, Source, Value
+from runner.errors import suggest
+from runner.settings import Endpoint, Media, Recording
 
 _PLAIN_VALUE = re.compile(r"[\w./:,+=@%-]+")
-# Settings of a graph that depend on the frame rate: by key, the placeholder that they fill and its computation.
-_PER_FRAME_RATE: dict[str, tuple[str, Callable[[float, float], float]]] = {
-    "key_interval_s": ("key_interval_frames", lambda seconds, fps: seconds * fps),
-    "vbv_frames": ("vbv_ms", lambda frames, fps: 1000 * frames / fps),
-}
 # Without colorimetry, decoders derive it from the picture size: colours would change when a picture is scaled.
 COLORIMETRY = "colorimetry=bt709"
 _PICTURE = f"pixel-aspect-ratio=1/1,{COLORIMETRY}"
@@ -351,17 +333,17 @@ def _buffer(camera: Camera, kbps: int) -> dict[str, Value]:
 
     At least 1 kbit: x264 rounds down to whole kbit, and treats 0 as unlimited.
     """
-    key = "vbv_frames"
-    if key not in camera.graph.settings:
-        return {}
-    name, ms = _per_frame_rate(camera, key)
-    return {name: max(ms, math.ceil(1000 / kbps))}
+    values = _per_frame_rate(camera)
+    return {"vbv_ms": max(values["vbv_ms"], math.ceil(1000 / kbps))} if "vbv_ms" in values else {}
 
 
-def _per_frame_rate(camera: Camera, key: str) -> tuple[str, int]:
-    """The placeholder that a setting fills at the camera's frame rate, and its value."""
-    name, amount = _PER_FRAME_RATE[key]
-    return name, max(1, round(amount(float(camera.graph.settings[key]), float(camera.fps))))
+def _per_frame_rate(camera: Camera) -> dict[str, int]:
+    """The placeholders that settings of the graph fill at the camera's frame rate."""
+    settings, fps = camera.graph.settings, float(camera.fps)
+    seconds, frames = settings.key_interval_s, settings.vbv_frames
+    values = {} if seconds is None else {"key_interval_frames": seconds * fps}
+    values |= {} if frames is None else {"vbv_ms": 1000 * frames / fps}
+    return {name: max(1, round(value)) for name, value in values.items()}
 
 
 def _check_names(graph: Graph, source: Source, recorder: Iterable[Element]) -> None:
@@ -381,7 +363,7 @@ def _check_names(graph: Graph, source: Source, recorder: Iterable[Element]) -> N
 
 
 def _check_packets(graph: Graph) -> None:
-    size = int(graph.settings.get("mtu_bytes", 0))
+    size = graph.settings.mtu_bytes
     uris = (str(e.properties.get("uri")) for e in graph.vehicle if e.factory == "srtsink")
     if size > SRT_MOST_BYTES and any("payloadsize=" not in uri for uri in uris):
         rule = f"must be at most {SRT_MOST_BYTES} with srtsink, which cuts longer packets"
@@ -392,10 +374,11 @@ def _values(camera: Camera, media: Media, index: int, clip: str | None) -> dict[
     """The values of the placeholders of a camera's source and graph; None: the property keeps its default."""
     width, height = camera.source_size
     rate = f"{camera.fps.numerator}/{camera.fps.denominator}"
-    port = int(camera.graph.settings["first_port"]) + index
+    settings = camera.graph.settings
+    port = settings.first_port + index
     values: dict[str, Value | None] = {
         **camera.source.settings,
-        **camera.graph.settings,
+        **camera.graph.placeholders,
         **camera.mount,
         "camera": camera.name,
         "width": width,
@@ -405,14 +388,12 @@ def _values(camera: Camera, media: Media, index: int, clip: str | None) -> dict[
         "capture_caps": _capture_caps(camera.capture),
         "controls": _controls(camera.capture),
         "host": media.host,
-        "url": rtsp_url(media, camera.name, feedback=bool(camera.graph.settings.get("retransmission_ms"))),
+        "url": rtsp_url(media, camera.name, feedback=bool(settings.retransmission_ms)),
         "port": port,
         "endpoint": str(Endpoint(media.host, port)),
+        "iptos": 4 * settings.dscp if settings.dscp >= 0 else -1,  # the byte of the IP header
+        **_per_frame_rate(camera),
     }
-    if "dscp" in camera.graph.settings:
-        dscp = int(camera.graph.settings["dscp"])
-        values["iptos"] = 4 * dscp if dscp >= 0 else -1  # the byte of the IP header whose upper six bits it is
-    values |= dict(_per_frame_rate(camera, key) for key in _PER_FRAME_RATE if key in camera.graph.settings)
     return values if clip is None else values | {"clip": clip}
 
 

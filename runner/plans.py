@@ -12,24 +12,25 @@ from runner.clips import View, cache_directory, rendered, view
 from runner.core.model import Camera, Progress, Vehicle
 from runner.errors import RunError
 from runner.graph import Plan, compile_graph
+from runner.settings import Setup
 
 
-def compile_plans(vehicle: Vehicle) -> list[Plan]:
+def compile_plans(setup: Setup) -> list[Plan]:
     """A plan for each camera, with its rendered clip if there is one."""
     return [
-        compile_graph(camera, vehicle.media, index, clip=rendered(camera), recording=vehicle.recording)
-        for index, camera in enumerate(vehicle.cameras.values())
+        compile_graph(camera, setup.media, index, clip=rendered(camera), recording=setup.recording)
+        for index, camera in enumerate(setup.vehicle.cameras.values())
     ]
 
 
-def as_offered(vehicle: Vehicle, report: Callable[[str], None]) -> Vehicle:
-    """The vehicle with the rates that its V4L2 devices state: 29.97 Hz stands for 30000/1001. Reports each change."""
-    cameras = dict(vehicle.cameras)
-    for name, camera in vehicle.cameras.items():
+def as_offered(setup: Setup, report: Callable[[str], None]) -> Setup:
+    """The setup with the rates that V4L2 devices state: 29.97 Hz stands for 30000/1001. Reports each change."""
+    cameras = dict(setup.vehicle.cameras)
+    for name, camera in setup.vehicle.cameras.items():
         if (rate := nearest_rate(camera)) and camera.capture.fps:
             report(f"{name}: {camera.device} captures at {rate} Hz, the nearest to {float(camera.capture.fps):g}")
             cameras[name] = replace(camera, capture=replace(camera.capture, fps=rate))
-    return vehicle if cameras == vehicle.cameras else replace(vehicle, cameras=cameras)
+    return setup.with_cameras(cameras)
 
 
 def nearest_rate(camera: Camera) -> Fraction | None:

@@ -15,7 +15,7 @@ from functools import cache
 from itertools import groupby, islice
 from typing import TYPE_CHECKING, Any
 
-from runner.core.model import suggest
+from runner.errors import suggest
 from runner.resources import directory
 
 if TYPE_CHECKING:

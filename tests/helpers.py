@@ -22,13 +22,18 @@ from runner.core.events import parse
 from runner.core.model import Vehicle
 from runner.core.step import Run, start, step
 from runner.resources import directory
+from runner.settings import Setup
 
 CONF = directory("conf")
 
 
 @cache
+def setup(*overrides: str) -> Setup:
+    return configuration(["source=test", *overrides]).setup()
+
+
 def vehicle(*overrides: str) -> Vehicle:
-    return configuration(["source=test", *overrides]).vehicle()
+    return setup(*overrides).vehicle
 
 
 @cache

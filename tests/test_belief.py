@@ -12,14 +12,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from runner.core import belief
-from runner.core.evidence import Evidence, EvidenceMemory, LinkReport, ReceivedUnit, observe, rounded
+from runner.core.events import Evidence
+from runner.core.evidence import EvidenceMemory, LinkReport, ReceivedUnit, observe, rounded
 from runner.core.learned import Learned
 from runner.core.policer import Losses, Policer, police
 from runner.drive.predictions import compared, worth
 from runner.drive.read import read_drive
 from runner.drive.series import series
 from runner.simulation.figures import Figures
-from runner.simulation.runs import Job, Setup, run_job
+from runner.simulation.runs import Common, Job, run_job
 
 KBIT = 8 / 1000
 PATH_S = 0.03
@@ -252,7 +253,7 @@ def constant(tmp_path: Path) -> Path:
 
 
 def drive(link: Path | str, prediction: str, *words: str, seconds: float = 25) -> Figures:
-    return run_job(Setup((*WORDS, *words), None), Job(str(link), 0.0, prediction, 1, seconds)).figures
+    return run_job(Common((*WORDS, *words), None), Job(str(link), 0.0, prediction, 1, seconds)).figures
 
 
 @pytest.mark.slow
@@ -275,7 +276,7 @@ def test_a_wrong_prediction_costs_little_against_none() -> None:
 @pytest.mark.slow
 def test_a_drive_tells_what_its_predictions_were_worth(tmp_path: Path) -> None:
     place = (tmp_path / "drive", 1.77e9)
-    run_job(Setup(WORDS, None), Job("saw", 0.0, "high_50", 1, 30), False, place)
+    run_job(Common(WORDS, None), Job("saw", 0.0, "high_50", 1, 30), False, place)
     done = series(read_drive(place[0]))
     both = compared(done)
     assert both and done.believed

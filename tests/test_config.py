@@ -128,7 +128,7 @@ def test_a_user_can_add_files_of_every_group(conf: UserConf) -> None:
     mine = configuration(["vehicle=mine", "graph=own", "modes=own", "source=own"], conf.path).vehicle()
     assert (mine.name, list(mine.cameras)) == ("mine", ["a"])
     camera = mine.cameras["a"]
-    assert (camera.width, camera.graph.settings["first_port"]) == (640, 7000)
+    assert (camera.width, camera.graph.settings.first_port) == (640, 7000)
     assert camera.source.elements[0].properties == {"pattern": "ball"}
 
 
@@ -203,8 +203,8 @@ def test_a_vehicle_builds_on_another(conf: UserConf) -> None:
         "# @package _global_\ndefaults:\n  - tum_q7\n  - override /cameras@cameras.rear_center: top_view\n  - _self_\n"
         "name: mine\ncameras: {front_left: {weight: 3}}\nlatency: {fixed_ms: 60}\n",
     )
-    mine = configuration(["source=test", "vehicle=mine"], conf.path).vehicle()
-    cameras = mine.cameras
+    mine = configuration(["source=test", "vehicle=mine"], conf.path).setup()
+    cameras = mine.vehicle.cameras
     assert (len(cameras), cameras["front_left"].weight, cameras["rear_center"].width) == (8, 3, 1280)
     assert (mine.latency.fixed_ms, mine.latency.limit_ms) == (60, 200)
 

@@ -8,11 +8,12 @@ from fractions import Fraction
 from typing import Any
 
 import pytest
-from helpers import CONF, vehicle
+from helpers import CONF, setup, vehicle
 
 from runner.core.commands import KnobValue
-from runner.core.model import Camera, Element, Graph, KnobTarget, Media, ModelError, Roi, Source
+from runner.core.model import Camera, Element, Graph, GraphSettings, KnobTarget, ModelError, Roi, Source
 from runner.graph import Plan, assignments, compile_graph, launch, rtsp_url, shell, text
+from runner.settings import Media
 
 MEDIA = Media("127.0.0.1", 8554, rtp_ports=(20000, 20999), session_timeout_s=10, max_viewers=1)
 LEFT = vehicle("modes=paper").cameras["front_left"]
@@ -90,7 +91,7 @@ def test_the_printed_lines_of_front_left() -> None:
 
 
 def test_the_recording_of_front_left() -> None:
-    recording = vehicle("modes=paper").recording
+    recording = setup("modes=paper").recording
     assert compile_graph(LEFT, MEDIA, recording=recording).recording("/tmp/my rec/.front_left.mkv.part") == (
         f"{SOURCE} ! queue name=waiting leaky=upstream max-size-bytes=128000000 max-size-buffers=0 max-size-time=0 ! "
         "identity name=recorded single-segment=true ! "
@@ -103,7 +104,7 @@ def test_the_recording_of_front_left() -> None:
 def test_every_graph_ends_in_a_sink_and_begins_with_the_source_for_it(name: str) -> None:
     camera = vehicle(f"graph={name}").cameras["front_right"]
     compiled = plan(camera, index=2)
-    port = str(camera.graph.settings["first_port"] + 2)  # type: ignore[operator]
+    port = str(camera.graph.settings.first_port + 2)
     sink, source = compiled.vehicle_line(KNOBS).split(" ! ")[-1], compiled.operator_line().split(" ! ")[0]
     assert (sink.split()[0], source.split()[0]) in {("udpsink", "udpsrc"), ("srtsink", "srtsrc")}
     assert port in sink and port in source
@@ -158,7 +159,7 @@ def test_encoders_that_count_in_bits() -> None:
 
 def graph(**properties: Any) -> Graph:
     element = Element("pay0", "rtph264pay", properties)
-    return Graph("rtsp", (element,), (Element("sink", "fakesink", {}),), (), (), {}, {"mtu": 1200, "first_port": 5600})
+    return Graph("rtsp", (element,), (Element("sink", "fakesink", {}),), (), (), {}, GraphSettings(5600), {"mtu": 1200})
 
 
 def test_a_whole_placeholder_keeps_its_type_and_a_part_becomes_text() -> None:
@@ -181,7 +182,7 @@ def test_a_source_may_not_use_the_name_of_an_element_of_the_graph() -> None:
 
 def test_settings_that_depend_on_the_frame_rate() -> None:
     own = graph(interval="{key_interval_frames}", vbv="{vbv_ms}")
-    settings = {**own.settings, "key_interval_s": 1.5, "vbv_frames": 2.1}
+    settings = GraphSettings(5600, key_interval_s=1.5, vbv_frames=2.1)
     slow = plan(fps=Fraction(30000, 1001), graph=replace(own, settings=settings))
     assert slow.vehicle[0].properties == {"interval": 45, "vbv": 70}
     assert "framerate=30000/1001" in slow.pipeline

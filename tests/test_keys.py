@@ -229,14 +229,14 @@ def test_each_revocation_list_is_later_than_the_one_before(authority):
 
 def test_a_network_that_needs_no_keys():
     robot, private, insecure = (
-        configuration(["vehicle=delivery_robot", "control.host=10.9.0.1", *words]).vehicle()
+        configuration(["vehicle=delivery_robot", "control.host=10.9.0.1", *words]).setup()
         for words in ([], ["insecure=10.9.0.0/24"], ["insecure=true"])
     )
 
-    def needs(vehicle, host):
+    def needs(setup, host):
         """Whether keys are needed."""
         try:
-            return keyring_of(replace(vehicle, media=replace(vehicle.media, host=host))) is not None
+            return keyring_of(replace(setup, media=replace(setup.media, host=host))) is not None
         except UserError:
             return True
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from runner.core.model import LatencyLimit
+from runner.settings import LatencyLimit
 
 
 @pytest.mark.parametrize(

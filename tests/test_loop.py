@@ -49,14 +49,14 @@ class Watched:
 
     def __init__(self, *words: str, access: Access | None = None) -> None:
         config = configuration(["vehicle=delivery_robot", "pqos=constant", *words], runnable=False)
-        vehicle, (pqos, track) = config.vehicle(), config.pqos()
-        self.side = RecordingVehicle(compile_plans(vehicle))
+        setup, (pqos, track) = config.setup(), config.pqos()
+        self.side = RecordingVehicle(compile_plans(setup))
         self.published: list[Any] = []
         self.reports: list[str] = []
         self.publishes: Callable[[Any], bool] = lambda record: True
         log = Log(None, "vehicle", {}, {}, self.reports.append)
         report = self.reports.append
-        self.loop = ControlLoop(vehicle, self.side, pqos, track, log, self._publish, report, access or Access())
+        self.loop = ControlLoop(setup, self.side, pqos, track, log, self._publish, report, access or Access())
 
     def _publish(self, record: Any) -> bool:
         accepted = self.publishes(record)

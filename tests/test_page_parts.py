@@ -18,7 +18,7 @@ from types import SimpleNamespace
 from urllib.parse import urlencode
 
 import pytest
-from helpers import vehicle
+from helpers import setup
 
 from rig import free_port
 from runner.errors import RunError
@@ -72,7 +72,7 @@ def served(*overrides, layouts=None, login=None, keyring=None, note=print):
     """
     port = free_port()
     station = SimpleNamespace(state=None, note=note, user="anna", answer_s=1.0, attention=None, link_state=LinkState())
-    page = PageServer(vehicle(f"page.port={port}", *overrides), station, layouts=layouts, keyring=keyring)
+    page = PageServer(setup(f"page.port={port}", *overrides), station, layouts=layouts, keyring=keyring)
     page._login = login or page._login
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("runner.page.server.UNRESPONSIVE_S", 60)

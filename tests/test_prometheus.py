@@ -18,11 +18,12 @@ import yaml
 
 from rig import CHECKOUT, free_port
 from runner.core.decision import Believed
-from runner.core.model import Endpoint, Mode
+from runner.core.model import Mode
 from runner.errors import RunError
 from runner.metrics.side import metrics_of
 from runner.mqtt.link import ControlLink
 from runner.records import CameraTelemetry, Telemetry, VehicleState
+from runner.settings import Endpoint
 
 pytest.importorskip("prometheus_client")
 

@@ -12,8 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from runner.core.budget import on_the_wire, video_kbps, wire_kbps
-from runner.core.events import LinkMeasured
-from runner.core.evidence import LinkState
+from runner.core.events import LinkMeasured, LinkState
 from runner.mqtt.messages import MqttMessage, read_reception, topic
 from runner.records import ReceptionReport, ReceptionReported, UnitReceived, line_from_json, line_to_json, to_json
 from runner.schema import MAX_ERRORS

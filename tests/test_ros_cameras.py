@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from runner.configuration.config import configuration
-from runner.core.model import RosSettings
 from runner.errors import ConfigError, UserError
 from runner.ros.cameras import CameraStream
 from runner.ros.inputs import check_names
 from runner.ros.node import pictures, ros1
 from runner.ros.process import NodeProcess, check_discovery
+from runner.settings import RosSettings
 from runner.system.clocks import SECOND_NS
 
 WORDS = ["vehicle=delivery_robot", "source=ros", "fps_max=10"]
@@ -188,8 +188,8 @@ def test_a_master_of_another_machine_needs_insecure(monkeypatch, uri, rule):
 
 def test_version_1_refuses_all_keys_of_ros_2_together():
     words = ["ros.qos={/front: {depth: 1}}", "ros.discovery=subnet", "ros.use_sim_time=true"]
-    assert configuration([*WORDS, *TOPICS, *words]).vehicle().ros.interpreter == ".venv-ros2/bin/python"
-    assert configuration([*WORDS, *TOPICS, "ros.version=1"]).vehicle().ros.interpreter == "/usr/bin/python3"
+    assert configuration([*WORDS, *TOPICS, *words]).setup().ros.interpreter == ".venv-ros2/bin/python"
+    assert configuration([*WORDS, *TOPICS, "ros.version=1"]).setup().ros.interpreter == "/usr/bin/python3"
     with pytest.raises(ConfigError) as failed:
         configuration([*WORDS, *TOPICS, *words, "ros.version=1"]).vehicle()
     assert str(failed.value).splitlines() == [
@@ -252,7 +252,7 @@ def test_pictures_that_the_middleware_does_not_number_are_lost_as_far_as_it_know
 def test_a_node_is_started_again_after_any_error(monkeypatch):
     monkeypatch.setattr("runner.ros.process.RETRY_S", (0.0, 0.0))
     reports, again = [], threading.Event()
-    node = NodeProcess(configuration([*WORDS, *TOPICS]).vehicle().ros, print, lambda _, text: reports.append(text))
+    node = NodeProcess(configuration([*WORDS, *TOPICS]).setup().ros, print, lambda _, text: reports.append(text))
 
     def run_once():
         if not reports:

@@ -38,9 +38,9 @@ def test_command_lines_of_launch_files_are_valid(file):
     for _, verb, *words in started:
         assert verb in VERBS
         topics = [f"cameras.{name}.topic=/{name}" for name in ("front", "rear", "mast")]
-        vehicle = configuration([*words, *topics], runnable=False).vehicle()
-        names.add((vehicle.ros.node, vehicle.ros.pictures))
-        assert vehicle.ros.python == "python3"
+        ros = configuration([*words, *topics], runnable=False).setup().ros
+        names.add((ros.node, ros.pictures))
+        assert ros.python == "python3"
     assert len(names) == 2  # nodes of different names
 
 

@@ -11,8 +11,7 @@ from helpers import vehicle
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runner.core.events import LinkMeasured
-from runner.core.evidence import LinkState
+from runner.core.events import LinkMeasured, LinkState
 from runner.records import ReceptionReport, ReceptionReported, SentFrame, UnitReceived
 from runner.vehicle.sending import BUSY_S, KEPT_S, ON_ITS_WAY_S, SendingTimes
 from runner.vehicle.uplink import MeasuredUplink

@@ -28,10 +28,10 @@ from runner.simulation.families import FAMILIES, LEFT_OUT, generate
 from runner.simulation.figures import cuts, percentile
 from runner.simulation.predictions import prediction
 from runner.simulation.queues import CreditQueue, OpportunityQueue, RateQueue
-from runner.simulation.runs import Job, Setup, jobs, run_job
+from runner.simulation.runs import Common, Job, jobs, run_job
 from runner.simulation.steps import Steps
 
-SHORT = Setup(("vehicle=delivery_robot", "fps_max=15"), None)
+SHORT = Common(("vehicle=delivery_robot", "fps_max=15"), None)
 
 
 @pytest.mark.parametrize("lowest, queue_ms, dropped", [(100, 60_000, 0), (0, 200, 283)])
@@ -75,7 +75,7 @@ def test_a_scheduler_serves_saved_credit_faster_and_grants_late() -> None:
 
 def test_competing_flows_fill_the_link() -> None:
     """Alone; with the cameras they get what those leave."""
-    flows = Setup((*SHORT.overrides, "link=netns", "link.share=1", "link.tcp={flows: 1}"), None)
+    flows = Common((*SHORT.overrides, "link=netns", "link.share=1", "link.tcp={flows: 1}"), None)
     shared = run_job(flows, Job("step", 0.0, "right", 1, 9.9)).figures  # at 4000 kbit/s
     assert 0.9 < shared["use"] + shared["tcp"] / 4000 < 1.05
     assert shared["tcp"] > 300
@@ -86,7 +86,7 @@ def test_losses_are_repaired_within_a_round_trip_and_shown_where_they_are_not() 
     back = "link.reverse={kbps: 5000, queue_ms: 200, delay_ms: 15}"
     job = Job("step", 0.0, "right", 1, 12.0)
     repaired, never = (
-        run_job(Setup((*lossy, "link.delay_ms=15", back, f"graph.retransmission_ms={ms}"), None), job).figures
+        run_job(Common((*lossy, "link.delay_ms=15", back, f"graph.retransmission_ms={ms}"), None), job).figures
         for ms in (500, 0)
     )
     assert repaired["lost"] > 50 and never["lost"] > 50

@@ -46,8 +46,8 @@ DEVICES = [f"cameras.{name}.device=/dev/video{n}" for n, name in enumerate(("fro
 
 
 def plans(*overrides: str) -> dict[str, Plan]:
-    vehicle = configuration(["vehicle=delivery_robot", "source=v4l2", *DEVICES, *overrides]).vehicle()
-    return {plan.camera.name: plan for plan in compile_plans(vehicle)}
+    setup = configuration(["vehicle=delivery_robot", "source=v4l2", *DEVICES, *overrides]).setup()
+    return {plan.camera.name: plan for plan in compile_plans(setup)}
 
 
 def asked(plan: Plan) -> tuple[object, object]:

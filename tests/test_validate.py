@@ -258,7 +258,7 @@ def test_elements_of_the_packaged_graphs_have_a_package() -> None:
     from runner.gst import Gst, registry
 
     for graph in (file.stem for file in (CONF / "graph").glob("*.yaml")):
-        for plan in compile_plans(configuration([f"graph={graph}", "source=test"]).vehicle()):
+        for plan in compile_plans(configuration([f"graph={graph}", "source=test"]).setup()):
             for element in (*plan.vehicle, *plan.operator):
                 found = Gst.ElementFactory.find(element.factory)
                 is_core = found is not None and found.get_plugin_name() == "coreelements"

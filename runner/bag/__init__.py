@@ -16,8 +16,8 @@ from runner.bag.files import METADATA, SUFFIXES, BagFiles, is_named_like_a_bag
 from runner.bag.messages import Decoder, decoder
 from runner.bag.pictures import BadPicture, Picture, read_compressed, read_image, stamp_ns
 from runner.bag.storage import Channel, UnreadableError
-from runner.core.model import DEPTH_M, ModelError, suggest
-from runner.errors import reason
+from runner.core.model import DEPTH_M, ModelError
+from runner.errors import reason, suggest
 from runner.system.clocks import SECOND_NS
 
 if TYPE_CHECKING:

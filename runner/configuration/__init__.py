@@ -1,1 +1,1 @@
-"""From YAML files and overrides to a checked `Vehicle`."""
+"""From YAML files and overrides to a checked `Setup`."""

@@ -1,11 +1,11 @@
-"""Builds a `Vehicle` from plain data: builds the parts that the schemas accept, and collects all problems."""
+"""Builds a `Setup` from plain data: builds the parts that the schemas accept, and collects all problems."""
 
 from __future__ import annotations
 
 import re
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from fractions import Fraction
 from functools import cached_property
 from ipaddress import IPv4Network, IPv6Network, ip_network
@@ -20,37 +20,39 @@ from runner.core.commands import KnobValue
 from runner.core.model import (
     Camera,
     Capture,
-    Dimensions,
     Element,
-    Endpoint,
     Graph,
-    Inputs,
+    GraphSettings,
     KnobTarget,
-    LatencyLimit,
-    Media,
-    MetricsPorts,
     Mode,
     ModelError,
-    PageSettings,
     Place,
     Pose,
     RateQualityModel,
-    Recording,
     Roi,
-    RosPrediction,
-    RosQos,
-    RosSettings,
     Source,
-    Value,
     Vehicle,
     exact,
     overlapping,
-    suggest,
 )
 from runner.core.rules import RuleCall
-from runner.errors import ConfigError, Problem
+from runner.errors import ConfigError, Problem, suggest
 from runner.graph import Plan, assignments, check_video, compile_graph
 from runner.redact import has_password, redacted
+from runner.settings import (
+    Dimensions,
+    Endpoint,
+    Inputs,
+    LatencyLimit,
+    Media,
+    MetricsPorts,
+    PageSettings,
+    Recording,
+    RosPrediction,
+    RosQos,
+    RosSettings,
+    Setup,
+)
 
 if TYPE_CHECKING:
     from runner.configuration.experiment import LinkSettings, TimedRequest
@@ -64,6 +66,7 @@ GRAPH_STRUCTURE = (
     *("defaults", "transport", "verified", "key_frame", "vehicle", "operator", "wire", "knobs", "mutable"),
     *("effort", "efforts"),
 )
+GRAPH_SETTINGS = [part.name for part in fields(GraphSettings)]
 ONLY_EFFORT = "medium"  # of graphs without `efforts`
 
 T = TypeVar("T")
@@ -88,7 +91,7 @@ class Builder:
     bad: set[schema.Path] = field(default_factory=set)
     broken: dict[schema.Path, Problem] = field(default_factory=dict)  # broken rules of the model, by path
     built: set[str] = field(default_factory=set)  # names of the cameras
-    vehicle: Vehicle | None = None
+    setup: Setup | None = None
     others: dict[int, Builder | None] = field(default_factory=dict)  # builders without one part, by its id
 
     @classmethod
@@ -101,13 +104,13 @@ class Builder:
         check: PlanCheck | None,
         fits: Collection[str],
     ) -> Builder:
-        """The builder of a configuration, with its vehicle built."""
+        """The builder of a configuration, with its vehicle and settings built."""
         builder = cls(composed, runnable, files, bags, check, fits)
-        builder.vehicle = builder._vehicle()
+        builder.setup = builder._setup()
         builder._attribute_problems()
         return builder
 
-    def _vehicle(self) -> Vehicle | None:
+    def _setup(self) -> Setup | None:
         document = self.composed.document
         unknown = {key: value for key, value in document.items() if key not in self.fits}
         found = schema.findings(unknown, "composed")
@@ -152,16 +155,12 @@ class Builder:
                 self._check_files(camera)
         if self.problems or recording is None:
             return None
-        return Vehicle(
-            name=document["name"],
-            cameras=built,
-            mode=Mode(document["mode"]),
-            modes=modes,
+        return Setup(
+            Vehicle(document["name"], built, Mode(document["mode"]), modes),
             media=media,
             control=control,
             page=page,
             latency=LatencyLimit(**document.get("latency", {})),  # older drives lack it
-            pqos=document["pqos"],
             recording=recording,
             log_video=document["log"]["video"],
             expires_s=float(document["control"]["expires_s"]),
@@ -238,7 +237,7 @@ class Builder:
             composed = without(self.composed, part) if self._is_determined else None
             other = Builder(composed, self.runnable, self.files, self.bags, self.check) if composed else None
             if other:
-                other._vehicle()
+                other._setup()
             self.others[id(part)] = other
         return self.others[id(part)]
 
@@ -301,7 +300,7 @@ class Builder:
 
     def check_link(self, link: LinkSettings) -> None:
         """Check that all cameras can use a limited link, and that its kind supports the settings."""
-        cameras = tuple(self.vehicle.cameras.values()) if self.vehicle else ()
+        cameras = tuple(self.setup.vehicle.cameras.values()) if self.setup else ()
         dialling = [camera.name for camera in cameras if camera.graph.transport != "rtsp"]
         if dialling and link.kind == "relay":
             rule = f"supports RTSP only; the graph of {dialling[0]} has its own transport; choose link=netns"
@@ -386,7 +385,7 @@ class Builder:
                 self._report((), ModelError(path, str(port), f"is already the port of {taken[port]}"))
             taken[port] = path
         for index, (name, camera) in enumerate(cameras.items()):
-            port = int(camera.graph.settings["first_port"]) + index
+            port = camera.graph.settings.first_port + index
             if port in taken:
                 own = ("cameras", name) if "graph" in self.composed.document["cameras"][name] else ()
                 rule = f"camera {name} would get port {port}, already the port of {taken[port]}"
@@ -479,7 +478,7 @@ def _graph(data: Mapping[str, Any]) -> Graph:
         if key in data:
             raise ModelError(key, None, f"is unused; include it in {side} as ${{..{key}}}")
     wire = data.get("wire") or {}
-    settings: dict[str, Value] = {key: value for key, value in data.items() if key not in GRAPH_STRUCTURE}
+    named = {key: value for key, value in data.items() if key not in GRAPH_STRUCTURE} | _effort(data)
     return Graph(
         transport=data["transport"],
         vehicle=_elements(data["vehicle"]),
@@ -487,7 +486,8 @@ def _graph(data: Mapping[str, Any]) -> Graph:
         wire_vehicle=_elements(wire.get("vehicle")),
         wire_operator=_elements(wire.get("operator")),
         knobs={knob: tuple(KnobTarget(**target) for target in targets) for knob, targets in data["knobs"].items()},
-        settings=settings | _effort(data),
+        settings=GraphSettings(**_given(named, GRAPH_SETTINGS)),
+        placeholders=named,
         mutable=tuple((entry["element"], entry["property"]) for entry in data.get("mutable") or ()),
         **_given(data, ("verified", "key_frame")),
     )

@@ -15,8 +15,8 @@ from runner.configuration.overrides import Override, choice_problems, parse_over
 from runner.configuration.replaced_rules import with_successors
 from runner.configuration.resolve import resolved
 from runner.configuration.yaml_file import label, load_file, read
-from runner.core.model import Mode, suggest
-from runner.errors import COMMAND_LINE, ConfigError, Problem
+from runner.core.model import Mode
+from runner.errors import COMMAND_LINE, ConfigError, Problem, suggest
 from runner.resources import directory
 
 if TYPE_CHECKING:

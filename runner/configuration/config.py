@@ -10,15 +10,16 @@ from typing import TYPE_CHECKING, Any
 from runner.configuration.build import Builder, PlanCheck
 from runner.configuration.compose import compose, recompose
 from runner.configuration.files import conf_directories
-from runner.core.model import Vehicle
 from runner.errors import ArgumentError
 
 if TYPE_CHECKING:
     from runner.configuration.experiment import Experiment, LinkSettings, RateAtTime
     from runner.configuration.origin import Composed
+    from runner.core.model import Vehicle
     from runner.pqos import Pqos
     from runner.pqos.track import Track
     from runner.rate_quality.study import Study
+    from runner.settings import Setup
 
 CONF = "conf="
 Base = tuple[dict[str, Any], str]  # a configuration composed before, and its location
@@ -35,8 +36,8 @@ class Configuration:
     check     further check of a compiled plan, against the GStreamer registry
     fits      sections already known to satisfy the schemas
 
-    `vehicle()`, `pqos()`, `study()` and `experiment()` raise ConfigError with all problems of the vehicle and of the
-    parts requested so far.
+    `setup()`, `pqos()`, `study()` and `experiment()` raise ConfigError with all problems of the vehicle, its settings
+    and the parts requested so far.
     """
 
     def __init__(
@@ -70,8 +71,11 @@ class Configuration:
 
         return listing(self._composed)
 
+    def setup(self) -> Setup:
+        return self._builder.checked(self._builder.setup)
+
     def vehicle(self) -> Vehicle:
-        return self._builder.checked(self._builder.vehicle)
+        return self.setup().vehicle
 
     def pqos(self) -> tuple[Pqos, Track | None]:
         """The source of predictions, and the drive that gives positions if no GPS does."""

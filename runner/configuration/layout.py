@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 from runner import schema
 from runner.configuration.files import LAYOUT
 from runner.configuration.yaml_file import label, load_file
-from runner.core.model import Place, Vehicle, overlapping, suggest
-from runner.errors import ConfigError, Problem, UserError, os_errors_as
+from runner.core.model import Place, Vehicle, overlapping
+from runner.errors import ConfigError, Problem, UserError, os_errors_as, suggest
 
 WITHOUT_KEYS = "operator"  # name of an operator without keys
 MAX_NAMED = 5  # unknown cameras in an answer

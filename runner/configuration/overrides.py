@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 from runner import schema
 from runner.configuration.files import GROUPS, options
 from runner.configuration.yaml_file import label
-from runner.core.model import suggest
-from runner.errors import COMMAND_LINE, ConfigError, Problem
+from runner.errors import COMMAND_LINE, ConfigError, Problem, suggest
 
 if TYPE_CHECKING:
     from hydra.core.override_parser.overrides_parser import OverridesParser

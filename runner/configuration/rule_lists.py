@@ -12,8 +12,9 @@ from enum import StrEnum
 from typing import Any
 
 from runner.configuration.replaced_rules import REPLACED, SUCCESSOR
-from runner.core.model import Mode, ModelError, exact, suggest
+from runner.core.model import Mode, ModelError, exact
 from runner.core.rules import GIVEN, Rule, RuleCall, registry
+from runner.errors import suggest
 
 RULE = "rule"  # key of an entry: the rule that it runs, where it has a name of its own
 OWN_RULES = "; one of your own needs the entry point tod_runner.rules, see docs/rules.md"

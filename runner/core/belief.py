@@ -15,7 +15,8 @@ from statistics import median
 from typing import NamedTuple
 
 from runner.core import history
-from runner.core.evidence import JITTER_S, REPORT_S, Evidence
+from runner.core.events import Evidence
+from runner.core.evidence import JITTER_S, REPORT_S
 from runner.core.history import History, recorded, value_at
 from runner.core.learned import HORIZON_S, MEMORY_S, WRONG, Learned
 from runner.core.policer import Losses, Policer, police

@@ -8,13 +8,12 @@ from functools import lru_cache
 
 from runner.core.model import Camera, Graph, Kbps
 
-MTU_BYTES, HEADER_BYTES = 1200, 58  # of a graph that does not state its own
 INSIDE_MTU = 14  # RTP header (RFC 3550) and fragmentation header (RFC 6184, FU-A), which count as part of the MTU
 
 
 def on_the_wire(graph: Graph, size: int) -> int:
     """Bytes on the wire, headers included, of an access unit of `size` bytes."""
-    return size + -(-size // payload_bytes(graph)) * header_bytes(graph)
+    return size + -(-size // payload_bytes(graph)) * graph.settings.header_bytes
 
 
 def wire_kbps(cameras: Iterable[Camera], video: Kbps) -> Kbps:
@@ -35,16 +34,11 @@ def video_kbps(cameras: Iterable[Camera], wire: Kbps) -> Kbps:
 @lru_cache(maxsize=64)  # for a few sets of cameras that are on
 def _overhead(cameras: tuple[Camera, ...]) -> tuple[Kbps, Fraction]:
     """kbit/s of one more packet per access unit, and bytes on the wire per byte of full packets."""
-    fixed = sum((header_bytes(camera.graph) * 8 * camera.fps / 1000 for camera in cameras), Fraction(0))
-    factors = [1 + Fraction(header_bytes(camera.graph), payload_bytes(camera.graph)) for camera in cameras]
+    fixed = sum((camera.graph.settings.header_bytes * 8 * camera.fps / 1000 for camera in cameras), Fraction(0))
+    factors = [1 + Fraction(camera.graph.settings.header_bytes, payload_bytes(camera.graph)) for camera in cameras]
     return fixed, max(factors, default=Fraction(1))
 
 
 def payload_bytes(graph: Graph) -> int:
     """Of video in a full packet."""
-    return max(1, int(graph.settings.get("mtu_bytes", MTU_BYTES)) - INSIDE_MTU)
-
-
-def header_bytes(graph: Graph) -> int:
-    """Of a packet on the wire, below the payload of the video."""
-    return int(graph.settings.get("header_bytes", HEADER_BYTES))
+    return max(1, graph.settings.mtu_bytes - INSIDE_MTU)

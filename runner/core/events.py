@@ -9,9 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from enum import StrEnum
 from fractions import Fraction
-from typing import Any
+from typing import Any, NamedTuple
 
-from runner.core.evidence import Evidence, LinkState
 from runner.core.model import Kbps, Mode, Roi, exact, plain
 
 
@@ -92,6 +91,55 @@ class CameraConfigured(_Event):
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WeightsSet(_Event):
     weights: Mapping[str, Fraction]
+
+
+class LinkState(StrEnum):
+    """State of the queue in front of the link."""
+
+    CLEAR = "clear"
+    FILLING = "filling"
+    DRAINING = "draining"
+    STALLED = "stalled"
+
+
+class Evidence(NamedTuple):
+    """What one report tells of the uplink's capacity, see `runner.core.evidence`.
+
+    busy_kbit, busy_s         carried while the link was known to be busy, and the time this took
+    train_kbit, train_s       the same for the packet trains of frames that found it busy
+    trains                    their number
+    idle_kbit, idle_s, idle   the same for trains of frames that met no queue: an idle link may pass the first packets
+                              of each at once
+    unqueued                  number of frames that met no queue
+    kbit      all that arrived since the previous report
+    wait_s    the standing queue: the shortest wait in the last frame interval
+    longest_s the longest wait in it
+    shorter_s by which the path of a camera proved shorter than known: what was first measured held a queue
+    growth    by which waits grew, s per s
+    lost_kbit lost since the previous report
+    age_s     from the middle of these services to the report
+    silent_s  without arrivals beyond `evidence.GAP_S`, although something is on its way
+    backlog   the newest frame was sent before a stall had ended
+    """
+
+    busy_kbit: float = 0.0
+    busy_s: float = 0.0
+    train_kbit: float = 0.0
+    train_s: float = 0.0
+    trains: int = 0
+    idle_kbit: float = 0.0
+    idle_s: float = 0.0
+    idle: int = 0
+    unqueued: int = 0
+    kbit: float = 0.0
+    wait_s: float = 0.0
+    longest_s: float = 0.0
+    shorter_s: float = 0.0
+    growth: float = 0.0
+    lost_kbit: float = 0.0
+    age_s: float = 0.0
+    silent_s: float = 0.0
+    backlog: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -11,11 +11,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from enum import StrEnum
 from math import inf
 from types import MappingProxyType
 from typing import NamedTuple
 
+from runner.core.events import Evidence, LinkState
 from runner.core.history import History, rate, recorded
 
 REPORT_S = 0.04  # between two reports
@@ -32,15 +32,6 @@ GAP_INTERVALS = 1.5  # frame intervals without a frame are no gap, either
 FIRST_INTERVAL_S = 1 / 15
 QUEUE_S = 0.02  # a shorter standing wait is no queue worth mentioning
 RATE_S, COUNTED_S = 0.5, 1.0  # what is received, and the share lost, are stated of this time
-
-
-class LinkState(StrEnum):
-    """State of the queue in front of the link."""
-
-    CLEAR = "clear"
-    FILLING = "filling"
-    DRAINING = "draining"
-    STALLED = "stalled"
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,46 +76,6 @@ class LinkReport:
     packets: int = 0
     lost: int = 0
     all_received: bool = False
-
-
-class Evidence(NamedTuple):
-    """Of one report.
-
-    busy_kbit, busy_s         carried while the link was known to be busy, and the time this took
-    train_kbit, train_s       the same for the packet trains of frames that found it busy
-    trains                    their number
-    idle_kbit, idle_s, idle   the same for trains of frames that met no queue: an idle link may pass the first packets
-                              of each at once
-    unqueued                  number of frames that met no queue
-    kbit      all that arrived since the previous report
-    wait_s    the standing queue: the shortest wait in the last frame interval
-    longest_s the longest wait in it
-    shorter_s by which the path of a camera proved shorter than known: what was first measured held a queue
-    growth    by which waits grew, s per s
-    lost_kbit lost since the previous report
-    age_s     from the middle of these services to the report
-    silent_s  without arrivals beyond GAP_S, although something is on its way
-    backlog   the newest frame was sent before a stall had ended
-    """
-
-    busy_kbit: float = 0.0
-    busy_s: float = 0.0
-    train_kbit: float = 0.0
-    train_s: float = 0.0
-    trains: int = 0
-    idle_kbit: float = 0.0
-    idle_s: float = 0.0
-    idle: int = 0
-    unqueued: int = 0
-    kbit: float = 0.0
-    wait_s: float = 0.0
-    longest_s: float = 0.0
-    shorter_s: float = 0.0
-    growth: float = 0.0
-    lost_kbit: float = 0.0
-    age_s: float = 0.0
-    silent_s: float = 0.0
-    backlog: bool = False
 
 
 class Path(NamedTuple):

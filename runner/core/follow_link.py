@@ -11,8 +11,7 @@ from runner.core import belief as beliefs
 from runner.core.belief import Belief
 from runner.core.budget import video_kbps, wire_kbps
 from runner.core.decision import Believed, Draft
-from runner.core.events import LinkMeasured
-from runner.core.evidence import Evidence
+from runner.core.events import Evidence, LinkMeasured
 from runner.core.learned import WRONG
 from runner.core.model import Camera, Kbps, exact, plain
 from runner.core.state import State

@@ -10,7 +10,8 @@ from typing import Any, assert_never
 
 from runner.core import events as ev
 from runner.core.decision import NOTHING, Decision
-from runner.core.model import SMALLEST_SIDE_PX, Camera, Kbps, Mode, Roi, Vehicle, plain, suggest
+from runner.core.model import SMALLEST_SIDE_PX, Camera, Kbps, Mode, Roi, Vehicle, plain
+from runner.errors import suggest
 
 
 class Refused(Exception):

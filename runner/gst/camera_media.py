@@ -7,11 +7,11 @@ import weakref
 
 from gi.repository import Gst, GstRtsp, GstRtspServer, GstSdp
 
-from runner.core.model import Media
 from runner.graph import FEEDBACK, Plan
 from runner.gst.patient_media import PatientMedia
 from runner.gst.pipeline import CameraPipeline
 from runner.gst.srtp import set_master_key
+from runner.settings import Media
 from runner.system.ports import ip_address_of
 
 QUEUE_BYTES = 2_000_000  # more than a viewer may lag at any bitrate
@@ -67,12 +67,12 @@ class CameraFactory(GstRtspServer.RTSPMediaFactory):  # type: ignore[misc]
         self.set_shared(True)  # otherwise a second viewer takes the pipeline from the first
         self.set_latency(0)
         self.set_address_pool(addresses)
-        if dscp_of(plan) >= 0:
-            self.set_dscp_qos(dscp_of(plan))
+        if settings.dscp >= 0:
+            self.set_dscp_qos(settings.dscp)
         if permissions:
             self.set_permissions(permissions)
         plain, feedback = _profiles(permissions is not None)
-        repairs = int(settings.get("retransmission_ms", 0))
+        repairs = settings.retransmission_ms
         if repairs:
             self.set_retransmission_time(repairs * Gst.MSECOND)
             self.set_do_retransmission(True)
@@ -80,11 +80,6 @@ class CameraFactory(GstRtspServer.RTSPMediaFactory):  # type: ignore[misc]
 
     def do_gen_key(self, _url: GstRtsp.RTSPUrl) -> str:
         return "media"
-
-
-def dscp_of(plan: Plan) -> int:
-    """DiffServ code point of a camera's packets; -1 leaves it to the system."""
-    return int(plan.camera.graph.settings.get("dscp", -1))
 
 
 def _profiles(secure: bool) -> tuple[GstRtsp.RTSPProfile, GstRtsp.RTSPProfile]:

@@ -118,8 +118,8 @@ class Receiver:
         self._packets = (0, 0)  # received and missing, as last read
         self._newest: Arrival | None = None
         settings = plan.camera.graph.settings
-        self._reorder_ms = int(settings.get("jitter_buffer_ms", 0))
-        self._repairs = bool(settings.get("retransmission_ms"))
+        self._reorder_ms = settings.jitter_buffer_ms
+        self._repairs = bool(settings.retransmission_ms)
         self._buffers: list[RepairBuffer] = []
         self._over_udp = self._feedback = False  # transport and profile of the session
         self._kernel_times = False  # whether packets state when the kernel received them

@@ -10,7 +10,8 @@ from functools import cache, lru_cache
 from gi.repository import GLib, GObject, Gst
 
 from runner.core.commands import KnobValue
-from runner.core.model import Element, ModelError, Value, suggest
+from runner.core.model import Element, ModelError, Value
+from runner.errors import suggest
 from runner.graph import Plan, assignments, launch, text
 
 PACKAGES = {  # elements by Debian package; `doctor` and messages on missing plugins name the package

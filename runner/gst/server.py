@@ -20,10 +20,9 @@ from typing import TYPE_CHECKING
 
 from gi.repository import GLib, GObject, Gst, GstRtsp, GstRtspServer
 
-from runner.core.model import Media
 from runner.errors import RunError
 from runner.graph import FEEDBACK, Plan, rtsp_url
-from runner.gst.camera_media import CameraFactory, address_pool, describe_for, dscp_of, on_element, wants_feedback
+from runner.gst.camera_media import CameraFactory, address_pool, describe_for, on_element, wants_feedback
 from runner.gst.connections import RtspConnection
 from runner.gst.lost import LostCameras
 from runner.gst.memory import give_back
@@ -31,6 +30,7 @@ from runner.gst.pipeline import Build, CameraPipeline
 from runner.gst.timers import every
 from runner.gst.video_files import concerns_file
 from runner.gst.viewers import admit, operator_of, over_uplink
+from runner.settings import Media
 from runner.system.ports import check_port_free, ip_address_of
 from runner.system.reports import LimitedReports
 
@@ -516,7 +516,7 @@ class CameraServer:
         name = _camera_name(context)
         connection.cameras[name] = context.trans
         if context.trans.get_transport().lower_transport & GstRtsp.RTSPLowerTrans.TCP:
-            connection.carry_video(dscp_of(self._cameras[name].plan))
+            connection.carry_video(self._cameras[name].plan.camera.graph.settings.dscp)
             if name in connection.refused_udp:
                 first, last = self._media.rtp_ports
                 is_ipv4_at_ipv6 = "." in connection.viewer.address and ":" in ip_address_of(self._media.host)

@@ -17,13 +17,13 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 
-from runner.core.model import Endpoint, suggest
-from runner.errors import RunError
+from runner.errors import RunError, suggest
 from runner.link import netns
 from runner.link.ends import Ends
 from runner.link.limit import Limit, LinkCounters
 from runner.link.relayed import relayed
 from runner.records import LinkSample
+from runner.settings import Endpoint
 
 __all__ = ["KINDS", "Limit", "LimitedLink", "check_possible", "limited_link"]
 

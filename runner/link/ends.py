@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from runner.core.model import Endpoint
 from runner.link.limit import Shaper
+from runner.settings import Endpoint
 
 
 @dataclass(frozen=True)

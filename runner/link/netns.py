@@ -25,11 +25,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from runner.core.model import Endpoint
 from runner.errors import RunError
 from runner.link.child import Child, ChildShaper
 from runner.link.ends import Ends, overrides
 from runner.link.limit import Limit, TcpFlows
+from runner.settings import Endpoint
 from runner.system import children
 from runner.system.signals import urgent
 

@@ -7,11 +7,11 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from runner.core.model import Endpoint
 from runner.errors import RunError
 from runner.link.child import Child, ChildShaper
 from runner.link.ends import Ends, overrides
 from runner.link.limit import Limit
+from runner.settings import Endpoint
 from runner.system import children
 
 

@@ -20,8 +20,8 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.exposition import ThreadingWSGIServer
 from prometheus_client.registry import Collector
 
-from runner.core.model import Endpoint
 from runner.records import Sample, Telemetry, VehicleState
+from runner.settings import Endpoint
 from runner.system.ports import check_port_free
 
 STOP_S = 1.0

@@ -15,10 +15,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from runner.core.model import Endpoint
 from runner.errors import RunError
 from runner.security.broker_files import ACCESS, PASSWORDS, broker_settings
 from runner.security.keyring import CERTIFICATE, REVOKED, version_of
+from runner.settings import Endpoint
 from runner.system import children, signals
 from runner.system.ports import check_port_free
 from runner.system.reports import LimitedReports

@@ -18,11 +18,11 @@ from typing import Any
 from paho.mqtt.client import Client, MQTTMessage, MQTTMessageInfo
 from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode
 
-from runner.core.model import Endpoint
 from runner.errors import RunError, UserError
 from runner.mqtt.login import Login
 from runner.mqtt.messages import JsonObject, MqttMessage
 from runner.security.exposure import is_loopback
+from runner.settings import Endpoint
 from runner.system.reports import LimitedReports
 
 CONNECT_S = 1.0  # one attempt to connect

@@ -21,8 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.configuration.config import configuration
-from runner.core.model import suggest
-from runner.errors import UserError
+from runner.errors import UserError, suggest
 from runner.plans import compile_plans
 from runner.security.exposure import viewer_keyring
 
@@ -96,13 +95,14 @@ def live_frames(
     """
     from runner import apply
 
-    vehicle = configuration(overrides, conf, runnable=False, check=apply.check_operator).vehicle()
+    setup = configuration(overrides, conf, runnable=False, check=apply.check_operator).setup()
+    vehicle = setup.vehicle
     for name in cameras or ():
         if name not in vehicle.cameras:
             raise UserError("cameras", "", name, f"unknown camera{suggest(name, vehicle.cameras)}")
-    plans = [plan for plan in compile_plans(vehicle) if cameras is None or plan.camera.name in cameras]
+    plans = [plan for plan in compile_plans(setup) if cameras is None or plan.camera.name in cameras]
     frames, stopped = Frames(), threading.Event()
-    keyring = viewer_keyring(vehicle)
+    keyring = viewer_keyring(setup)
     side = apply.OperatorSide(plans, report, on_picture=frames.put, keyring=keyring, vehicle=vehicle.name)
     expected = {plan.camera.name: True for plan in plans}
     delivered, since = dict.fromkeys(expected, 0), dict.fromkeys(expected, time.monotonic())

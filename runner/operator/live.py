@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING
 from runner.configuration import agreement
 from runner.configuration.config import configuration
 from runner.core.evidence import REPORT_S
-from runner.core.model import Vehicle
 from runner.drive.log import Log
 from runner.errors import RunError
 from runner.metrics.side import SideMetrics, metrics_of
@@ -30,6 +29,7 @@ from runner.operator.station import Listener, Station
 from runner.plans import compile_plans
 from runner.records import Outcome, Sample, VehicleState
 from runner.security.exposure import viewer_keyring
+from runner.settings import Setup
 from runner.system.held_up import LateCheck
 from runner.system.service import notify
 
@@ -49,7 +49,7 @@ END_S = 1.0  # how long the last sample may take
 class LiveOperator:
     """The parts of an operator's side.
 
-    vehicle  as this side's configuration describes it
+    setup    as this side's configuration describes it
     station  this end of the control link; its listeners must be added before `start`
 
     requests  in order of time; each is sent at its time since the vehicle came online
@@ -57,13 +57,13 @@ class LiveOperator:
 
     def __init__(
         self,
-        vehicle: Vehicle,
+        setup: Setup,
         station: Station,
         log: Log,
         build: Callable[[OnUnit | None], OperatorSide],
         requests: Sequence[TimedRequest] = (),
     ) -> None:
-        self.vehicle, self.station = vehicle, station
+        self.setup, self.station = setup, station
         self._log, self._build = log, build
         self._side: OperatorSide | None = None
         self._stopped = threading.Event()
@@ -205,16 +205,16 @@ class _MetricsListener(Listener):
         self._metrics.take(sample)
 
 
-def _ros_pictures(vehicle: Vehicle, station: Station) -> DecodedPictures | None:
+def _ros_pictures(setup: Setup, station: Station) -> DecodedPictures | None:
     """The ROS node that publishes decoded pictures; None if they are not published.
 
     raises  UserError
     """
-    if not vehicle.ros.pictures:
+    if not setup.ros.pictures:
         return None
     from runner.ros.pictures import DecodedPictures
 
-    return DecodedPictures(vehicle, station.note)
+    return DecodedPictures(setup, station.note)
 
 
 @contextmanager
@@ -231,16 +231,16 @@ def live_operator(
     from runner import apply
 
     config = configuration(overrides, conf, runnable=False, check=apply.check_operator)
-    vehicle, document = config.vehicle(), config.document
-    plans = compile_plans(vehicle)
-    keyring = viewer_keyring(vehicle)
-    station = Station(vehicle, agreement.settings(document), keyring)
+    setup, document = config.setup(), config.document
+    plans = compile_plans(setup)
+    keyring = viewer_keyring(setup)
+    station = Station(setup, agreement.settings(document), keyring)
     versions = apply.versions(element for plan in plans for element in plan.operator)
-    pictures, requests = _ros_pictures(vehicle, station), config.experiment().requests
+    pictures, requests = _ros_pictures(setup, station), config.experiment().requests
     drive = Log(log, "operator", document if log else {}, versions, station.note)
     if log:
         station.listeners.append(DriveLog(station, drive))
-    video = apply.VideoFiles(log, drive.video, drive.video_shift) if log and vehicle.log_video else None
+    video = apply.VideoFiles(log, drive.video, drive.video_shift) if log and setup.log_video else None
 
     def publish(camera: str, captured: float | None, width: int, height: int, data: bytes) -> None:
         assert pictures
@@ -258,13 +258,13 @@ def live_operator(
             video=video,
             operator=station.identity,
             keyring=keyring,
-            vehicle=vehicle.name,
+            vehicle=setup.vehicle.name,
         )
 
-    operator = LiveOperator(vehicle, station, drive, build, requests)
+    operator = LiveOperator(setup, station, drive, build, requests)
     with ExitStack() as ending:  # in reverse order
         ending.callback(drive.close)
-        metrics = metrics_of(vehicle.name, vehicle.metrics.operator_port, log)
+        metrics = metrics_of(setup.vehicle.name, setup.metrics.operator_port, log)
         station.listeners.append(_MetricsListener(metrics))
         ending.callback(metrics.close)
         if pictures:

@@ -15,7 +15,6 @@ from msgspec import UNSET
 
 from runner.configuration import agreement
 from runner.core.events import Attention
-from runner.core.model import Vehicle
 from runner.mqtt.link import ControlLink
 from runner.mqtt.login import Login
 from runner.mqtt.messages import (
@@ -55,6 +54,7 @@ from runner.records import (
     to_json,
 )
 from runner.security.keyring import Keyring
+from runner.settings import Setup
 from runner.system.clocks import KEPT_S, MOST_DRIFT, STEP_S, ClockComparison, ClockDifference, Exchange, latency
 from runner.system.held_up import LateCheck
 from runner.system.kernel_clock import clock_error_s, wall_ahead_s
@@ -124,12 +124,13 @@ class Station:
     Requests go out through `ask`; samples of the cameras' counters come in through `take`.
     """
 
-    def __init__(self, vehicle: Vehicle, settings: agreement.SettingsByPath, keyring: Keyring | None = None) -> None:
+    def __init__(self, setup: Setup, settings: agreement.SettingsByPath, keyring: Keyring | None = None) -> None:
+        vehicle = setup.vehicle
         self._vehicle, self._settings = vehicle, settings
         login = Login(keyring, self.note) if keyring else None
         self.user = login.user if login else None  # this operator's name in its keys; None: it has none
         self.identity = self.user or uuid.uuid4().hex[:12]  # of this operator
-        self.answer_s = answer_s(vehicle.expires_s)
+        self.answer_s = answer_s(setup.expires_s)
         self.listeners: list[Listener] = []
         self.state: VehicleState | None = None  # None: the vehicle is offline
         self._published: VehicleState | None = None  # the last state that the vehicle published
@@ -174,7 +175,7 @@ class Station:
         self._requests = topic(vehicle.name, "request", self.identity)
         self._receptions = topic(vehicle.name, "reception", self.identity)
         will = (self._requests, of_run(OPERATOR_GONE, self._run))
-        self.link = ControlLink(vehicle.control, will, listen, self._on_connected, self.note, login)
+        self.link = ControlLink(setup.control, will, listen, self._on_connected, self.note, login)
 
     def connect(self) -> None:
         """Connect to the broker, and stay connected; returns immediately."""

@@ -23,7 +23,7 @@ from aiohttp.web_protocol import RequestHandler
 
 from runner.configuration.layout import NOWHERE, Layouts, Places, own_places
 from runner.core.events import Attention
-from runner.core.model import Camera, Vehicle, plain
+from runner.core.model import Camera, plain
 from runner.core.roles import DRIVER_EVENTS
 from runner.errors import ConfigError, RunError, UserError
 from runner.graph import video_codec
@@ -39,6 +39,7 @@ from runner.page.viewer import PageViewer
 from runner.records import Note, Outcome, Sample, VehicleState, state_to_json, to_json
 from runner.schema import shortened
 from runner.security.keyring import Keyring
+from runner.settings import Setup
 from runner.system.files import plotly_script
 from runner.system.ports import check_port_free
 from runner.system.reports import LimitedReports
@@ -94,19 +95,20 @@ class PageServer(Listener):
 
     def __init__(
         self,
-        vehicle: Vehicle,
+        setup: Setup,
         station: Station,
         on_counter: Callable[[CounterReading], None] | None = None,
         keyring: Keyring | None = None,
         layouts: Layouts | None = None,
     ) -> None:
-        self._vehicle, self._station, self._on_counter = vehicle, station, on_counter
+        self._setup, self._station, self._on_counter = setup, station, on_counter
+        self._vehicle = vehicle = setup.vehicle
         self._layouts, self._is_saving = layouts or Layouts(), False
         self._report = LimitedReports(station.note)  # of what browsers and others on the network can cause
         self._tls = PageTls(keyring, station.note) if keyring else None
         self._holder = keyring.watched_holder(station.note) if keyring else None
         self._login = PageLogin(keyring.watched_token(station.note).get) if keyring else None
-        check_port_free(vehicle.page.endpoint)
+        check_port_free(setup.page.endpoint)
         self._plotly = plotly_script("page")
         self._index = {name: number for number, name in enumerate(vehicle.cameras)}
         self._recent = [_recent(camera) for camera in vehicle.cameras.values()]
@@ -122,7 +124,7 @@ class PageServer(Listener):
 
     @property
     def url(self) -> str:
-        endpoint = self._vehicle.page.endpoint
+        endpoint = self._setup.page.endpoint
         if self._holder is None:
             return f"http://{endpoint}/"
         return f"https://{replace(endpoint, host=next(iter(self._names), endpoint.host))}/"
@@ -130,7 +132,7 @@ class PageServer(Listener):
     @property
     def _names(self) -> tuple[str, ...]:
         """Addresses and names at which browsers reach the page."""
-        return self._holder.get().hosts if self._holder else (*LOOPBACK, self._vehicle.page.host)
+        return self._holder.get().hosts if self._holder else (*LOOPBACK, self._setup.page.host)
 
     def start(self) -> None:
         self._thread.start()
@@ -192,7 +194,7 @@ class PageServer(Listener):
             app, access_log=None, logger=self._logger(), shutdown_timeout=0.5, keepalive_timeout=REQUEST_S
         )
         await self._runner.setup()
-        endpoint, tls = self._vehicle.page.endpoint, self._tls.context if self._tls else None
+        endpoint, tls = self._setup.page.endpoint, self._tls.context if self._tls else None
         handshake_s = REQUEST_S if tls else None  # until it has ended, `_expire` has nothing to close
         self._server = await self._loop.create_server(
             self._new_connection, endpoint.host, endpoint.port, ssl=tls, ssl_handshake_timeout=handshake_s
@@ -409,7 +411,7 @@ class PageServer(Listener):
 
     def _send_current_state(self, viewer: PageViewer) -> None:
         viewer.selected = next((other.selected for other in self._others(viewer) if other.selected), "")
-        introduction = _introduction(self._vehicle, viewer.cameras)
+        introduction = _introduction(self._setup, viewer.cameras)
         station = {"operator": self._station.user, "answer_s": self._station.answer_s}
         current = {"layout": self._layout(), "selected": viewer.selected or None}
         viewer.post("hello", introduction | station | current)
@@ -575,13 +577,7 @@ def _as_in_url(name: str) -> str:
 
 
 def _recent(camera: Camera) -> RecentUnits:
-    return RecentUnits(_wave_s(camera), video_codec(camera.graph))
-
-
-def _wave_s(camera: Camera) -> float | None:
-    """Length of a refresh wave, or time between key frames; None: unknown."""
-    period = camera.graph.settings.get("key_interval_s")
-    return None if period is None else float(period)
+    return RecentUnits(camera.graph.settings.key_interval_s, video_codec(camera.graph))
 
 
 class _FaultHandler(logging.Handler):
@@ -617,7 +613,7 @@ async def _send(ws: web.WebSocketResponse, viewer: PageViewer) -> None:
         pass  # `_listen` ends the connection
 
 
-def _introduction(vehicle: Vehicle, shown: Sequence[int]) -> dict[str, Any]:
+def _introduction(setup: Setup, shown: Sequence[int]) -> dict[str, Any]:
     """The description of the vehicle that a page needs first.
 
     shown  indexes of the cameras that the page shows
@@ -629,7 +625,7 @@ def _introduction(vehicle: Vehicle, shown: Sequence[int]) -> dict[str, Any]:
             "width": camera.width,
             "height": camera.height,
             "fps": float(camera.fps),
-            "wave_s": _wave_s(camera),
+            "wave_s": camera.graph.settings.key_interval_s,
             "pose": camera.pose and asdict(camera.pose),
             "fov_deg": camera.fov_deg,
             "lens": camera.lens,
@@ -642,13 +638,13 @@ def _introduction(vehicle: Vehicle, shown: Sequence[int]) -> dict[str, Any]:
             "b_min_kbps": [plain(bound) for bound in camera.rate_quality.b_min],
             "b_full_kbps": plain(camera.rate_quality.b_full),
         }
-        for index, camera in enumerate(vehicle.cameras.values())
+        for index, camera in enumerate(setup.vehicle.cameras.values())
         if index in shown
     ]
-    dimensions = vehicle.dimensions and asdict(vehicle.dimensions)
-    limits = {"late_ms": vehicle.page.late_ms, "frozen_ms": FROZEN_MS}
-    inputs = asdict(vehicle.inputs)
-    return {"vehicle": vehicle.name, "cameras": cameras, "dimensions": dimensions, "inputs": inputs, **limits}
+    dimensions = setup.dimensions and asdict(setup.dimensions)
+    limits = {"late_ms": setup.page.late_ms, "frozen_ms": FROZEN_MS}
+    inputs = asdict(setup.inputs)
+    return {"vehicle": setup.vehicle.name, "cameras": cameras, "dimensions": dimensions, "inputs": inputs, **limits}
 
 
 def _places(places: Places) -> dict[str, Any]:

@@ -24,6 +24,7 @@ from runner.rate_quality.sequence import Sequence as Clip
 from runner.rate_quality.study import Study, check_size, stride
 from runner.rate_quality.sweep import Sweep
 from runner.rate_quality.workers import open_executor, parallel_tasks
+from runner.settings import Setup
 from runner.system.files import file_problem, write_whole
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ LATER_ROUNDS = 0.3  # work that the adaptive plan is expected to add, as a share
 
 
 def measure(
-    vehicle: Vehicle,
+    setup: Setup,
     study: Study,
     sequences: Mapping[str, Footage],
     output: Path,
@@ -58,8 +59,8 @@ def measure(
     parallel = parallel_tasks(study.parallel)
     with open_executor(study.workers, study.scheduler, parallel) as executor:
         for model, members in models.items():
-            sweeps = [_sweep(vehicle, study, name, clips[name], metrics, cache, executor, parallel) for name in members]
-            measured = _measure(model, vehicle, study, sweeps, metrics, progress)
+            sweeps = [_sweep(setup, study, name, clips[name], metrics, cache, executor, parallel) for name in members]
+            measured = _measure(model, setup.vehicle, study, sweeps, metrics, progress)
             yield _write(measured, output, sweeps)
 
 
@@ -94,7 +95,7 @@ def _metric(study: Study, name: str) -> Metric:
 
 
 def _sweep(
-    vehicle: Vehicle,
+    setup: Setup,
     study: Study,
     name: str,
     clip: Clip,
@@ -105,16 +106,16 @@ def _sweep(
 ) -> Sweep:
     from runner.apply import versions
 
-    camera, _ = as_recorded(vehicle.cameras[name], clip)
+    camera, _ = as_recorded(setup.vehicle.cameras[name], clip)
     try:
         check_size(study, camera)
     except ModelError as error:
         raise ArgumentError(error.key, str(error.found), error.rule) from None
-    plan = compile_graph(camera, vehicle.media)
+    plan = compile_graph(camera, setup.media)
     roi = camera.in_source
     before, after = cut(plan)
     mask = study.masks.get(name)
-    key_interval = round(float(camera.graph.settings.get("key_interval_s", 0)) * float(camera.fps))
+    key_interval = round((camera.graph.settings.key_interval_s or 0) * float(camera.fps))
     return Sweep(
         name=name,
         clip=clip,

@@ -8,9 +8,10 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from runner.core.model import Camera, Recording
+from runner.core.model import Camera
 from runner.errors import ArgumentError, RunError, os_errors_as, reason
 from runner.redact import redacted
+from runner.settings import Recording
 from runner.system.files import put_in_place, unfinished
 
 INDEX = "recording.json"

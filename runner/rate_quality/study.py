@@ -10,7 +10,8 @@ from math import gcd
 from pathlib import Path
 from typing import Any
 
-from runner.core.model import SMALLEST_SIDE_PX, Camera, ModelError, exact, plain, suggest
+from runner.core.model import SMALLEST_SIDE_PX, Camera, ModelError, exact, plain
+from runner.errors import suggest
 
 FEWEST_SCORED = 40  # frames; a mean over fewer does not carry over to other sequences
 

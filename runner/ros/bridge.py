@@ -11,7 +11,6 @@ import uuid
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from runner.core.model import Vehicle
 from runner.graph import rtsp_url
 from runner.mqtt.link import ControlLink
 from runner.mqtt.login import Login
@@ -30,6 +29,7 @@ from runner.mqtt.messages import (
 from runner.ros.inputs import PRESENCE, OperatorInput, check_names, input_services, input_topics, ros_name
 from runner.ros.process import Message, NodeProcess
 from runner.security.keyring import Keyring
+from runner.settings import Setup
 from runner.system.reports import LimitedReports
 
 REQUEST, REPLY, STATE, TELEMETRY, URL = "~/request", "~/reply", "~/state", "~/telemetry", "~/url"
@@ -48,20 +48,21 @@ class Bridge:
     the vehicle takes any message from it as a sign that the operator is still present.
     """
 
-    def __init__(self, vehicle: Vehicle, keyring: Keyring | None, on_report: Callable[[str], None]) -> None:
+    def __init__(self, setup: Setup, keyring: Keyring | None, on_report: Callable[[str], None]) -> None:
+        vehicle, ros = setup.vehicle, setup.ros
         check_names(vehicle)
-        self._vehicle, self._on_report = vehicle, on_report
+        self._prediction, self._on_report = ros.prediction, on_report
         self._report_refusal, self._report_publisher = LimitedReports(on_report), LimitedReports(on_report)
         login = Login(keyring, on_report) if keyring else None
         self.identity = login.user if login else uuid.uuid4().hex[:12]
         self._vehicle_time = (0.0, -math.inf)  # in the newest telemetry, and when it arrived by time.monotonic
-        self._answer_s = answer_s(vehicle.expires_s)
+        self._answer_s = answer_s(setup.expires_s)
         self._has_keys = login is not None
         self._pending: dict[str, float] = {}  # by id of a request, until when it may be answered
         self._calls: dict[str, str] = {}  # by id of a request, the service call that waits for its answer
         self._numbers = itertools.count(1)  # of requests without an id of their own
         self._topics, self._services = input_topics(vehicle), input_services(vehicle)
-        self._reports = bool(vehicle.ros.position or vehicle.ros.prediction)
+        self._reports = bool(ros.position or ros.prediction)
         self._due: dict[str, float] = {}  # by event, when the next may be sent
         self._lock = threading.Lock()  # of the next three
         self._state = OFFLINE  # the newest from the vehicle
@@ -75,27 +76,27 @@ class Bridge:
         }
         # With keys an operator's side may have the same name; after a crash its silence shows that it is gone.
         will = None if self._has_keys else (self._requests, OPERATOR_GONE)
-        self._link = ControlLink(vehicle.control, will, listen, lambda here: None, on_report, login)
+        self._link = ControlLink(setup.control, will, listen, lambda here: None, on_report, login)
         inputs = {REQUEST: "text", **{name: operator_input.kind for name, operator_input in self._topics.items()}}
         if not self._reports:
             inputs[PRESENCE] = "sign"
-        if vehicle.ros.position:
-            inputs[vehicle.ros.position] = "fix"
-        if vehicle.ros.prediction:
-            inputs[vehicle.ros.prediction.topic] = "newest_number"
+        if ros.position:
+            inputs[ros.position] = "fix"
+        if ros.prediction:
+            inputs[ros.prediction.topic] = "newest_number"
         self._urls = {
-            f"{URL}/{ros_name(name)}": rtsp_url(vehicle.media, name)
+            f"{URL}/{ros_name(name)}": rtsp_url(setup.media, name)
             for name, camera in vehicle.cameras.items()
             if camera.graph.transport == "rtsp"
         }
         self._node = NodeProcess(
-            vehicle.ros,
+            ros,
             self._on_message,
             self._on_node_report,
             inputs=inputs,
             outputs={REPLY: False, TELEMETRY: False, STATE: True, **dict.fromkeys(self._urls, True)},
             services={name: operator_input.kind for name, operator_input in self._services.items()},
-            insecure=vehicle.insecure,
+            insecure=setup.insecure,
         )
 
     def start(self) -> None:
@@ -183,7 +184,7 @@ class Bridge:
 
     def _may_predict(self, nodes: list[str]) -> bool:
         """Whether only the named node publishes predictions; False while names are unknown."""
-        prediction = self._vehicle.ros.prediction
+        prediction = self._prediction
         assert prediction
         if others := [name for name in nodes if name != prediction.node]:
             published = f"is published by {', '.join(others)}, must be by {prediction.node} alone"

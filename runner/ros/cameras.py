@@ -11,8 +11,9 @@ from typing import NamedTuple
 
 from runner.bag.compressed import compressed_form
 from runner.bag.pictures import image_format, must_be_packed, packed_rows
-from runner.core.model import Camera, RosSettings
+from runner.core.model import Camera
 from runner.ros.process import Message, NodeProcess
+from runner.settings import RosSettings
 from runner.system.clocks import SECOND_NS
 
 OLD_NS = SECOND_NS  # a stamp that is older, or further in the future than FUTURE_NS, is from another clock

@@ -6,10 +6,11 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from runner.core.intrinsics import Intrinsics, delivered_intrinsics
-from runner.core.model import Camera, Roi, Vehicle
+from runner.core.model import Camera, Roi
 from runner.records import CameraState
 from runner.ros.inputs import check_names, ros_name
 from runner.ros.process import NodeProcess, check_discovery
+from runner.settings import Setup
 
 
 class DecodedPictures:
@@ -19,13 +20,13 @@ class DecodedPictures:
     raises     UserError
     """
 
-    def __init__(self, vehicle: Vehicle, on_report: Callable[[str], None]) -> None:
-        check_discovery(vehicle.ros, vehicle.insecure)
-        check_names(vehicle)
-        settings = replace(vehicle.ros, node=f"{vehicle.ros.node}_operator")
-        self._cameras = vehicle.cameras
+    def __init__(self, setup: Setup, on_report: Callable[[str], None]) -> None:
+        check_discovery(setup.ros, setup.insecure)
+        check_names(setup.vehicle)
+        settings = replace(setup.ros, node=f"{setup.ros.node}_operator")
+        self._cameras = setup.vehicle.cameras
         self._node = NodeProcess(
-            settings, lambda *_: None, lambda _, what: on_report(what), publishes=True, insecure=vehicle.insecure
+            settings, lambda *_: None, lambda _, what: on_report(what), publishes=True, insecure=setup.insecure
         )
 
     def start(self) -> None:

@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from runner.core.model import RosQos, RosSettings
 from runner.errors import ArgumentError, RunError, UserError
 from runner.ros.node.port import MAX_MESSAGE_BYTES, shared_memory
 from runner.security.exposure import is_loopback
+from runner.settings import RosQos, RosSettings
 from runner.system import children
 from runner.system.backoff import pause_s
 

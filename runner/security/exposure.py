@@ -6,41 +6,41 @@ from ipaddress import ip_address
 from pathlib import Path
 from typing import NamedTuple
 
-from runner.core.model import Vehicle
 from runner.core.roles import VIEWERS, Role
 from runner.errors import ArgumentError, UserError
 from runner.security.keyring import HOLDER, MEDIA_SECRET, PASSPHRASE, PEOPLE, TOKEN, Keyring
+from runner.settings import Setup
 
 
-def keyring_of(vehicle: Vehicle, *needed: str) -> Keyring | None:
+def keyring_of(setup: Setup, *needed: str) -> Keyring | None:
     """The keys that a side's configuration names; None: it names none and needs none.
 
     needed  files that this side needs in addition to those that every holder has
     raises  UserError if keys are incomplete, or missing although video or control leave this machine; for an address of
             media.host that they do not work with
     """
-    if vehicle.keys is not None:
-        _check_server_name(vehicle)
-        return Keyring.of(Path(vehicle.keys), *needed)
-    reached = {"media.host": vehicle.media.host, "control.host": vehicle.control.host}
+    if setup.keys is not None:
+        _check_server_name(setup)
+        return Keyring.of(Path(setup.keys), *needed)
+    reached = {"media.host": setup.media.host, "control.host": setup.control.host}
     exposed = [
-        f"{key} {host}" for key, host in reached.items() if not is_loopback(host) and not _is_private(host, vehicle)
+        f"{key} {host}" for key, host in reached.items() if not is_loopback(host) and not _is_private(host, setup)
     ]
-    if exposed and not vehicle.insecure:
+    if exposed and not setup.insecure:
         found = "is not a loopback address" if len(exposed) == 1 else "are not loopback addresses"
         rule = f"{found}: give keys=DIR, created by `tod-runner keys`, or insecure=true"
         raise ArgumentError("keys", None, f"{' and '.join(exposed)} {rule}")
     return None
 
 
-def _check_server_name(vehicle: Vehicle) -> None:
+def _check_server_name(setup: Setup) -> None:
     """GLib's TLS client states the host as server name (RFC 6066, section 3), and GnuTLS refuses an IPv6 address there.
 
     raises  UserError
     """
-    if ":" in vehicle.media.host and any(camera.graph.transport == "rtsp" for camera in vehicle.cameras.values()):
+    if ":" in setup.media.host and any(camera.graph.transport == "rtsp" for camera in setup.vehicle.cameras.values()):
         rule = "an IPv6 address does not work for RTSP with keys: give a name that stands for it, as in /etc/hosts"
-        raise ArgumentError("media.host", vehicle.media.host, rule)
+        raise ArgumentError("media.host", setup.media.host, rule)
 
 
 class KeysOfAll(NamedTuple):
@@ -51,65 +51,63 @@ class KeysOfAll(NamedTuple):
     controller: Path
 
     @staticmethod
-    def of(vehicle: Vehicle) -> KeysOfAll | None:
+    def of(setup: Setup) -> KeysOfAll | None:
         """For a process that runs both sides: `keys` names the directory with everyone's keys; None: it is not set.
 
         raises  UserError, also if keys are missing although video or control leave this machine
         """
-        if vehicle.keys is None:
-            keyring_of(vehicle)
+        if setup.keys is None:
+            keyring_of(setup)
             return None
-        directory = Path(vehicle.keys)
+        directory = Path(setup.keys)
         holders = {path.parent: Keyring(path.parent).holder for path in sorted(directory.glob(f"*/{HOLDER}"))}
         found = {
             role: next((path for path, holder in holders.items() if holder.role is role), None)
             for role in (Role.BROKER, Role.CONTROLLER)
         }
-        own = next(
-            (path for path, holder in holders.items() if (holder.name, holder.role) == (vehicle.name, Role.VEHICLE)),
-            None,
-        )
+        named = (setup.vehicle.name, Role.VEHICLE)
+        own = next((path for path, holder in holders.items() if (holder.name, holder.role) == named), None)
         broker, controller = found.values()
         if not (broker and controller and own):
-            required = {"broker=localhost": broker, f"vehicle={vehicle.name}": own, "controller=NAME": controller}
+            required = {"broker=localhost": broker, f"vehicle={setup.vehicle.name}": own, "controller=NAME": controller}
             words = " ".join(word for word, path in required.items() if path is None)
-            raise UserError("keys", "", vehicle.keys, f"lacks keys: tod-runner keys output={vehicle.keys} {words}")
+            raise UserError("keys", "", setup.keys, f"lacks keys: tod-runner keys output={setup.keys} {words}")
         return KeysOfAll(broker, own, controller)
 
 
-def vehicle_keyring(vehicle: Vehicle) -> Keyring | None:
+def vehicle_keyring(setup: Setup) -> Keyring | None:
     """The vehicle's keys; raises UserError as `keyring_of`, and for those of another holder."""
-    keyring = keyring_of(vehicle, PEOPLE, PASSPHRASE)
-    if keyring and (keyring.holder.name, keyring.holder.role) != (vehicle.name, Role.VEHICLE):
-        raise _wrong_holder(keyring, f"vehicle {vehicle.name}")
+    keyring = keyring_of(setup, PEOPLE, PASSPHRASE)
+    if keyring and (keyring.holder.name, keyring.holder.role) != (setup.vehicle.name, Role.VEHICLE):
+        raise _wrong_holder(keyring, f"vehicle {setup.vehicle.name}")
     return keyring
 
 
-def viewer_keyring(vehicle: Vehicle) -> Keyring | None:
+def viewer_keyring(setup: Setup) -> Keyring | None:
     """The keys of a role that may see a vehicle's pictures; raises UserError as `keyring_of`, and for other roles."""
-    keyring = keyring_of(vehicle, MEDIA_SECRET)
+    keyring = keyring_of(setup, MEDIA_SECRET)
     if keyring and keyring.holder.role not in VIEWERS:
         raise _wrong_holder(keyring, "a controller or a watcher")
     return keyring
 
 
-def page_keyring(vehicle: Vehicle) -> Keyring | None:
+def page_keyring(setup: Setup) -> Keyring | None:
     """The keys with which the page is served to other machines; None: it is served on loopback.
 
     raises  UserError if it would be served elsewhere without keys
     """
-    if is_loopback(vehicle.page.host):
+    if is_loopback(setup.page.host):
         return None
-    if vehicle.keys is None:
+    if setup.keys is None:
         rule = (
             "is not a loopback address: give keys=DIR, created by `tod-runner keys`; browsers play video by HTTPS only"
         )
-        raise ArgumentError("page.host", vehicle.page.host, rule)
-    keyring = Keyring.of(Path(vehicle.keys), TOKEN)
+        raise ArgumentError("page.host", setup.page.host, rule)
+    keyring = Keyring.of(Path(setup.keys), TOKEN)
     if not keyring.holder.hosts:
         rule = "does not name the addresses of the page: tod-runner keys output=DIR"
         who = f"{keyring.holder.role}={keyring.holder.name}"
-        raise UserError("keys", "", vehicle.keys, f"{rule} {who} host={vehicle.page.host}")
+        raise UserError("keys", "", setup.keys, f"{rule} {who} host={setup.page.host}")
     return keyring
 
 
@@ -118,10 +116,10 @@ def _wrong_holder(keyring: Keyring, expected: str) -> UserError:
     return UserError("keys", "", str(keyring.directory), f"must be those of {expected}, not of {found}")
 
 
-def _is_private(host: str, vehicle: Vehicle) -> bool:
+def _is_private(host: str, setup: Setup) -> bool:
     """Whether an address is on the network that needs no keys by the configuration; a name never is."""
     try:
-        return vehicle.private is not None and ip_address(host) in vehicle.private
+        return setup.private is not None and ip_address(host) in setup.private
     except ValueError:
         return False
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from msgspec import UNSET
 
 from runner.core.decision import Decision
-from runner.core.model import Vehicle, plain
+from runner.core.model import plain
 from runner.core.step import Run
 from runner.records import (
     CameraState,
@@ -20,6 +20,7 @@ from runner.records import (
     applied_to_json,
     to_json,
 )
+from runner.settings import Setup
 
 # As in runner.vehicle.loop.
 STATE_S, REASONS_S = 0.2, 1.0
@@ -30,14 +31,14 @@ MESSAGE = 30  # of MQTT's own header with a topic, about
 class ControlMessages:
     """The messages as JSON, which hardly change their size during a drive."""
 
-    def __init__(self, vehicle: Vehicle, run: Run) -> None:
-        applied = {name: applied_to_json(name, run.commanded.get(name, {})) for name in vehicle.cameras}
+    def __init__(self, setup: Setup, run: Run) -> None:
+        applied = {name: applied_to_json(name, run.commanded.get(name, {})) for name in setup.vehicle.cameras}
         cameras = {name: CameraTelemetry(own, 1234, 1_234_567, 1.23, 4.56) for name, own in applied.items()}
         self.telemetry = _bytes(Telemetry(12.345678, 1234.5, None, cameras, 0, 0, 1.0))
         self.state = _bytes(
             vehicle_state(run, run.state.t, "link_measured kbps 1234.5 queue_ms 12.3 loss 0 state clear")
         )
-        advised = vehicle.latency.speed_factor(None) is not None
+        advised = setup.latency.speed_factor(None) is not None
         self.advice = _bytes(SpeedAdvice(12.345678, 1.0, 123.4, 0.2)) if advised else 0
         self._stated: tuple[float, Decision | None] = (-STATE_S, None)
 

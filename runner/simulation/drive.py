@@ -11,14 +11,14 @@ from itertools import count
 from typing import Any, NamedTuple
 
 from runner.configuration.experiment import TimedRequest
-from runner.core.budget import header_bytes, payload_bytes
+from runner.core.budget import payload_bytes
 from runner.core.events import BitratePredicted, Event, parse
-from runner.core.model import Vehicle
 from runner.core.step import Run
 from runner.link.limit import TcpFlows
 from runner.link.losses import LossModel
 from runner.pqos import Pqos
 from runner.records import Arrival, ReceptionReported
+from runner.settings import Setup
 from runner.simulation.control import ControlMessages, segments
 from runner.simulation.encoder import Encoder, EncoderModel
 from runner.simulation.operator import REORDER_S, RETRY_S, TAIL_S, Frame, Loss, Operator
@@ -34,6 +34,7 @@ RTO_S = 0.2  # until TCP repeats a segment (Linux' least)
 # Each frame begins with a packet of its own for the access unit delimiter (2 bytes of payload), and only this one has
 # the header extension with the capture time. Seen in reports of real drives.
 DELIMITER, EXTENSION = 2, 16
+UNSTATED_WAVE_S = 1.5  # length of a refresh wave where the graph states none
 REPEATED = 2  # bytes by which a repeated packet is longer (RFC 4588)
 DelayAt = Callable[[float], float]
 
@@ -140,24 +141,24 @@ class Simulation:
     """One drive. Events wait in a heap; packets do not, see `runner.simulation.queues`."""
 
     def __init__(
-        self, vehicle: Vehicle, link: Link, pqos: Pqos, duration_s: float, conditions: Conditions, seed: int,
+        self, setup: Setup, link: Link, pqos: Pqos, duration_s: float, conditions: Conditions, seed: int,
         recorder: Recorder, requests: Sequence[TimedRequest] = (),
     ) -> None:  # fmt: skip
         self.link, self.conditions, self.recorder = link, conditions, recorder
         self._rng = rng = random.Random(seed)
         self.done = Drive(duration_s, link.capacity)
-        graphs = [camera.graph for camera in vehicle.cameras.values()]
+        cameras = setup.vehicle.cameras
         self._sizes = {
-            n: (payload_bytes(c.graph), header_bytes(c.graph) - EXTENSION) for n, c in vehicle.cameras.items()
+            n: (payload_bytes(c.graph), c.graph.settings.header_bytes - EXTENSION) for n, c in cameras.items()
         }
-        self.encoders = {n: Encoder(c, conditions.encoder, rng) for n, c in vehicle.cameras.items()}
-        settings = [graph.settings for graph in graphs]
+        self.encoders = {n: Encoder(c, conditions.encoder, rng) for n, c in cameras.items()}
+        settings = [camera.graph.settings for camera in cameras.values()]
         self.operator = Operator(
-            repairs_s=max(float(one.get("retransmission_ms", 0)) for one in settings) / 1000,
-            jitter_s=max(float(one.get("jitter_buffer_ms", 40)) for one in settings) / 1000,
-            wave_s=2 * max(float(one.get("key_interval_s", 1.5)) for one in settings),
+            repairs_s=max(one.retransmission_ms for one in settings) / 1000,
+            jitter_s=max(one.jitter_buffer_ms for one in settings) / 1000,
+            wave_s=2 * max(one.key_interval_s or UNSTATED_WAVE_S for one in settings),
         )
-        self.vehicle = SimulatedVehicle(vehicle, pqos, self.encoders, self._stepped, recorder.reported)
+        self.vehicle = SimulatedVehicle(setup, pqos, self.encoders, self._stepped, recorder.reported)
         self._requests = requests
         self._order = count()
         self._events: list[tuple[float, int, Callable[[float, Any], None], Any]] = []
@@ -174,7 +175,7 @@ class Simulation:
         """The whole drive."""
         vehicle, end = self.vehicle, self.done.duration_s
         vehicle.take_start()
-        self._messages = ControlMessages(vehicle.vehicle, vehicle.run)
+        self._messages = ControlMessages(vehicle.setup, vehicle.run)
         vehicle.connect(0.0)
         for name, encoder in self.encoders.items():  # real cameras start by chance
             self._schedule_frame(0.0, name, self._rng.uniform(0, encoder.interval_s))

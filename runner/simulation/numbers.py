@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 from runner.configuration.overrides import parse_overrides, sweep
 from runner.configuration.rule_lists import call_rule, find_rule, parameters_of, rule_of
-from runner.core.model import Mode, ModelError, exact, plain, suggest
-from runner.errors import COMMAND_LINE, ConfigError, Problem
+from runner.core.model import Mode, ModelError, exact, plain
+from runner.errors import COMMAND_LINE, ConfigError, Problem, suggest
 
 Modes = Mapping[str, Mapping[str, Mapping[str, Any]]]  # as in a modes file: by mode and name, parameters
 BETWEEN = re.compile(r"\s+(?=[A-Za-z])")  # two words: a list of values may contain blanks

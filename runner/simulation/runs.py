@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 from runner.configuration.config import Configuration, configuration
 from runner.configuration.files import conf_directories
 from runner.configuration.rule_lists import rule_of
-from runner.core.model import Kbps, Mode, ModelError, Vehicle, suggest
-from runner.errors import ArgumentError
+from runner.core.model import Kbps, Mode, ModelError
+from runner.errors import ArgumentError, suggest
 from runner.link.limit import Limit, OneWay
 from runner.link.losses import LossModel
 from runner.link.policer import Policer
@@ -47,7 +47,7 @@ class Scheduler(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Setup:
+class Common:
     """What all drives of a command have in common.
 
     overrides, conf  of the configuration
@@ -107,7 +107,7 @@ class Result(NamedTuple):
 
 
 def jobs(
-    setup: Setup, links: Sequence[str], predictions: Sequence[str], seeds: Sequence[int], windows: int
+    common: Common, links: Sequence[str], predictions: Sequence[str], seeds: Sequence[int], windows: int
 ) -> list[Job]:
     """All combinations.
 
@@ -119,32 +119,32 @@ def jobs(
             raise ArgumentError("predictions", repr(kind), f"unknown{suggest(kind, (*KINDS, CONFIGURED))}")
     found = []
     for link in links:
-        for each in _of_link(setup, link, windows):
+        for each in _of_link(common, link, windows):
             found += [each._replace(prediction=kind, seed=seed) for kind in predictions for seed in seeds]
     return found
 
 
-def _of_link(setup: Setup, link: str, windows: int) -> list[Job]:
+def _of_link(common: Common, link: str, windows: int) -> list[Job]:
     """Drives over one link: windows of a file, or runs of an experiment."""
-    job = Job(link, 0.0, "", 0, DURATION_S if setup.duration_s is None else setup.duration_s)
+    job = Job(link, 0.0, "", 0, DURATION_S if common.duration_s is None else common.duration_s)
     if link == CONFIGURED:
-        runs = _composed(setup, job)[0].experiment().runs or {"": ()}
-        return [_timed(setup, job._replace(run=name, words=words)) for name, words in runs.items()]
+        runs = _composed(common, job)[0].experiment().runs or {"": ()}
+        return [_timed(common, job._replace(run=name, words=words)) for name, words in runs.items()]
     if is_family(link):
         return [job]
-    return [job._replace(begin_s=begin) for begin in _windows(setup, job, windows)]
+    return [job._replace(begin_s=begin) for begin in _windows(common, job, windows)]
 
 
-def _timed(setup: Setup, job: Job) -> Job:
+def _timed(common: Common, job: Job) -> Job:
     """A run of an experiment, with its own duration."""
-    config = _composed(setup, job)[0]
-    timed = setup.duration_s is None and "experiment" in config.document
+    config = _composed(common, job)[0]
+    timed = common.duration_s is None and "experiment" in config.document
     return job._replace(duration_s=config.experiment().duration_s) if timed else job
 
 
-def _windows(setup: Setup, job: Job, most: int) -> list[float]:
+def _windows(common: Common, job: Job, most: int) -> list[float]:
     """Where windows of a file begin, evenly taken from those in which the link carries something."""
-    rates, length = _file(job.link, setup.conf)[0], job.duration_s
+    rates, length = _file(job.link, common.conf)[0], job.duration_s
     begins = [begin * length for begin in range(int((rates.times[-1] + 1) / length))] or [0.0]
     usable = [begin for begin in begins if rates.mean(begin, begin + length) >= LEAST_KBPS]
     return [usable[i * len(usable) // most] for i in range(most)] if len(usable) > most else usable or begins[:1]
@@ -201,40 +201,39 @@ def _opportunities(path: Path) -> tuple[Steps, tuple[float, ...]]:
     return Steps(range(len(counts)), [count * OPPORTUNITY_BYTES * KBIT for count in counts]), times
 
 
-def _composed(setup: Setup, job: Job) -> tuple[Configuration, Vehicle, Limit]:
-    """The configuration of a job, its vehicle, and its link; the rate of the link is that of CONFIGURED only."""
-    return _compose((*_link_words(setup), *setup.overrides, *job.words), setup.conf, job.link == CONFIGURED)
+def _composed(common: Common, job: Job) -> tuple[Configuration, Limit]:
+    """The configuration of a job, and its link; the rate of the link is that of CONFIGURED only."""
+    return _compose((*_link_words(common), *common.overrides, *job.words), common.conf, job.link == CONFIGURED)
 
 
 @lru_cache(maxsize=64)
-def _compose(words: tuple[str, ...], conf: Path | None, configured: bool) -> tuple[Configuration, Vehicle, Limit]:
+def _compose(words: tuple[str, ...], conf: Path | None, configured: bool) -> tuple[Configuration, Limit]:
     config = configuration(words, conf, runnable=False)
-    vehicle = config.vehicle()
     link = config.link(None if configured else lambda _: Kbps(0))
     if link is None:
         raise ArgumentError("link", "null", "must not be null: it describes the link that is simulated")
-    return config, vehicle, link.limit
+    return config, link.limit
 
 
-def _link_words(setup: Setup) -> tuple[str, ...]:
-    return () if any(word.startswith(("link=", "+link=", "experiment=")) for word in setup.overrides) else UNNAMED_LINK
+def _link_words(common: Common) -> tuple[str, ...]:
+    return () if any(word.startswith(("link=", "+link=", "experiment=")) for word in common.overrides) else UNNAMED_LINK
 
 
-def check(setup: Setup, wanted: Iterable[Job]) -> None:
+def check(common: Common, wanted: Iterable[Job]) -> None:
     """raises ConfigError, ArgumentError if a configuration is wrong"""
     for job in wanted:
-        config, _, _ = _composed(setup, job)
+        config, _ = _composed(common, job)
         if job.prediction == CONFIGURED:
             config.pqos()
         config.experiment()
 
 
-def rules_in_force(setup: Setup, wanted: Iterable[Job]) -> tuple[Mapping[str, Any], list[Mode]]:
+def rules_in_force(common: Common, wanted: Iterable[Job]) -> tuple[Mapping[str, Any], list[Mode]]:
     """The modes file of the first drive, and the modes that drives are in: as configured, and as an experiment selects.
 
     raises  ArgumentError if runs of an experiment have other rules, not only other numbers
     """
-    configs = [_composed(setup, job)[0] for job in wanted]
+    configs = [_composed(common, job)[0] for job in wanted]
     files = [config.document["modes"] for config in configs]
     names = [{mode: [(n, rule_of(n, entry)) for n, entry in file[mode].items()] for mode in Mode} for file in files]
     if any(rules != names[0] for rules in names):
@@ -245,36 +244,36 @@ def rules_in_force(setup: Setup, wanted: Iterable[Job]) -> tuple[Mapping[str, An
     return files[0], [mode for mode in Mode if mode in selected]
 
 
-def run_job(setup: Setup, job: Job, keep: bool = False, log: tuple[Path, float] | None = None) -> Result:
+def run_job(common: Common, job: Job, keep: bool = False, log: tuple[Path, float] | None = None) -> Result:
     """Simulate one drive.
 
     keep  return what happened, too
     log   directory in which it is logged, and when it began, s since 1970
     """
-    config, vehicle, limit = _composed(setup, job)
+    config, limit = _composed(common, job)
     began = time.process_time()
-    capacity = _capacity(setup, job, limit, float(config.document["link"]["share"]))
+    capacity = _capacity(common, job, limit, float(config.document["link"]["share"]))
     if job.prediction == CONFIGURED:
         seen, _ = config.pqos()
     else:
         seen = prediction(job.prediction, capacity, job.duration_s, job.seed)
-    link, requests = _link(setup, job, limit, capacity), config.experiment().requests
-    with _recorder(setup, job, log) as recorder:
-        drive = Simulation(vehicle, link, seen, job.duration_s, setup.conditions, job.seed, recorder, requests).run()
-    return Result(job, figures(drive, setup.since_s), time.process_time() - began, drive if keep else None)
+    link, requests, setup = _link(common, job, limit, capacity), config.experiment().requests, config.setup()
+    with _recorder(common, job, log) as recorder:
+        drive = Simulation(setup, link, seen, job.duration_s, common.conditions, job.seed, recorder, requests).run()
+    return Result(job, figures(drive, common.since_s), time.process_time() - began, drive if keep else None)
 
 
 @contextmanager
-def _recorder(setup: Setup, job: Job, log: tuple[Path, float] | None) -> Iterator[Recorder]:
+def _recorder(common: Common, job: Job, log: tuple[Path, float] | None) -> Iterator[Recorder]:
     """Writes the drive, which exists only when it is complete."""
     if log is None:
         yield Recorder()
         return
     from runner.simulation.log import DriveFiles
 
-    config, vehicle, _ = _composed(setup, job)
+    config, _ = _composed(common, job)
     note = f"simulated: link {job.link} from {job.begin_s:g} s, prediction {job.prediction}, seed {job.seed}"
-    files = DriveFiles(log[0], vehicle, config.document, log[1], note)
+    files = DriveFiles(log[0], config.vehicle(), config.document, log[1], note)
     try:
         yield files
     except BaseException:
@@ -283,24 +282,24 @@ def _recorder(setup: Setup, job: Job, log: tuple[Path, float] | None) -> Iterato
     files.close()
 
 
-def _capacity(setup: Setup, job: Job, limit: Limit, share: float) -> Steps:
+def _capacity(common: Common, job: Job, limit: Limit, share: float) -> Steps:
     duration_s = job.duration_s + MARGIN_S
     if job.link == CONFIGURED:
         return Steps.of(limit.kbps_at, duration_s)
     rates = (
         generate(job.link, job.seed, duration_s)
         if is_family(job.link)
-        else _file(job.link, setup.conf)[0].moved(job.begin_s)
+        else _file(job.link, common.conf)[0].moved(job.begin_s)
     )
     return Steps(rates.times, [share * rate for rate in rates.values])
 
 
-def _link(setup: Setup, job: Job, limit: Limit, capacity: Steps) -> Link:
+def _link(common: Common, job: Job, limit: Limit, capacity: Steps) -> Link:
     """The link that the configuration describes, with this capacity."""
     back, seed = limit.reverse, job.seed
     return Link(
         capacity,
-        _queue(setup, job, limit, capacity),
+        _queue(common, job, limit, capacity),
         one_way_s=limit.delay_ms / 1000,
         back_s=back.delay_ms / 1000 if back else 0.0,
         delay_at=_in_seconds(limit),
@@ -316,16 +315,16 @@ def _back_rates(back: OneWay, job: Job) -> Steps:
     return Steps.of(back.kbps_at, job.duration_s)
 
 
-def _queue(setup: Setup, job: Job, limit: Limit, capacity: Steps) -> Queue:
+def _queue(common: Common, job: Job, limit: Limit, capacity: Steps) -> Queue:
     policer = Policer(*limit.policer) if limit.policer else None
-    times = () if job.link == CONFIGURED or is_family(job.link) else _file(job.link, setup.conf)[1]
+    times = () if job.link == CONFIGURED or is_family(job.link) else _file(job.link, common.conf)[1]
     if times:
         end = job.begin_s + job.duration_s + MARGIN_S
         within = [t - job.begin_s for t in times if job.begin_s <= t < end]
         return OpportunityQueue(within, limit.queue_ms, policer)
-    slot_s = setup.slot_ms / 1000
-    if setup.scheduler:
-        peak, credit_ms, grant_ms = setup.scheduler
+    slot_s = common.slot_ms / 1000
+    if common.scheduler:
+        peak, credit_ms, grant_ms = common.scheduler
         return CreditQueue(
             capacity,
             limit.queue_ms,
@@ -335,7 +334,7 @@ def _queue(setup: Setup, job: Job, limit: Limit, capacity: Steps) -> Queue:
             slot_s=slot_s,
             policer=policer,
         )
-    return RateQueue(capacity, limit.queue_ms, bursts=setup.bursts, slot_s=slot_s, policer=policer)
+    return RateQueue(capacity, limit.queue_ms, bursts=common.bursts, slot_s=slot_s, policer=policer)
 
 
 def _in_seconds(way: OneWay) -> Callable[[float], float] | None:

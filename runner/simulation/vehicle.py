@@ -9,11 +9,11 @@ from dataclasses import dataclass, field
 from msgspec import UNSET
 
 from runner.core.events import ClockAdvanced, ControlPassed, Event, OperatorConnected, OperatorDisconnected
-from runner.core.model import Vehicle
 from runner.core.step import Run, start, step
 from runner.errors import RunError
 from runner.pqos import Pqos
 from runner.records import ReceptionReport, ReceptionReported, SentFrame
+from runner.settings import Setup
 from runner.simulation.encoder import Encoder
 from runner.vehicle.operators import Operators
 from runner.vehicle.sending import SendingTimes
@@ -29,7 +29,7 @@ OnStep = Callable[[Run, Event, Run], None]
 class SimulatedVehicle:
     """on_step: called with each event and the run before and after it; on_report: with each reception report."""
 
-    vehicle: Vehicle
+    setup: Setup
     pqos: Pqos
     encoders: Mapping[str, Encoder]
     on_step: OnStep
@@ -39,9 +39,10 @@ class SimulatedVehicle:
     _in_control: str = ""
 
     def __post_init__(self) -> None:
-        self.run = start(self.vehicle)
-        self._uplink, self._sending = MeasuredUplink(self.vehicle), SendingTimes()
-        self._operators = Operators(self.vehicle.expires_s)
+        vehicle = self.setup.vehicle
+        self.run = start(vehicle)
+        self._uplink, self._sending = MeasuredUplink(vehicle), SendingTimes()
+        self._operators = Operators(self.setup.expires_s)
 
     def take(self, event: Event) -> None:
         """Process an event, and the prediction that follows from it."""
@@ -86,7 +87,7 @@ class SimulatedVehicle:
 
     def _step(self, event: Event) -> None:
         before = self.run
-        self.run = after = step(self.vehicle, before, event)
+        self.run = after = step(self.setup.vehicle, before, event)
         if after.fault:
             raise RunError(after.fault)
         for command in after.commands:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import socket
 
-from runner.core.model import Endpoint
 from runner.errors import RunError, os_errors_as
+from runner.settings import Endpoint
 
 
 def ip_address_of(host: str) -> str:

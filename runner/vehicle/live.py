@@ -22,7 +22,7 @@ from msgspec import UNSET
 
 from runner.configuration import agreement
 from runner.configuration.config import configuration
-from runner.core.model import Progress, Vehicle
+from runner.core.model import Progress
 from runner.drive.log import Log, check_free
 from runner.errors import RunError
 from runner.graph import rtsp_url
@@ -54,6 +54,7 @@ from runner.records import (
 )
 from runner.security.exposure import vehicle_keyring
 from runner.security.keyring import Keyring
+from runner.settings import Setup
 from runner.system.held_up import LateCheck
 from runner.system.kernel_clock import clock_error_s, wall_ahead_s
 from runner.system.service import notify
@@ -209,12 +210,12 @@ class _VehicleControl:
 
     def __init__(
         self,
-        vehicle: Vehicle,
+        setup: Setup,
         document: Mapping[str, Any],
         on_report: Callable[[str], None],
         keyring: Keyring | None = None,
     ) -> None:
-        self._name, self._on_report = vehicle.name, on_report
+        self._name, self._on_report = setup.vehicle.name, on_report
         self._settings = Settings(uuid.uuid4().hex, agreement.settings(document))
         self._others: set[str] = set()
         self._is_name_free = threading.Event()
@@ -228,7 +229,7 @@ class _VehicleControl:
         }
         login = Login(keyring, on_report) if keyring else None
         will = (self._topic("state"), OFFLINE)
-        self.link = ControlLink(vehicle.control, will, listen, self._on_connected, on_report, login)
+        self.link = ControlLink(setup.control, will, listen, self._on_connected, on_report, login)
 
     def connect(self, live: LiveVehicle) -> None:
         self._live = live
@@ -320,26 +321,26 @@ class _VehicleControl:
             self._on_report(f"another vehicle named {self._name} connected to the broker: operators see both")
 
 
-def _check_ros(vehicle: Vehicle) -> None:
+def _check_ros(setup: Setup) -> None:
     """raises UserError if the ROS node would discover unauthenticated nodes"""
-    if any(camera.topic for camera in vehicle.cameras.values()):
+    if any(camera.topic for camera in setup.vehicle.cameras.values()):
         from runner.ros.process import check_discovery
 
-        check_discovery(vehicle.ros, vehicle.insecure)
+        check_discovery(setup.ros, setup.insecure)
 
 
 def ros_cameras(
-    vehicle: Vehicle, push: Callable[[str, SharedPicture], bool], report: Callable[[str], None]
+    setup: Setup, push: Callable[[str, SharedPicture], bool], report: Callable[[str], None]
 ) -> RosCameras | None:
     """The node that subscribes to the topics of a vehicle's cameras; None if no camera has one."""
-    if not any(camera.topic for camera in vehicle.cameras.values()):
+    if not any(camera.topic for camera in setup.vehicle.cameras.values()):
         return None
     from runner.ros.cameras import RosCameras
 
     def on_report(camera: str, what: str) -> None:
         report(f"{camera}: {what}" if camera else what)
 
-    return RosCameras(vehicle.ros, vehicle.cameras.values(), push, on_report, vehicle.insecure)
+    return RosCameras(setup.ros, setup.vehicle.cameras.values(), push, on_report, setup.insecure)
 
 
 @contextmanager
@@ -366,13 +367,13 @@ def live_vehicle(
     if config.document.get("strict"):
         config = config.drivable(apply.check_vehicle)
     (pqos, track), document, rates = config.pqos(), config.document, list[str]()
-    vehicle = as_offered(config.vehicle(), rates.append)
-    keyring = vehicle_keyring(vehicle)
-    _check_ros(vehicle)
-    render_missing(vehicle, progress)
-    plans = compile_plans(vehicle)
-    lost = apply.check_machine(plans, strict=vehicle.strict)
-    if log and vehicle.strict:
+    setup = as_offered(config.setup(), rates.append)
+    keyring = vehicle_keyring(setup)
+    _check_ros(setup)
+    render_missing(setup.vehicle, progress)
+    plans = compile_plans(setup)
+    lost = apply.check_machine(plans, strict=setup.strict)
+    if log and setup.strict:
         check_free(log, "vehicle")
     console = _Console(say)
     with ExitStack() as ending:  # in reverse order, also of a vehicle that cannot start
@@ -387,31 +388,31 @@ def live_vehicle(
 
         for rate in rates:
             report(rate)
-        video = apply.VideoFiles(log, drive.video, drive.video_shift) if log and vehicle.log_video else None
+        video = apply.VideoFiles(log, drive.video, drive.video_shift) if log and setup.log_video else None
         side = apply.VehicleSide(
-            plans, vehicle.media, lambda camera, what: report(f"{camera}: {what}"), video, keyring, lost
+            plans, setup.media, lambda camera, what: report(f"{camera}: {what}"), video, keyring, lost
         )
         ending.callback(side.stop)
-        control = _VehicleControl(vehicle, document, report, keyring)
+        control = _VehicleControl(setup, document, report, keyring)
         ending.callback(control.close)
-        metrics = metrics_of(vehicle.name, vehicle.metrics.vehicle_port, log)
+        metrics = metrics_of(setup.vehicle.name, setup.metrics.vehicle_port, log)
         ending.callback(metrics.close)
 
         def publish(record: VehicleState | Telemetry | SpeedAdvice | SteeringAngle) -> bool:
             metrics.take(record)
             return control.publish(record)
 
-        loop = ControlLoop(vehicle, side, pqos, track, drive, publish, report, Access(keyring, report))
+        loop = ControlLoop(setup, side, pqos, track, drive, publish, report, Access(keyring, report))
         side.on_turned = loop.wake
         live = LiveVehicle(side, loop)
-        if ros := ros_cameras(vehicle, side.push_shared, report):
+        if ros := ros_cameras(setup, side.push_shared, report):
             ending.callback(ros.close)
         ending.callback(live.stop)
         if ros:
-            ros.start(patient=not vehicle.strict)
+            ros.start(patient=not setup.strict)
         metrics.serve(live.problem, control.link)
         control.connect(live)
         for plan in plans:
-            address = rtsp_url(vehicle.media, plan.camera.name) if plan.serves else "connects to the operator"
+            address = rtsp_url(setup.media, plan.camera.name) if plan.serves else "connects to the operator"
             console.say(f"{plan.camera.name}: {address}")
         yield live

@@ -27,7 +27,7 @@ from runner.core.events import (
     describe,
     parse,
 )
-from runner.core.model import Vehicle, plain
+from runner.core.model import plain
 from runner.core.step import Run, start, step
 from runner.mqtt.messages import APPLY_S
 from runner.pqos import Pqos
@@ -47,6 +47,7 @@ from runner.records import (
     applied_to_json,
 )
 from runner.schema import event_problem, shortened
+from runner.settings import Setup
 from runner.system.held_up import LateCheck
 from runner.system.reports import LimitedReports
 from runner.vehicle.access import Access
@@ -117,7 +118,7 @@ class ControlLoop:
     finished a piece of work (time.monotonic), `busy_with` what it is doing.
     """
 
-    vehicle: Vehicle
+    setup: Setup
     applier: Applier
     pqos: Pqos
     track: Track | None
@@ -148,10 +149,11 @@ class ControlLoop:
     _refusals: dict[str, int] = field(default_factory=dict)  # by sender, since the last tick
 
     def __post_init__(self) -> None:
+        self.vehicle = self.setup.vehicle
         self._cameras: Mapping[str, CameraReading] = dict.fromkeys(
             self.vehicle.cameras, CameraReading()
         )  # as last read
-        self._operators = Operators(self.vehicle.expires_s, self.access.may_control)
+        self._operators = Operators(self.setup.expires_s, self.access.may_control)
         self._uplink, self._sending = MeasuredUplink(self.vehicle), SendingTimes()
         self._report_denial = LimitedReports(self.on_report)
         self._in_control = ""
@@ -377,14 +379,14 @@ class ControlLoop:
         """Publish the speed that the latency of the operator's pictures allows; 0 without a recent report or driver."""
         if (factor := self._speed_factor(t)) is not None:
             _, measured_ms = self._latency
-            limit = self.vehicle.latency
+            limit = self.setup.latency
             total_ms = None if not factor or measured_ms is None else round(measured_ms + (limit.fixed_ms or 0.0), 1)
             self.publish(SpeedAdvice(t, factor, total_ms, ADVICE_S))
 
     def _speed_factor(self, t: float) -> float | None:
         at, measured_ms = self._latency
         is_seen = t - at <= ADVICE_S and self._run.state.attention not in UNSEEN
-        factor = self.vehicle.latency.speed_factor(measured_ms if is_seen else None)
+        factor = self.setup.latency.speed_factor(measured_ms if is_seen else None)
         return None if factor is None else round(factor, 3)
 
     def _state_clock(self, item: QueuedReport, t: float) -> None:

@@ -9,7 +9,7 @@ from operator import attrgetter
 
 from msgspec import UNSET
 
-from runner.core.budget import header_bytes, on_the_wire
+from runner.core.budget import on_the_wire
 from runner.core.events import LinkMeasured
 from runner.core.evidence import EvidenceMemory, LinkReport, ReceivedUnit, observe, rounded, summarise
 from runner.core.model import Graph, Vehicle, exact
@@ -76,14 +76,14 @@ def _on_the_wire(vehicle: Vehicle, reported: ReceptionReported) -> LinkReport:
 
 
 def _unit(graph: Graph, at: float, unit: UnitReceived, late: float) -> ReceivedUnit:
-    header = header_bytes(graph)
+    header = graph.settings.header_bytes
     return ReceivedUnit(
         unit.camera,
         unit.captured(at),
         at - unit.ago_s,
         on_the_wire(graph, unit.bytes),
         unit.whole,
-        float(graph.settings.get("srt_latency_ms", 0)) / 1000,
+        graph.settings.srt_latency_ms / 1000,
         late,
         unit.train_s,
         unit.train_bytes + unit.train_packets * header,

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from runner.configuration.files import GROUPS
-from runner.core.model import suggest
-from runner.errors import COMMAND_LINE, ArgumentError, UserError
+from runner.errors import COMMAND_LINE, ArgumentError, UserError, suggest
 from runner.schema import schema_document
 
 DRIVE = "DRIVE"  # stands for the directory of a drive in the usage

@@ -44,13 +44,13 @@ from typing import Any, NamedTuple
 from runner.configuration.config import Configuration, configuration
 from runner.configuration.experiment import LinkSettings
 from runner.configuration.files import conf_directories
-from runner.core.model import Vehicle
 from runner.drive.log import FILES, WITHOUT_LOG, Log, check_free
 from runner.errors import ArgumentError, os_errors_as
 from runner.link import LimitedLink, check_possible, limited_link
 from runner.mqtt.broker import private_broker
 from runner.plans import render_missing
 from runner.security.exposure import KeysOfAll
+from runner.settings import Setup
 from runner.system import children, signals
 from runner.system.children import VerbProcess
 from runner.system.files import write_whole
@@ -78,7 +78,7 @@ class _Run(NamedTuple):
 
     name: str
     arguments: Arguments
-    vehicle: Vehicle
+    setup: Setup
     directory: Path | None
     link: LinkSettings | None
     document: dict[str, Any]
@@ -191,17 +191,17 @@ def _prepare_run(
         check_possible(link.kind)
     config = config.drivable(apply.check_plan)
     config.pqos()
-    vehicle = config.vehicle()
+    setup = config.setup()
     # In network namespaces of its own, a link replaces the hosts.
-    keys = None if vehicle.keys is None and link and link.kind == "netns" else KeysOfAll.of(vehicle)
+    keys = None if setup.keys is None and link and link.kind == "netns" else KeysOfAll.of(setup)
     if keys and link and link.kind == "relay":
         rule = "rewrites ports in RTSP, which keys encrypt; link=netns passes it unread"
         raise ArgumentError("link", link.kind, rule)
     duration_s = arguments.number("duration_s")
     duration_s = config.experiment().duration_s if duration_s is None else duration_s
     with progress_bar() as progress:
-        render_missing(vehicle, progress)
-    return _Run(name, own, vehicle, directory, link, config.document, duration_s, keys)
+        render_missing(setup.vehicle, progress)
+    return _Run(name, own, setup, directory, link, config.document, duration_s, keys)
 
 
 def _with_rate(arguments: Arguments) -> tuple[Arguments, Configuration]:
@@ -243,7 +243,7 @@ def _drive(run: _Run) -> None:
         signals.stopping(END_S),
         _link(run) as (link, log),
         private_broker(
-            link.broker if link else run.vehicle.control, run.keys.broker if run.keys else None, say
+            link.broker if link else run.setup.control, run.keys.broker if run.keys else None, say
         ) as broker,
         _sides(own, link, run) as (vehicle, operator),
     ):
@@ -312,8 +312,8 @@ def _link(run: _Run) -> Iterator[tuple[LimitedLink | None, Log]]:
         return
     log = Log(run.directory, "link", run.document, {}, say)
     try:
-        media, control = run.vehicle.media, run.vehicle.control
-        dials = any(camera.graph.transport != "rtsp" for camera in run.vehicle.cameras.values())
+        media, control = run.setup.media, run.setup.control
+        dials = any(camera.graph.transport != "rtsp" for camera in run.setup.vehicle.cameras.values())
         with limited_link(settings.kind, settings.limit, media, control, log.record, dials=dials) as link:
             yield link, log
     finally:

@@ -22,13 +22,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from runner.configuration.config import configuration
-from runner.core.model import Camera, Endpoint, RosSettings, Vehicle, suggest
-from runner.errors import ArgumentError, MissingBindings, RunError, UserError, reason
+from runner.core.model import Camera, Vehicle
+from runner.errors import ArgumentError, MissingBindings, RunError, UserError, reason, suggest
 from runner.inputs import input_problem
 from runner.mqtt.broker import find_mosquitto
 from runner.plans import compile_plans, nearest_rate
 from runner.security.keyring import HOLDER, Keyring
 from runner.security.validity import date, expiring, invalid
+from runner.settings import Endpoint, RosSettings, Setup
 from runner.system.extras import EXTRAS, how_to_install
 from runner.system.ports import check_port_free
 from runner.system.rtsp import OK, UNAUTHORIZED, describe
@@ -65,7 +66,7 @@ def run(arguments: Arguments) -> int:
     verb = _verb(arguments)
     overrides = [study_word(word) for word in arguments.overrides] if verb == "model" else arguments.overrides
     config = configuration(overrides, arguments.conf, runnable=False)
-    findings = list(examine(verb, config.vehicle(), config.document))
+    findings = list(examine(verb, config.setup(), config.document))
     for fine, what in findings:
         print(f"{'ok     ' if fine else 'MISSING'} {what}")
     if not findings:
@@ -82,10 +83,11 @@ def _verb(arguments: Arguments) -> str:
     return words[0]
 
 
-def examine(verb: str, vehicle: Vehicle, document: Mapping[str, Any]) -> Iterator[Diagnosis]:
+def examine(verb: str, setup: Setup, document: Mapping[str, Any]) -> Iterator[Diagnosis]:
     """Everything that a verb needs with this configuration."""
+    vehicle = setup.vehicle
     needed: dict[str, str] = {}
-    for extra in _extras(verb, vehicle, document):
+    for extra in _extras(verb, setup, document):
         for module in EXTRAS[extra]:
             needed.setdefault(module, extra)
     for module, extra in needed.items():
@@ -96,36 +98,37 @@ def examine(verb: str, vehicle: Vehicle, document: Mapping[str, Any]) -> Iterato
         bindings = list(_bindings())
         yield from bindings
         if all(finding.fine for finding in bindings):
-            yield from _elements(verb, vehicle)
+            yield from _elements(verb, setup)
     if verb == "demo":
         yield _broker()
-    yield from _ports(verb, vehicle)
-    if verb in CONNECTING and vehicle.keys is not None and find_spec("cryptography"):
-        yield from _certificates(Path(vehicle.keys))
+    yield from _ports(verb, setup)
+    if verb in CONNECTING and setup.keys is not None and find_spec("cryptography"):
+        yield from _certificates(Path(setup.keys))
     if verb in ("vehicle", "demo", "record"):
         yield from _devices(vehicle)
         yield from _ip_cameras(vehicle)
     if verb in ("vehicle", "demo"):
         yield _cores(vehicle)
     subscribes = any(camera.source.subscribes for camera in vehicle.cameras.values())
-    publishes = vehicle.ros.pictures and verb in ("operator", "demo")
+    publishes = setup.ros.pictures and verb in ("operator", "demo")
     if verb == "ros" or publishes or (subscribes and verb in ("vehicle", "demo")):
-        yield _ros_library(vehicle.ros)
+        yield _ros_library(setup.ros)
 
 
-def _extras(verb: str, vehicle: Vehicle, document: Mapping[str, Any]) -> Iterator[str]:
+def _extras(verb: str, setup: Setup, document: Mapping[str, Any]) -> Iterator[str]:
     """Extras of this package that a verb needs."""
+    sources = [camera.source for camera in setup.vehicle.cameras.values()]
     yield from NEEDED.get(verb, ())
-    if verb in ("operator", "demo") and vehicle.page.serve:
+    if verb in ("operator", "demo") and setup.page.serve:
         yield "page"
-    if verb in ("vehicle", "demo", "record") and any(c.source.render for c in vehicle.cameras.values()):
+    if verb in ("vehicle", "demo", "record") and any(source.render for source in sources):
         yield "synthetic"
     if verb in CONNECTING:
-        yield from ["security"] if vehicle.keys is not None else []
-    ports = {"vehicle": vehicle.metrics.vehicle_port, "operator": vehicle.metrics.operator_port}
+        yield from ["security"] if setup.keys is not None else []
+    ports = {"vehicle": setup.metrics.vehicle_port, "operator": setup.metrics.operator_port}
     if any(port is not None and verb in (side, "demo") for side, port in ports.items()):
         yield "metrics"
-    if verb in ("vehicle", "demo", "record", "model") and any(c.source.plays_bags for c in vehicle.cameras.values()):
+    if verb in ("vehicle", "demo", "record", "model") and any(source.plays_bags for source in sources):
         yield "bag"
     if verb == "model":
         study = document["study"]
@@ -159,12 +162,12 @@ def _bindings() -> Iterator[Diagnosis]:
         yield from (Diagnosis(True, f"typelib {name}") for name in apply.TYPELIBS)
 
 
-def _elements(verb: str, vehicle: Vehicle) -> Iterator[Diagnosis]:
+def _elements(verb: str, setup: Setup) -> Iterator[Diagnosis]:
     """GStreamer elements: those of one side for its own verb, otherwise all."""
     from runner.apply import missing_plugins, missing_recorders
 
     lines, missing = [], dict[str, None]()
-    for plan in compile_plans(vehicle):
+    for plan in compile_plans(setup):
         if verb == "operator":
             lines += [plan.operator]
             missing |= dict.fromkeys(missing_plugins(plan, ("operator",)))
@@ -187,15 +190,15 @@ def _broker() -> Diagnosis:
         return Diagnosis(False, str(error))
 
 
-def _ports(verb: str, vehicle: Vehicle) -> Iterator[Diagnosis]:
+def _ports(verb: str, setup: Setup) -> Iterator[Diagnosis]:
     """Ports that a verb listens on."""
     ports: dict[str, Endpoint] = {}
     if verb in ("vehicle", "demo"):
-        ports["media.port"] = vehicle.media
+        ports["media.port"] = setup.media
     if verb == "demo":
-        ports["control.port"] = vehicle.control
-    if verb == "latency" or (verb in ("operator", "demo") and vehicle.page.serve):
-        ports["page.port"] = vehicle.page.endpoint
+        ports["control.port"] = setup.control
+    if verb == "latency" or (verb in ("operator", "demo") and setup.page.serve):
+        ports["page.port"] = setup.page.endpoint
     for key, endpoint in ports.items():
         try:
             check_port_free(endpoint)

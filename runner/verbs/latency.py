@@ -27,11 +27,12 @@ from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING
 
 from runner.configuration.config import configuration
-from runner.core.model import Camera, Vehicle, suggest
-from runner.errors import ArgumentError, RunError
+from runner.core.model import Camera, Vehicle
+from runner.errors import ArgumentError, RunError, suggest
 from runner.operator.station import Listener
 from runner.records import Note
 from runner.security.exposure import KeysOfAll, page_keyring
+from runner.settings import Setup
 from runner.system.signals import stopping
 from runner.verbs import Arguments
 from runner.verbs.screen import SWITCH_S, progress_bar, say, streaming
@@ -65,11 +66,11 @@ def run(arguments: Arguments) -> int:
 
     duration = arguments.number("duration_s")
     looped = arguments.choice("loop") == "true"
-    vehicle = configuration(arguments.overrides, arguments.conf, runnable=False).vehicle()
-    camera = _camera(vehicle, arguments.values.get("camera"))
-    keys = KeysOfAll.of(vehicle) if looped else None
+    setup = configuration(arguments.overrides, arguments.conf, runnable=False).setup()
+    camera = _camera(setup.vehicle, arguments.values.get("camera"))
+    keys = KeysOfAll.of(setup) if looped else None
     own = [*arguments.overrides, *([f"keys={keys.controller}"] if keys else [])]
-    page_keys = page_keyring(configuration(own, arguments.conf, runnable=False).vehicle())
+    page_keys = page_keyring(configuration(own, arguments.conf, runnable=False).setup())
     sys.setswitchinterval(SWITCH_S)
     readings: deque[CounterReading] = deque(maxlen=MOST_READINGS)
 
@@ -79,10 +80,10 @@ def run(arguments: Arguments) -> int:
 
     with ExitStack() as stack:
         if looped:
-            stack.enter_context(private_broker(vehicle.control, keys.broker if keys else None, say))
+            stack.enter_context(private_broker(setup.control, keys.broker if keys else None, say))
             stack.enter_context(_looped_vehicle(arguments, camera, [f"keys={keys.vehicle}"] if keys else []))
         operator = stack.enter_context(live_operator(own, arguments.conf))
-        page = PageServer(operator.vehicle, operator.station, on_counter, keyring=page_keys)
+        page = PageServer(operator.setup, operator.station, on_counter, keyring=page_keys)
         page.start()
         stack.callback(page.stop)
         operator.station.listeners += [page, _Notes()]
@@ -160,7 +161,7 @@ def _collect(
         before = sampled
         seen = seen or operator.station.state is not None
         if not seen and now - began > START_S:
-            raise RunError(_no_vehicle(operator.vehicle))
+            raise RunError(_no_vehicle(operator.setup))
         if now - reported >= SAY_S and readings:
             reported = now
             say(f"counter read in {_count_read(readings)} of {len(readings)} pictures")
@@ -169,10 +170,10 @@ def _collect(
     return decoded_ms
 
 
-def _no_vehicle(vehicle: Vehicle) -> str:
-    broker = f"{vehicle.control.host}:{vehicle.control.port}"
+def _no_vehicle(setup: Setup) -> str:
+    broker = f"{setup.control.host}:{setup.control.port}"
     rule = "start it with `tod-runner vehicle`, or check name=, control.host= and control.port="
-    return f"no vehicle {vehicle.name} has answered for {START_S:.0f} s over the broker at {broker}: {rule}"
+    return f"no vehicle {setup.vehicle.name} has answered for {START_S:.0f} s over the broker at {broker}: {rule}"
 
 
 def _count_read(readings: Collection[CounterReading]) -> int:

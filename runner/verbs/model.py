@@ -32,8 +32,9 @@ from typing import TYPE_CHECKING
 from runner.bag import PICTURES, Bag, is_bag
 from runner.configuration.config import configuration
 from runner.configuration.files import conf_directories, options
-from runner.core.model import BagTopic, ModelError, Vehicle, suggest
-from runner.errors import COMMAND_LINE, ArgumentError, ConfigError, Problem
+from runner.core.model import BagTopic, ModelError, Vehicle
+from runner.errors import COMMAND_LINE, ArgumentError, ConfigError, Problem, suggest
+from runner.settings import Setup
 from runner.system import signals
 from runner.system.extras import require
 from runner.verbs import Arguments, study_word
@@ -50,12 +51,12 @@ def run(arguments: Arguments) -> int:
     streaming()
     require("model")
     output = arguments.given_path("output", "the directory to write models to")
-    vehicle, study, names = _targets(arguments)
-    paths = _sequences(arguments, vehicle, names)
+    setup, study, names = _targets(arguments)
+    paths = _sequences(arguments, setup, names)
     from runner.rate_quality.measure import measure
 
     with progress_bar() as progress, signals.interruptible():
-        for written in measure(vehicle, study, {name: paths[name] for name in names}, output, progress, say):
+        for written in measure(setup, study, {name: paths[name] for name in names}, output, progress, say):
             print(written)
     return 0
 
@@ -72,7 +73,7 @@ def compare(words: Sequence[str]) -> int:
     return 0
 
 
-def _targets(arguments: Arguments) -> tuple[Vehicle, Study, list[str]]:
+def _targets(arguments: Arguments) -> tuple[Setup, Study, list[str]]:
     """The vehicle, the study, and the cameras to measure; a kind of camera that the vehicle lacks is mounted."""
     from runner.apply import check_plan
     from runner.rate_quality.study import check_cameras
@@ -80,34 +81,34 @@ def _targets(arguments: Arguments) -> tuple[Vehicle, Study, list[str]]:
     words = [study_word(word) for word in arguments.overrides]
     requested = arguments.values.get("camera")
     config = configuration(words, arguments.conf, runnable=False, check=check_plan)
-    study, vehicle = config.study(), config.vehicle()
-    if requested and requested not in vehicle.cameras:
+    study, setup = config.study(), config.setup()
+    if requested and requested not in setup.vehicle.cameras:
         kinds = options("cameras", conf_directories(arguments.conf))
         if requested not in kinds:
-            hint = suggest(requested, [*vehicle.cameras, *kinds])
+            hint = suggest(requested, [*setup.vehicle.cameras, *kinds])
             raise ArgumentError("camera", repr(requested), f"is neither mounted nor a kind of camera{hint}")
         words.append(f"+cameras@cameras.{requested}={requested}")
         config = configuration(words, arguments.conf, runnable=False, check=check_plan)
-        study, vehicle = config.study(), config.vehicle()
-    names = [requested] if requested else list(vehicle.cameras)
+        study, setup = config.study(), config.setup()
+    names = [requested] if requested else list(setup.vehicle.cameras)
     for name in names:
-        own, used = config.document["cameras"][name]["fps"], vehicle.cameras[name].fps
+        own, used = config.document["cameras"][name]["fps"], setup.vehicle.cameras[name].fps
         if float(used) < own - 1e-6:  # not 30000/1001, which is written as 29.97...
             say(f"{name}: fps_max limits its {own:g} Hz to {float(used):g}, which its file will state")
     try:
         check_cameras(study, names)
     except ModelError as error:
         raise ArgumentError(error.key, str(error.found), error.rule) from None
-    return vehicle, study, names
+    return setup, study, names
 
 
-def _sequences(arguments: Arguments, vehicle: Vehicle, names: Sequence[str]) -> Mapping[str, Footage]:
+def _sequences(arguments: Arguments, setup: Setup, names: Sequence[str]) -> Mapping[str, Footage]:
     """By camera, its clip, or its topic in a bag."""
     given = arguments.path("sequence")
     if given is None:
-        return _clips_of_sources(vehicle, names)
+        return _clips_of_sources(setup, names)
     if is_bag(given):
-        return _topics(given, vehicle, names)
+        return _topics(given, setup.vehicle, names)
     if "camera" in arguments.values and not given.is_dir():
         return {names[0]: given}
     if not given.is_dir():
@@ -146,15 +147,13 @@ def _topics(path: Path, vehicle: Vehicle, names: Sequence[str]) -> Mapping[str, 
     return found
 
 
-def _clips_of_sources(vehicle: Vehicle, names: Sequence[str]) -> Mapping[str, Footage]:
+def _clips_of_sources(setup: Setup, names: Sequence[str]) -> Mapping[str, Footage]:
     """By camera, the clip or the bag's pictures that its source plays; missing clips are rendered first."""
-    from dataclasses import replace
-
     from runner.plans import compile_plans, render_missing
 
-    measured = replace(vehicle, cameras={name: vehicle.cameras[name] for name in names})
+    measured = setup.with_cameras({name: setup.vehicle.cameras[name] for name in names})
     with progress_bar() as progress:
-        render_missing(measured, progress)
+        render_missing(measured.vehicle, progress)
     found: dict[str, Footage] = {}
     for plan in compile_plans(measured):
         if plan.bag:

@@ -65,14 +65,14 @@ def _served(operator: LiveOperator, conf: Path | None) -> Iterator[PageServer | 
 
     conf  the user's directory, with the operator's layouts
     """
-    vehicle, station = operator.vehicle, operator.station
-    if not vehicle.page.serve:
+    setup, station = operator.setup, operator.station
+    if not setup.page.serve:
         yield None
         return
     from runner.page.server import PageServer
 
-    layouts = Layouts(conf, station.identity if vehicle.keys else WITHOUT_KEYS)
-    page = PageServer(vehicle, station, keyring=page_keyring(vehicle), layouts=layouts)
+    layouts = Layouts(conf, station.identity if setup.keys else WITHOUT_KEYS)
+    page = PageServer(setup, station, keyring=page_keyring(setup), layouts=layouts)
     station.listeners.append(page)
     page.start()
     station.note(f"page: {page.url}")

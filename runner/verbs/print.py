@@ -57,7 +57,7 @@ def _print_configuration(arguments: Arguments) -> int:
     if "total_kbps" in arguments.values:
         raise ArgumentError("total_kbps", None, "has no effect with format=yaml")
     config = configuration(arguments.overrides, arguments.conf)
-    config.vehicle()
+    config.setup()
     _print(config.listing(), [])
     return 0
 
@@ -88,8 +88,8 @@ def _parameter_sets(plans: Sequence[Plan]) -> list[str]:
 
 def _plan(arguments: Arguments) -> tuple[Vehicle, Sequence[Plan], Decision]:
     total = arguments.number("total_kbps")
-    vehicle = configuration(arguments.overrides, arguments.conf).vehicle()
-    return vehicle, compile_plans(vehicle), decide(vehicle, None if total is None else exact(total))
+    setup = configuration(arguments.overrides, arguments.conf).setup()
+    return setup.vehicle, compile_plans(setup), decide(setup.vehicle, None if total is None else exact(total))
 
 
 def _print(text: str, notes: list[str]) -> None:

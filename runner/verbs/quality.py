@@ -79,13 +79,13 @@ def _cameras(drive: Drive) -> tuple[Mapping[str, Any], Mapping[str, Path]]:
     if missing:
         raise UserError(str(drive.path), "", None, f"no log of the {' and the '.join(missing)}: both sides are needed")
     began = drive.sides["vehicle"].began
-    vehicle = configuration([], base=(dict(began.config), f"{drive.path}: config"), runnable=False).vehicle()
+    setup = configuration([], base=(dict(began.config), f"{drive.path}: config"), runnable=False).setup()
     clips = {  # only rendered ones have the shape of the camera's picture; others are cropped by their source
         plan.camera.name: Path(str(plan.source[0].properties["location"]))
-        for plan in compile_plans(vehicle)
+        for plan in compile_plans(setup)
         if plan.loops and plan.camera.source.render
     }
-    return vehicle.cameras, {name: clip for name, clip in clips.items() if clip.is_file()}
+    return setup.vehicle.cameras, {name: clip for name, clip in clips.items() if clip.is_file()}
 
 
 def _show(path: Path, found: Mapping[str, DeliveredQuality]) -> None:

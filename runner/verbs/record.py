@@ -32,6 +32,7 @@ from runner.core.model import Camera, Vehicle, plain
 from runner.errors import ArgumentError, RunError
 from runner.plans import as_offered, compile_plans, render_missing
 from runner.rate_quality import recordings
+from runner.settings import Setup
 from runner.system.signals import Stop, stopping
 from runner.verbs import Arguments
 from runner.verbs.screen import forgiving, progress_bar, say, streaming
@@ -48,18 +49,19 @@ def run(arguments: Arguments) -> int:
     duration, directory = _duration(arguments), _directory(arguments)
     apply = streaming()
     config = configuration(arguments.overrides, arguments.conf, check=apply.check_plan)
-    vehicle = as_offered(config.vehicle(), say)
+    setup = as_offered(config.setup(), say)
+    vehicle = setup.vehicle
     _check_sources(vehicle)
     recordings.make_directory(directory)
     with progress_bar() as progress:
         render_missing(vehicle, progress)
-    plans = compile_plans(vehicle)
+    plans = compile_plans(setup)
     apply.check_recorders(plans)
-    recordings.check_space(directory, vehicle.cameras.values(), vehicle.recording, duration)
+    recordings.check_space(directory, vehicle.cameras.values(), setup.recording, duration)
     files = recordings.claim_files(directory, vehicle.cameras)
     # Encoders and disks take their time to finish; a second signal does not wait for them.
     with stopping(limit_s=None) as stop, _shown(vehicle, files, duration) as show:
-        session = _Session(vehicle, directory, duration, stop)
+        session = _Session(setup, directory, duration, stop)
         try:
             side = apply.RecordingSide(plans, files, duration)
             try:
@@ -75,14 +77,15 @@ def run(arguments: Arguments) -> int:
 class _Session:
     """One recording from start to end: names files when they are complete, and records why it ends."""
 
-    def __init__(self, vehicle: Vehicle, directory: Path, duration_s: float | None, stop: Stop) -> None:
-        self._vehicle, self._directory, self._duration_s, self._stop = vehicle, directory, duration_s, stop
+    def __init__(self, setup: Setup, directory: Path, duration_s: float | None, stop: Stop) -> None:
+        self._vehicle, self._codec = setup.vehicle, setup.recording.codec
+        self._directory, self._duration_s, self._stop = directory, duration_s, stop
         self._ended: dict[str, Recorded] = {}
         self._finishing = False  # ending before the requested time
         self._kept: set[str] = set()  # cameras whose files are complete and have their names
         self._problems: list[str] = []
         self._losing: set[str] = set()
-        self._margin = recordings.margin(vehicle.cameras.values())
+        self._margin = recordings.margin(setup.vehicle.cameras.values())
 
     def watch(self, side: RecordingSide, show: Show) -> None:
         """Run until every camera has ended."""
@@ -144,7 +147,7 @@ class _Session:
             document = {
                 "tod_runner": version("tod-runner"),
                 "vehicle": self._vehicle.name,
-                "codec": self._vehicle.recording.codec,
+                "codec": self._codec,
                 "cameras": cameras,
                 "configuration": configuration,
             }

@@ -38,9 +38,9 @@ def run(arguments: Arguments) -> int:
     from runner.security.exposure import keyring_of
 
     duration = arguments.number("duration_s")
-    vehicle = configuration(arguments.overrides, arguments.conf, runnable=False).vehicle()
-    check_discovery(vehicle.ros, vehicle.insecure)
-    bridge = Bridge(vehicle, keyring_of(vehicle), say)
+    setup = configuration(arguments.overrides, arguments.conf, runnable=False).setup()
+    check_discovery(setup.ros, setup.insecure)
+    bridge = Bridge(setup, keyring_of(setup), say)
     try:
         bridge.start()
         say(f"requests have the id {bridge.identity}")

@@ -55,12 +55,12 @@ if TYPE_CHECKING:
 def run(arguments: Arguments) -> int:
     from runner.simulation.runs import check, jobs
 
-    setup = simulated.setup(arguments)
+    common = simulated.common(arguments)
     links, kinds = simulated.links(arguments), simulated.predictions(arguments)
-    wanted = jobs(setup, links, kinds, simulated.seeds(arguments), simulated.windows(arguments))
-    check(setup, wanted)
+    wanted = jobs(common, links, kinds, simulated.seeds(arguments), simulated.windows(arguments))
+    check(common, wanted)
     figure, places, workers = simulated.figure(arguments), _places(arguments, wanted), simulated.workers(arguments)
-    results = list(simulated.run_all(setup, wanted, places, workers, keep=figure is not None))
+    results = list(simulated.run_all(common, wanted, places, workers, keep=figure is not None))
     print("\n".join(_table(results)))
     if output := arguments.path("output"):
         write_whole(output, json.dumps([one.to_json() for one in results], indent=1).encode())

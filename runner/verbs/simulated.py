@@ -12,7 +12,7 @@ from runner.errors import ArgumentError, RunError
 from runner.verbs import Arguments
 
 if TYPE_CHECKING:
-    from runner.simulation.runs import Job, Result, Setup
+    from runner.simulation.runs import Common, Job, Result
 
 ALL, SYNTHETIC = "all", "synthetic"
 SHORTEST_S = 1.0  # that counts
@@ -21,24 +21,24 @@ FORMATS = (".png", ".pdf", ".svg")  # of the figure
 Place = tuple[Path, float]  # directory of a drive, and when it began, s since 1970
 
 
-def setup(arguments: Arguments) -> Setup:
+def common(arguments: Arguments) -> Common:
     """What all drives have in common."""
     from runner.simulation.drive import Conditions
     from runner.simulation.encoder import EncoderModel
-    from runner.simulation.runs import DURATION_S, Scheduler, Setup
+    from runner.simulation.runs import DURATION_S, Common, Scheduler
 
     def number(key: str, default: float = 0.0) -> float:
         value = arguments.number(key)
         return default if value is None else value
 
-    duration_s, since_s = arguments.number("duration_s"), number("since_s", Setup.since_s)
+    duration_s, since_s = arguments.number("duration_s"), number("since_s", Common.since_s)
     if (shown_s := DURATION_S if duration_s is None else duration_s) < since_s + SHORTEST_S:
         rule = f"must be at least {since_s + SHORTEST_S:g}: the first {since_s:g} s do not count"
         raise ArgumentError("duration_s", f"{shown_s:g}", rule)
     if (lost := number("report_loss")) > 1:
         raise ArgumentError("report_loss", f"{lost:g}", "must be a share from 0 to 1")
     credit_ms, grant_ms = number("credit_ms"), number("grant_ms")
-    return Setup(
+    return Common(
         tuple(arguments.overrides),
         arguments.conf,
         duration_s,
@@ -123,7 +123,7 @@ def figure(arguments: Arguments) -> Path | None:
 
 
 def run_all(
-    setup: Setup, wanted: Sequence[Job], places: Sequence[Place | None], workers: int, *, keep: bool
+    common: Common, wanted: Sequence[Job], places: Sequence[Place | None], workers: int, *, keep: bool
 ) -> Iterator[Result]:
     """All drives, in order, on several cores; shows the progress.
 
@@ -140,11 +140,11 @@ def run_all(
         if min(workers, len(each)) == 1:
             for number, (job, place) in enumerate(each):
                 progress("simulated", number / len(each))
-                yield run_job(setup, job, keep, place)
+                yield run_job(common, job, keep, place)
         else:
             try:
                 with process_pool(min(workers, len(each))) as pool:
-                    running = [pool.submit(run_job, setup, job, keep, place) for job, place in each]
+                    running = [pool.submit(run_job, common, job, keep, place) for job, place in each]
                     for number, one in enumerate(running):
                         progress("simulated", number / len(each))
                         yield one.result()

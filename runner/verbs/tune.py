@@ -39,7 +39,7 @@ from runner.verbs.simulated import row
 if TYPE_CHECKING:
     from runner.simulation.comparison import Compared, Means
     from runner.simulation.numbers import Trial
-    from runner.simulation.runs import Job, Result, Setup
+    from runner.simulation.runs import Common, Job, Result
 
 Sets = tuple[list["Job"], list["Job"]]  # drives over the links for tuning, and over those left out
 
@@ -48,14 +48,14 @@ def run(arguments: Arguments) -> int:
     from runner.simulation.comparison import CRITERION, compared, means
     from runner.simulation.runs import check
 
-    setup = simulated.setup(arguments)
-    figure, workers, sets = simulated.figure(arguments), simulated.workers(arguments), _sets(arguments, setup)
+    common = simulated.common(arguments)
+    figure, workers, sets = simulated.figure(arguments), simulated.workers(arguments), _sets(arguments, common)
     drives = [*sets[0], *sets[1]]
-    check(setup, drives)
-    tried = _trials(arguments, setup, drives)
+    check(common, drives)
+    tried = _trials(arguments, common, drives)
     say(f"{len(tried)} value{'s' if len(tried) > 1 else ''} and those in force, on {len(drives)} drives each")
     wanted = [*drives, *(_under(trial, job) for trial in tried for job in drives)]
-    results = list(simulated.run_all(setup, wanted, [None] * len(wanted), workers, keep=False))
+    results = list(simulated.run_all(common, wanted, [None] * len(wanted), workers, keep=False))
     base, *others = (_of_sets(results[at : at + len(drives)], sets) for at in range(0, len(results), len(drives)))
     in_force = [means(some) for some in base]
     values = [compared(trial, base, other) for trial, other in zip(tried, others, strict=True)]
@@ -69,7 +69,7 @@ def run(arguments: Arguments) -> int:
     return 0
 
 
-def _sets(arguments: Arguments, setup: Setup) -> Sets:
+def _sets(arguments: Arguments, common: Common) -> Sets:
     """raises ArgumentError, ConfigError"""
     from runner.simulation.families import LEFT_OUT, LEFT_OUT_SEED
     from runner.simulation.runs import jobs
@@ -82,16 +82,16 @@ def _sets(arguments: Arguments, setup: Setup) -> Sets:
         raise ArgumentError("seeds", str(len(seeds)), "must be 2 or more: a difference has to exceed what they spread")
     kinds, windows = simulated.predictions(arguments), simulated.windows(arguments)
     fresh = range(LEFT_OUT_SEED, LEFT_OUT_SEED + len(seeds))
-    return jobs(setup, tuned, kinds, seeds, windows), jobs(setup, left_out, kinds, fresh, windows)
+    return jobs(common, tuned, kinds, seeds, windows), jobs(common, left_out, kinds, fresh, windows)
 
 
-def _trials(arguments: Arguments, setup: Setup, drives: Sequence[Job]) -> list[Trial]:
+def _trials(arguments: Arguments, common: Common, drives: Sequence[Job]) -> list[Trial]:
     """raises ArgumentError, ConfigError"""
     from runner.simulation.numbers import trials
     from runner.simulation.runs import rules_in_force
 
     vary = arguments.values.get("vary")
-    tried, skipped = trials(vary, *rules_in_force(setup, drives))
+    tried, skipped = trials(vary, *rules_in_force(common, drives))
     if not tried:
         raise ArgumentError("vary", vary, "; ".join(skipped) or "gives no value but those in force")
     for what in skipped:

@@ -42,8 +42,8 @@ from runner.configuration.config import Configuration
 from runner.configuration.files import GROUPS, LAYOUT, bases_of, built_on, conf_directories, find_file, options
 from runner.configuration.overrides import choosable
 from runner.configuration.yaml_file import label, load_file, load_node
-from runner.core.model import ModelError, suggest
-from runner.errors import COMMAND_LINE, ArgumentError, ConfigError, MissingBindings, Problem, RunError
+from runner.core.model import ModelError
+from runner.errors import COMMAND_LINE, ArgumentError, ConfigError, MissingBindings, Problem, RunError, suggest
 from runner.graph import Plan
 from runner.verbs import Arguments
 
@@ -99,7 +99,7 @@ class ValidationTask(NamedTuple):
         """The readers to apply to the configuration."""
         if not self.choices or "experiment" in dict(self.choices):
             return Configuration.pqos, Configuration.experiment, Configuration.link
-        return [READERS.get(group, Configuration.vehicle) for group, _ in self.choices]
+        return [READERS.get(group, Configuration.setup) for group, _ in self.choices]
 
 
 def run(arguments: Arguments) -> int:

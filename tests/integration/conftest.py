@@ -14,8 +14,8 @@ import pytest
 from ros_domain import running
 
 from rig import BROWSER, CHROMIUM_FLAGS, free_port
-from runner.core.model import Endpoint
 from runner.mqtt.broker import private_broker
+from runner.settings import Endpoint
 
 UNTIMED = ("test_keyframe", "test_model", "test_report_page")
 

@@ -37,9 +37,9 @@ class Notes(Listener):
 
 def main(words: list[str]) -> None:
     config = configuration(words, check=apply.check_plan)
-    vehicle = config.vehicle()
-    plans, keyring = compile_plans(vehicle), viewer_keyring(vehicle)
-    station = Station(vehicle, agreement.settings(config.document), keyring)
+    setup = config.setup()
+    plans, keyring = compile_plans(setup), viewer_keyring(setup)
+    station = Station(setup, agreement.settings(config.document), keyring)
     station.listeners.append(Notes())
 
     def build(_on_unit: object) -> apply.OperatorSide:
@@ -49,10 +49,10 @@ def main(words: list[str]) -> None:
             on_picture=lambda camera, *_: report(what=camera, t=time.monotonic()),
             operator=station.identity,
             keyring=keyring,
-            vehicle=vehicle.name,
+            vehicle=setup.vehicle.name,
         )
 
-    operator = LiveOperator(vehicle, station, Log(None, "operator", {}, {}, station.note), build)
+    operator = LiveOperator(setup, station, Log(None, "operator", {}, {}, station.note), build)
     operator.start()
     while operator.runs(ASK_S):
         station.ask({"event": "mode_selected", "mode": "automatic"}, on_answer)

@@ -396,21 +396,19 @@ def process(
 def streaming(
     *overrides: str, cameras: Sequence[str] = ("front_left",), keyring: Keyring | None = None
 ) -> Iterator[Any]:
-    """Some cameras of a vehicle behind a real RTSP server. Yields (side, vehicle, plans, reports)."""
-    from dataclasses import replace
-
+    """Some cameras of a vehicle behind a real RTSP server. Yields (side, setup, plans, reports)."""
     from runner.apply import VehicleSide, check_plan
     from runner.configuration.config import configuration
     from runner.plans import compile_plans
 
     words = ["source=test", *overrides, f"media.port={free_port()}"]
-    vehicle = configuration(words, check=check_plan).vehicle()
-    vehicle = replace(vehicle, cameras={name: vehicle.cameras[name] for name in cameras or vehicle.cameras})
-    plans = compile_plans(vehicle)
+    setup = configuration(words, check=check_plan).setup()
+    setup = setup.with_cameras({name: setup.vehicle.cameras[name] for name in cameras or setup.vehicle.cameras})
+    plans = compile_plans(setup)
     reported: list[str] = []
-    side = VehicleSide(plans, vehicle.media, lambda camera, what: reported.append(f"{camera}: {what}"), keyring=keyring)
+    side = VehicleSide(plans, setup.media, lambda camera, what: reported.append(f"{camera}: {what}"), keyring=keyring)
     try:
-        yield side, vehicle, plans, reported
+        yield side, setup, plans, reported
     finally:
         side.stop()
 

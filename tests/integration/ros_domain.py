@@ -16,7 +16,7 @@ from xmlrpc.client import ServerProxy
 import pytest
 
 from rig import CHECKOUT, answers, free_port, until
-from runner.core.model import RosSettings
+from runner.settings import RosSettings
 
 NODE = "/tod_runner"
 SCRIPT = "ros/node"  # in the command line of the node

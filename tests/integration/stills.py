@@ -53,7 +53,8 @@ class Station(SimpleNamespace):
         document = vehicle_file(cameras, size, estimated)
         (place / "conf" / "vehicle" / "marks.yaml").write_text(f"# @package _global_\n{json.dumps(document)}\n")
         words = ["vehicle=marks", "source=test", "mode=single", f"page.port={free_port()}", *words]
-        self.vehicle = configuration(words, place / "conf").vehicle()
+        self.setup = configuration(words, place / "conf").setup()
+        self.vehicle = self.setup.vehicle
         self.run = start(self.vehicle)
         for name, camera in cameras.items():
             self.step(event="camera_configured", camera=name, kbps=4000, scaling=camera.factor)
@@ -128,7 +129,7 @@ def vehicle_file(cameras, size, estimated):
 @contextmanager
 def serving(station):
     """The page's server, sending the pictures of all cameras except the silent ones."""
-    page = PageServer(station.vehicle, station)
+    page = PageServer(station.setup, station)
     page.behind_s = 0.0  # how long ago pictures were captured
 
     def send():

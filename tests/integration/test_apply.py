@@ -184,9 +184,9 @@ def describe(endpoint, path, seconds=20.0):
 
 
 def test_a_camera_that_is_off_before_the_first_client_answers_at_once():
-    with streaming() as (side, vehicle, (plan,), reported):
+    with streaming() as (side, setup, (plan,), reported):
         turn(side, sending=False)
-        assert describe(vehicle.media, CAMERA) == "RTSP/1.0 200 OK"
+        assert describe(setup.media, CAMERA) == "RTSP/1.0 200 OK"
         until(lambda: f"{CAMERA}: pipeline stopped" in reported)  # the server refuses clients at this moment
         with watching(plan) as client:
             until(lambda: side.read()[CAMERA].applied.get("sending") is False)
@@ -357,9 +357,9 @@ def test_a_frame_of_a_misspelt_camera_is_refused():
 def test_a_port_in_use_is_reported_in_one_line():
     from runner.system.ports import check_port_free
 
-    with streaming() as (_, vehicle, _, _reported), pytest.raises(RunError) as raised:
-        check_port_free(vehicle.media)
-    where = f"127.0.0.1:{vehicle.media.port}"
+    with streaming() as (_, setup, _, _reported), pytest.raises(RunError) as raised:
+        check_port_free(setup.media)
+    where = f"127.0.0.1:{setup.media.port}"
     assert str(raised.value) == f"cannot listen on {where}: address already in use; choose another port"
 
 

@@ -414,10 +414,10 @@ def test_two_cameras_arrive_in_order_with_the_times_of_the_bag(tmp_path):
         for name, kind in (("front", "ros1"), ("rear", "mcap"))
     )
     words = robot(bag, f"cameras.rear.bag={other}")
-    with streaming(*words, cameras=()) as (side, vehicle, _, reported):
+    with streaming(*words, cameras=()) as (side, setup, _, reported):
         send(side, "front", "rear")
         seen = {name: [] for name in order}
-        with live_frames([*words, f"media.port={vehicle.media.port}"]) as received:
+        with live_frames([*words, f"media.port={setup.media.port}"]) as received:
             until(lambda: take(received, seen) and min(map(len, seen.values())) > 2 * count)
     for name, pictures in seen.items():
         numbers = [order[name].index(number) for number, _, _ in pictures]

@@ -82,7 +82,7 @@ def test_frames_of_a_v4l2_camera_keep_their_capture_times(fps):
     """Also of a camera at twice the rate, whose every second frame is dropped."""
     from runner.gst import Gst
 
-    (plan,) = (p for p in compile_plans(configuration([*V4L2]).vehicle()) if p.camera.name == CAMERA)
+    (plan,) = (p for p in compile_plans(configuration([*V4L2]).setup()) if p.camera.name == CAMERA)
     caps = f"video/x-raw,format=I420,width=1920,height=1040,framerate={fps}/1"
     stand_in = Element("source", "appsrc", {"format": "time", "is-live": True, "caps": caps})
     pipeline = Gst.parse_launch(f"{launch((stand_in, *plan.source[1:]))} ! appsink name=sink sync=false")

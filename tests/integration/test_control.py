@@ -19,11 +19,11 @@ import pytest
 
 from rig import CHECKOUT, ROBOT, SMALL_ROBOT, Operator, RecordingListener, free_port, process, run, until
 from runner.configuration.config import configuration
-from runner.core.model import Endpoint
 from runner.mqtt.broker import find_mosquitto, private_broker
 from runner.mqtt.link import ControlLink
 from runner.mqtt.messages import MAX_ROUND_TRIP_S, OFFLINE, topic
 from runner.operator.station import Station
+from runner.settings import Endpoint
 from runner.vehicle.operators import SILENT_S
 
 
@@ -253,7 +253,7 @@ def test_the_control_link_recovers_after_the_broker_has_hung(tmp_path):
     broker = Endpoint("127.0.0.1", free_port())
     file = tmp_path / "mosquitto.conf"
     file.write_text(f"listener {broker.port} {broker.host}\nallow_anonymous true\n")
-    station = Station(configuration([*ROBOT, f"control.port={broker.port}"]).vehicle(), {})
+    station = Station(configuration([*ROBOT, f"control.port={broker.port}"]).setup(), {})
     with subprocess.Popen([find_mosquitto(), "-c", file], stderr=subprocess.DEVNULL) as mosquitto:
         try:
             with process("vehicle", *ROBOT, f"control.port={broker.port}", f"media.port={free_port()}"):
@@ -308,7 +308,7 @@ GARBAGE = (
 
 @pytest.fixture
 def station(broker):
-    station = Station(configuration([*ROBOT, f"control.port={broker.port}"]).vehicle(), {})
+    station = Station(configuration([*ROBOT, f"control.port={broker.port}"]).setup(), {})
     listener = RecordingListener()
     station.listeners.append(listener)
     yield station, listener
@@ -335,7 +335,7 @@ def test_invalid_messages_from_the_vehicle_end_no_operator(broker, vehicle, stat
 
 def test_an_unknown_vehicle_is_reported_with_the_known_ones(broker, vehicle):
     Operator(broker).as_of()
-    station = Station(configuration([*ROBOT, "name=delivery_robott", f"control.port={broker.port}"]).vehicle(), {})
+    station = Station(configuration([*ROBOT, "name=delivery_robott", f"control.port={broker.port}"]).setup(), {})
     listener = RecordingListener()
     station.listeners.append(listener)
     station.connect()

@@ -61,16 +61,16 @@ def writes(monkeypatch):
 @pytest.fixture
 def streaming():
     """The vehicle's side with a viewer, playing, and the vehicle."""
-    vehicle = configuration([*ROBOT, f"media.port={free_port()}"], check=check_plan).vehicle()
-    plans = compile_plans(vehicle)
+    setup = configuration([*ROBOT, f"media.port={free_port()}"], check=check_plan).setup()
+    plans = compile_plans(setup)
     with ExitStack() as stack:
-        side = VehicleSide(plans, vehicle.media, lambda *_: None)
+        side = VehicleSide(plans, setup.media, lambda *_: None)
         stack.callback(side.stop)
-        side.turn(Command(name, "bitrate", 500) for name in vehicle.cameras)
+        side.turn(Command(name, "bitrate", 500) for name in setup.vehicle.cameras)
         viewer = OperatorSide(plans, lambda *_: None)
         stack.callback(viewer.stop)
         until(lambda: all(each.frames > FRAMES for each in viewer.sample({}).values()))
-        yield side, vehicle
+        yield side, setup.vehicle
 
 
 def test_a_frame_costs_no_call_into_python_on_the_vehicle(calls, streaming):
@@ -114,7 +114,7 @@ def test_a_side_loads_the_plugins_of_its_own_part_only(check, loads):
     code = f"""
 from runner import apply
 from runner.configuration.config import configuration
-configuration({ROBOT!r}, check=apply.{check}).vehicle()
+configuration({ROBOT!r}, check=apply.{check}).setup()
 mapped = open("/proc/self/maps").read()
 print([name for name in ("libgstx264", "libgstlibav") if name in mapped])
 """

@@ -9,11 +9,11 @@ import pytest
 
 from rig import free_port, needs_root, process, until
 from runner.configuration.config import configuration
-from runner.core.model import Endpoint
 from runner.link import limited_link
 from runner.link.limit import Limit, OneWay
 from runner.mqtt.broker import private_broker
 from runner.plans import compile_plans
+from runner.settings import Endpoint
 
 BACK_S = 5
 CONTROL_S = 1.0  # until the control link has recovered; until then it is unknown which cameras should send
@@ -30,7 +30,7 @@ def received(*words):
     """One camera at the operator. Yields (frames so far, given whether it is known to send; messages)."""
     from runner.apply import OperatorSide
 
-    plans = compile_plans(configuration([*COMMON, *words]).vehicle())
+    plans = compile_plans(configuration([*COMMON, *words]).setup())
     messages = []
     side = OperatorSide(plans, lambda cameras, what: messages.append(f"{cameras}: {what}"))
     name = plans[0].camera.name

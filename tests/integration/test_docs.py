@@ -15,8 +15,8 @@ from drives import measured, write_drive
 from helpers import Command
 
 from rig import CHECKOUT, SMALL_ROBOT, answers, free_port, process, run, until
-from runner.core.model import Endpoint
 from runner.mqtt.broker import private_broker
+from runner.settings import Endpoint
 
 DOCUMENTS = [CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").glob("*.md"))]
 PROGRAMS = ("tod-runner", "mosquitto_", "t=$(", "ffplay", "make", "pip")

@@ -22,12 +22,12 @@ import pytest
 from browser import PADS, all_live, measure, opened, press_button, send, shot, state_when, take_control, until, viewing
 from rig import CHECKOUT, answers, free_port, needs_browser, passes, process
 from runner.configuration.config import configuration
-from runner.core.model import Endpoint
 from runner.link import Limit
 from runner.link.limit import Rates
 from runner.link.relayed import relayed
 from runner.mqtt.broker import private_broker
 from runner.operator.meter import percentile
+from runner.settings import Endpoint
 
 pytestmark = [
     pytest.mark.gst,
@@ -49,9 +49,9 @@ RED, AMBER = (224, 27, 36), (255, 176, 0)  # of the marks: overlay.js
 class Drive:
     """A vehicle whose cameras fail on command, and the link between it and an operator's page."""
 
-    def __init__(self, url, vehicle, fed, shaper):
-        self.url, self.vehicle, self._fed, self._shaper = url, vehicle, fed, shaper
-        self.noticed_ms = vehicle.page.late_ms + MORE_MS
+    def __init__(self, url, setup, fed, shaper):
+        self.url, self.setup, self._fed, self._shaper = url, setup, fed, shaper
+        self.noticed_ms = setup.page.late_ms + MORE_MS
 
     def let(self, camera, does):
         """A camera moves, hangs or repeats its picture from now on, or loses one; returns when, ms since 1970."""
@@ -98,7 +98,7 @@ def drive(tmp_path_factory):
     words = ("vehicle=tasks", "source=appsrc", f"+source.repeated_s={REPEATED_S}", "pqos=constant")
     words += (f"pqos.kbps={TOTAL_KBPS}", f"page.port={page.port}", "control.expires_s=10")
     words += ("modes=open_loop",)  # not the measured link, whose stalls would lower the total
-    vehicle = configuration(words, conf).vehicle()
+    setup = configuration(words, conf).setup()
     with (
         relayed(Limit(lambda t: WIDE, QUEUE_MS, 0), media, control) as ends,
         private_broker(control),
@@ -106,7 +106,7 @@ def drive(tmp_path_factory):
         process("operator", *words, *ends.operator_overrides, f"conf={conf}", stdout=subprocess.DEVNULL),
     ):
         until(lambda: answers(page.port))
-        yield Drive(f"http://127.0.0.1:{page.port}/", vehicle, feeding, ends.shaper)
+        yield Drive(f"http://127.0.0.1:{page.port}/", setup, feeding, ends.shaper)
 
 
 @contextmanager
@@ -155,13 +155,13 @@ class Driver:
 
 @pytest.fixture(params=["keys", "buttons"])
 def driver(request, page, drive):
-    return Driver(page, drive.vehicle.inputs, request.param)
+    return Driver(page, drive.setup.inputs, request.param)
 
 
 @pytest.fixture
 def typist(page, drive):
     """A driver with a keyboard: the configuration defines what buttons do."""
-    return Driver(page, drive.vehicle.inputs, "keys")
+    return Driver(page, drive.setup.inputs, "keys")
 
 
 def box(page, camera):
@@ -371,8 +371,8 @@ def test_notice_a_late_picture(page, drive):
     The first picture that it holds up is captured up to a frame interval after it stopped: only if it stops for longer
     by that is this picture certainly late. Those of the other cameras follow it within a frame interval.
     """
-    sent, late_ms = drive.sent_kbps(), drive.vehicle.page.late_ms
-    interval_ms = 1000 / min(float(camera.fps) for camera in drive.vehicle.cameras.values())
+    sent, late_ms = drive.sent_kbps(), drive.setup.page.late_ms
+    interval_ms = 1000 / min(float(camera.fps) for camera in drive.setup.vehicle.cameras.values())
     assert sent > 0.5 * TOTAL_KBPS, "what is sent is less than what a full queue lasts for"
     drive.stall(2 * late_ms, 1.05 * sent)
     until(lambda: share(page, "front", AMBER) > 0.03)

@@ -16,8 +16,8 @@ import pytest
 from soak.signals import LIMIT_S, MARK, ROBOT, marked_processes
 
 from rig import CHECKOUT, free_port, until
-from runner.core.model import Endpoint
 from runner.mqtt.broker import private_broker
+from runner.settings import Endpoint
 
 pytestmark = pytest.mark.gst
 

@@ -7,7 +7,6 @@ import math
 import shutil
 import struct
 import subprocess
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -131,12 +130,12 @@ def filmed(tmp_path_factory):
     """Two cameras, really streamed and received, in a drive of both sides; the first frame of each file."""
     drive, first_frames, shifts, arrived = tmp_path_factory.mktemp("filmed"), [], [], []
     words = ["vehicle=delivery_robot", "source=test", f"media.port={free_port()}"]
-    vehicle = configuration(words, check=check_plan).vehicle()
-    vehicle = replace(vehicle, cameras={name: vehicle.cameras[name] for name in CAMERAS})
-    plans = [over_tcp(plan) for plan in compile_plans(vehicle)]  # a busy machine loses packets of UDP
+    setup = configuration(words, check=check_plan).setup()
+    setup = setup.with_cameras({name: setup.vehicle.cameras[name] for name in CAMERAS})
+    plans = [over_tcp(plan) for plan in compile_plans(setup)]  # a busy machine loses packets of UDP
     files = VideoFiles(drive, lambda *first: first_frames.append(first), lambda *shift: shifts.append(shift))
     reported = []
-    sending = VehicleSide(plans, vehicle.media, lambda camera, what: reported.append(what), files)
+    sending = VehicleSide(plans, setup.media, lambda camera, what: reported.append(what), files)
     try:
         sending.turn(Command(name, "size", (320, 180)) for name in CAMERAS)
         for _ in range(2):

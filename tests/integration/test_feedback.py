@@ -12,8 +12,7 @@ import pytest
 
 from rig import NOISE, ROBOT_SIZES, SMALL_ROBOT, Operator, free_port, needs_root, process, run
 from runner.core.belief import ABSENT_S
-from runner.core.events import LinkMeasured, OperatorConnected
-from runner.core.evidence import LinkState
+from runner.core.events import LinkMeasured, LinkState, OperatorConnected
 from runner.drive.read import read_drive
 from runner.records import DecisionMade, LinkSample, ReceptionReported
 

@@ -18,17 +18,16 @@ pytestmark = pytest.mark.gst
 @pytest.fixture
 def robot():
     host = f"media.host={LOOPBACK6}"
-    with streaming(*SMALL_ROBOT, "fps_max=15", host, cameras=()) as (side, vehicle, _, _):
-        side.turn(
-            [Command(name, *knob) for name in vehicle.cameras for knob in (("size", (450, 260)), ("bitrate", 900))]
-        )
+    with streaming(*SMALL_ROBOT, "fps_max=15", host, cameras=()) as (side, setup, _, _):
+        knobs = (("size", (450, 260)), ("bitrate", 900))
+        side.turn([Command(name, *knob) for name in setup.vehicle.cameras for knob in knobs])
         yield (
             side,
             [
                 *SMALL_ROBOT,
                 "fps_max=15",
                 host,
-                f"media.port={vehicle.media.port}",
+                f"media.port={setup.media.port}",
             ],
         )
 

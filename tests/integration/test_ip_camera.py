@@ -26,16 +26,16 @@ def driving(*words):
     """A robot whose rear camera is an IP camera. Yields (camera's process, side, vehicle, plan, reported)."""
     with (
         ip_camera(free_port()) as (address, camera),
-        streaming(*WORDS, f'source.address="{address}"', *words, cameras=("rear",)) as (side, vehicle, plans, reported),
+        streaming(*WORDS, f'source.address="{address}"', *words, cameras=("rear",)) as (side, setup, plans, reported),
     ):
         knobs(side, sending=True, size=(424, 240), bitrate=500)
-        yield camera, side, vehicle, plans[0], reported
+        yield camera, side, setup, plans[0], reported
 
 
 @contextmanager
-def ffmpeg(vehicle, transport):
+def ffmpeg(setup, transport):
     """A third-party viewer. Yields a function: how many frames it has decoded."""
-    url = f"rtsp://127.0.0.1:{vehicle.media.port}/rear"
+    url = f"rtsp://127.0.0.1:{setup.media.port}/rear"
     command = ["ffmpeg", "-v", "error", "-progress", "-", "-rtsp_transport", transport, "-i", url, "-f", "null", "-"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as child:
         seen = [0]
@@ -57,10 +57,10 @@ def ffmpeg(vehicle, transport):
 @pytest.mark.parametrize("frozen_s", [4, pytest.param(15, marks=pytest.mark.soak)])
 def test_a_camera_that_froze_comes_back_and_viewers_keep_their_session(frozen_s):
     with (
-        driving() as (camera, side, vehicle, plan, reported),
+        driving() as (camera, side, setup, plan, reported),
         watching(plan) as client,
-        ffmpeg(vehicle, "tcp") as over_tcp,
-        ffmpeg(vehicle, "udp") as over_udp,
+        ffmpeg(setup, "tcp") as over_tcp,
+        ffmpeg(setup, "udp") as over_udp,
     ):
 
         def counts():

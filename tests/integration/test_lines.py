@@ -78,8 +78,8 @@ def test_a_clip_with_blanks_in_its_path_plays(tod, tmp_path):
 @pytest.mark.parametrize("retransmission_ms", [0, 200])
 def test_a_third_party_client_plays_the_stream(transport, retransmission_ms):
     words = ("vehicle=delivery_robot", f"graph.retransmission_ms={retransmission_ms}")
-    with streaming(*words, cameras=("rear",)) as (_, vehicle, _, _reported):
-        url = f"rtsp://127.0.0.1:{vehicle.media.port}/rear"
+    with streaming(*words, cameras=("rear",)) as (_, setup, _, _reported):
+        url = f"rtsp://127.0.0.1:{setup.media.port}/rear"
         command = ["ffmpeg", "-v", "error", "-rtsp_transport", transport, "-i", url, "-frames:v", "30"]
         picture = ["-f", "rawvideo", "-pix_fmt", "gray", "-"]
         done = subprocess.run([*command, *picture], capture_output=True, timeout=60, check=True)

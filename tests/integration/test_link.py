@@ -19,12 +19,12 @@ from machines import machines
 from rig import CHECKOUT, NOISE, free_port, needs_root, over_tcp, process, streaming, until, watching
 from runner.configuration.config import configuration
 from runner.core.commands import Command
-from runner.core.model import Endpoint
 from runner.errors import RunError
 from runner.link import Limit, limited_link
 from runner.link.limit import OneWay, Policing, Rates, TcpFlows
 from runner.mqtt.broker import private_broker
 from runner.plans import compile_plans
+from runner.settings import Endpoint
 
 ROBOT = ("vehicle=delivery_robot", "~cameras.front", "~cameras.mast", "fps_max=15", "page.serve=false", "pqos=constant")
 SETTLE_S, MEASURE_S = 2.0, 4.0
@@ -105,7 +105,7 @@ def driving(kind, kbps_at, sent_kbps, tcp=False, queue_ms=200, delay_at=None):
         private_broker(link.broker),
         process("vehicle", *words, *link.vehicle_overrides, before=link.vehicle_command) as vehicle,
     ):
-        plans = compile_plans(configuration([*words, *link.operator_overrides]).vehicle())
+        plans = compile_plans(configuration([*words, *link.operator_overrides]).setup())
         side = OperatorSide([over_tcp(plan) if tcp else plan for plan in plans], lambda *_: None)
         try:
             drive = Drive(link, lines, side, vehicle, plans[0])
@@ -233,8 +233,8 @@ def test_lost_packets_are_retransmitted_through_the_relay():
     limit = Limit(lambda t: 4000, queue_ms=25, delay_ms=0)
     overrides = (*NOISE, "vehicle=delivery_robot", "fps_max=15", "graph.retransmission_ms=200")
     with (
-        streaming(*overrides, cameras=("rear",)) as (side, vehicle, plans, _),
-        limited_link("relay", limit, vehicle.media, _ends()[0], print) as link,
+        streaming(*overrides, cameras=("rear",)) as (side, setup, plans, _),
+        limited_link("relay", limit, setup.media, _ends()[0], print) as link,
     ):
         side.turn([Command("rear", "bitrate", 2000), Command("rear", "sending", True)])
         with watching(_at(plans[0], link.operator_overrides), feedback=True) as client:

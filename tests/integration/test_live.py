@@ -14,13 +14,13 @@ import pytest
 
 from rig import CLIPS, ROBOT, SHARED, SMALL_ROBOT, Operator, free_port, process, run, until
 from runner.core.events import BitratePredicted, CameraSwitched
-from runner.core.model import Endpoint
 from runner.drive.log import FILES
 from runner.drive.read import read_drive
 from runner.errors import RunError
 from runner.mqtt.broker import private_broker
 from runner.operator.frames import live_frames
 from runner.records import Sample
+from runner.settings import Endpoint
 
 NAN = b'{"id": "n", "event": "total_set", "kbps": NaN}'
 HUGE = b'{"id": "h", "event": "total_set", "kbps": 1e999}'

@@ -13,7 +13,6 @@ from datetime import UTC, datetime, timedelta
 import pytest
 
 from rig import free_port, until
-from runner.core.model import Endpoint
 from runner.core.roles import Role
 from runner.mqtt.broker import private_broker
 from runner.mqtt.link import ControlLink
@@ -21,6 +20,7 @@ from runner.mqtt.login import Login
 from runner.security import keyring
 from runner.security.authority import Authority
 from runner.security.keyring import Keyring
+from runner.settings import Endpoint
 
 pytestmark = pytest.mark.gst
 

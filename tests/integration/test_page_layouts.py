@@ -97,9 +97,10 @@ def picture():
 @contextmanager
 def served(picture, layouts, *words, vehicle=SMALL_ROBOT, conf=None):
     """A vehicle's page with pictures: its server and the station."""
-    vehicle = configuration([*vehicle, *WORDS, f"page.port={free_port()}", *words], conf).vehicle()
+    setup = configuration([*vehicle, *WORDS, f"page.port={free_port()}", *words], conf).setup()
+    vehicle = setup.vehicle
     station = Station(vehicle)
-    page, ended = PageServer(vehicle, station, layouts=layouts), threading.Event()
+    page, ended = PageServer(setup, station, layouts=layouts), threading.Event()
     page.silent = set()  # names of cameras that send nothing
     page.behind_s = 0.0  # how long ago pictures were captured
     page.sample = None  # sent with each picture

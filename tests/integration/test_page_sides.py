@@ -20,12 +20,12 @@ import pytest
 
 from browser import all_live, has_started, luma, measure, opened, send, shot, state_when, take_control, until, visit
 from rig import CHECKOUT, SMALL_ROBOT, answers, clock_ahead, free_port, needs_browser, needs_compiler, process
-from runner.core.model import Endpoint
 from runner.core.roles import Role
 from runner.drive.read import read_drive
 from runner.mqtt.broker import private_broker
 from runner.records import Sample
 from runner.security.authority import Authority
+from runner.settings import Endpoint
 
 pytestmark = [pytest.mark.gst, needs_browser]
 

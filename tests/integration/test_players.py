@@ -30,16 +30,16 @@ KNOBS = {"sending": True, "size": (320, 180), "bitrate": 500}
 class Served:
     """A camera that is sent, the plan of its receivers, and what its vehicle reports."""
 
-    def __init__(self, side, vehicle, plan, reported):
+    def __init__(self, side, setup, plan, reported):
         self.plan, self.reported = plan, reported
-        self.url = f"rtsp://127.0.0.1:{vehicle.media.port}/{CAMERA}"
+        self.url = f"rtsp://127.0.0.1:{setup.media.port}/{CAMERA}"
         side.turn([Command(CAMERA, *knob) for knob in KNOBS.items()])
 
 
 @contextmanager
 def serving(*overrides):
-    with streaming(*SMALL, *overrides, cameras=(CAMERA,)) as (side, vehicle, (plan,), reported):
-        yield Served(side, vehicle, plan, reported)
+    with streaming(*SMALL, *overrides, cameras=(CAMERA,)) as (side, setup, (plan,), reported):
+        yield Served(side, setup, plan, reported)
 
 
 @contextmanager

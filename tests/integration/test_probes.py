@@ -210,9 +210,9 @@ def test_attempts_to_reach_a_vehicle_that_is_away_make_no_callback(stored, made,
     monkeypatch.setattr(supervised, "RETRY_S", 0.05)
     monkeypatch.setattr(SupervisedPipeline, "start", counting(starts, "start", SupervisedPipeline.start))
     words = [*SMALL_ROBOT, f"media.port={free_port()}", f"log.video={str(stored).lower()}"]
-    vehicle = configuration(words, runnable=False).vehicle()
+    setup = configuration(words, runnable=False).setup()
     files = VideoFiles(tmp_path, lambda *_: None, lambda *_: None) if stored else None
-    viewer = OperatorSide(compile_plans(vehicle), lambda *_: None, video=files)
+    viewer = OperatorSide(compile_plans(setup), lambda *_: None, video=files)
     try:
         until(lambda: starts["start"] > 10)
         made.clear()
@@ -224,15 +224,15 @@ def test_attempts_to_reach_a_vehicle_that_is_away_make_no_callback(stored, made,
 
 @pytest.mark.parametrize("source", [(), ("source.frozen_s=1",)], ids=["plain", "watched"])
 def test_a_pipeline_that_is_built_again_makes_no_callback(source, made):
-    vehicle = configuration([*SMALL_ROBOT, "source=test", *source, f"media.port={free_port()}"]).vehicle()
+    setup = configuration([*SMALL_ROBOT, "source=test", *source, f"media.port={free_port()}"]).setup()
     reported = []
-    side = VehicleSide(compile_plans(vehicle), vehicle.media, lambda camera, what: reported.append(what))
-    camera = next(iter(vehicle.cameras))
+    side = VehicleSide(compile_plans(setup), setup.media, lambda camera, what: reported.append(what))
+    camera = next(iter(setup.vehicle.cameras))
     try:
         for number in range(1, 4):
             made.clear()  # those of the first pipeline include the server's own
             side.turn([Command(camera, "bitrate", 500 + number), Command(camera, "size", (160, 90))])
-            with RtspClient(f"rtsp://127.0.0.1:{vehicle.media.port}/{camera}") as client:
+            with RtspClient(f"rtsp://127.0.0.1:{setup.media.port}/{camera}") as client:
                 assert client.open() == [200, 200, 200]
                 client.read()
                 until(lambda c=client: c.frames > 5)
@@ -245,12 +245,12 @@ def test_a_pipeline_that_is_built_again_makes_no_callback(source, made):
 
 
 def test_sides_that_are_sampled_make_no_callback(made):
-    vehicle = configuration([*SMALL_ROBOT, "source=test", f"media.port={free_port()}"]).vehicle()
-    plans = compile_plans(vehicle)
-    side = VehicleSide(plans, vehicle.media, lambda *_: None)
+    setup = configuration([*SMALL_ROBOT, "source=test", f"media.port={free_port()}"]).setup()
+    plans = compile_plans(setup)
+    side = VehicleSide(plans, setup.media, lambda *_: None)
     viewer = OperatorSide(plans, lambda *_: None)
     try:
-        side.turn(Command(name, "bitrate", 500) for name in vehicle.cameras)
+        side.turn(Command(name, "bitrate", 500) for name in setup.vehicle.cameras)
         until(lambda: all(one.frames > 20 for one in viewer.sample({}).values()))
         until(lambda: all(side.stages().values()))
         made.clear()

@@ -28,15 +28,15 @@ def compiled(*words):
     from runner.configuration.config import configuration
     from runner.plans import compile_plans
 
-    vehicle = configuration([*WORDS, f"media.port={free_port()}", *words], check=check_plan).vehicle()
-    return vehicle, [plan for plan in compile_plans(vehicle) if plan.camera.name in CAMERAS]
+    setup = configuration([*WORDS, f"media.port={free_port()}", *words], check=check_plan).setup()
+    return setup, [plan for plan in compile_plans(setup) if plan.camera.name in CAMERAS]
 
 
 @contextmanager
-def sending(vehicle, plans):
+def sending(setup, plans):
     from runner.apply import VehicleSide
 
-    side = VehicleSide(plans, vehicle.media, lambda camera, what: None)
+    side = VehicleSide(plans, setup.media, lambda camera, what: None)
     knobs = {"sending": True, "size": (320, 180), "bitrate": 300}
     side.turn([Command(camera, knob, value) for camera in CAMERAS for knob, value in knobs.items()])
     try:
@@ -67,29 +67,29 @@ def receiving(plans):
 
 
 def test_waiting_for_a_vehicle_that_starts_later_is_silent():
-    vehicle, plans = compiled()
+    setup, plans = compiled()
     with receiving(plans) as (side, messages, more):
         end = time.monotonic() + 3
         while time.monotonic() < end:
             side.sample({})
             time.sleep(0.1)
-        with sending(vehicle, plans):
+        with sending(setup, plans):
             more()
             assert {received.rebuilt for received in side.sample(SENDING).values()} == {0}
             assert messages == []
 
 
 def test_a_vehicle_that_is_away_is_reported_once_and_its_return_once():
-    vehicle, plans = compiled()
+    setup, plans = compiled()
     with receiving(plans) as (side, messages, more):
-        with sending(vehicle, plans):
+        with sending(setup, plans):
             more()
         end = time.monotonic() + 8
         while time.monotonic() < end:
             side.sample(SENDING)
             time.sleep(0.1)
         away = list(messages)
-        with sending(vehicle, plans):
+        with sending(setup, plans):
             more()
             until(lambda: any("works again" in what for what in messages))
             assert {received.rebuilt for received in side.sample(SENDING).values()} == {1}
@@ -101,8 +101,8 @@ def test_a_vehicle_that_is_away_is_reported_once_and_its_return_once():
 
 def test_the_end_of_a_stream_is_handled_here_and_not_by_the_client():
     """The client's handlers of RTCP BYE and time-outs may deadlock with the failure of its connection."""
-    vehicle, plans = compiled()
-    with sending(vehicle, plans), receiving(plans) as (side, messages, more):
+    setup, plans = compiled()
+    with sending(setup, plans), receiving(plans) as (side, messages, more):
         more()
         pipeline, elements = side._receivers["front"]._supervised._pipeline, []
         pipeline.get_bus().connect("message::eos", lambda *_: elements.append("ended"))
@@ -144,16 +144,16 @@ def test_a_client_is_not_stopped_while_it_frees_its_connection():
     report(Gst.ProgressType.ERROR)
     assert stopped.wait(1)
     stopping.join()
-    vehicle, plans = compiled()
-    with sending(vehicle, plans), receiving(plans) as (side, _, more):
+    setup, plans = compiled()
+    with sending(setup, plans), receiving(plans) as (side, _, more):
         more()
         source = side._receivers["front"]._client
         assert source.get_property("teardown-timeout") > 1000 * source.get_property("tcp-timeout")  # ns, µs
 
 
 def test_packets_of_other_senders_are_dropped_and_counted():
-    vehicle, plans = compiled()
-    with sending(vehicle, plans), receiving(plans) as (side, messages, more):
+    setup, plans = compiled()
+    with sending(setup, plans), receiving(plans) as (side, messages, more):
         more()
         sockets = [sock for r in side._receivers.values() for sock in r._filter._sockets.values()]
         assert len(sockets) >= 2 * len(CAMERAS)  # RTP and RTCP
@@ -176,8 +176,8 @@ def test_packets_of_other_senders_are_dropped_and_counted():
 
 def test_an_unresponsive_server_is_retried_every_two_seconds():
     """Accepts connections and sends nothing, like a vehicle that hangs."""
-    vehicle, plans = compiled()
-    with socket.create_server((vehicle.media.host, vehicle.media.port)) as server:
+    setup, plans = compiled()
+    with socket.create_server((setup.media.host, setup.media.port)) as server:
         server.settimeout(30)
         with receiving(plans[:1]) as (_, messages, _more), ExitStack() as connections:
             connected = []
@@ -190,8 +190,8 @@ def test_an_unresponsive_server_is_retried_every_two_seconds():
 
 def test_loss_during_a_rebuild_shows_until_a_wave_is_complete():
     """Another viewer keeps the stream running, so that it does not begin with an IDR picture."""
-    vehicle, plans = compiled("media.max_viewers=2")
-    with sending(vehicle, plans), receiving(plans) as (_, _, watched), receiving(plans) as (side, messages, more):
+    setup, plans = compiled("media.max_viewers=2")
+    with sending(setup, plans), receiving(plans) as (_, _, watched), receiving(plans) as (side, messages, more):
         watched()
         more()
         assert side.sample(SENDING)["front"].damaged == 0
@@ -214,8 +214,8 @@ def test_what_was_rebuilt_is_freed_at_once():
         kinds = (RepairBuffer, RepeatDetector, EncoderWatch)
         return Counter(type(each) for each in gc.get_objects() if isinstance(each, kinds))
 
-    vehicle, plans = compiled()
-    with sending(vehicle, plans), receiving(plans[:1]) as (side, _, more):
+    setup, plans = compiled()
+    with sending(setup, plans), receiving(plans[:1]) as (side, _, more):
         more()
         before, receiver = alive(), side._receivers["front"]
         assert len(before) == 3
@@ -251,8 +251,8 @@ def test_a_receiver_that_locks_up_does_not_delay_the_others(monkeypatch):
             return super()._on_built(pipeline)
 
     monkeypatch.setattr("runner.apply.Receiver", Locking)
-    vehicle, plans = compiled()
-    with sending(vehicle, plans):
+    setup, plans = compiled()
+    with sending(setup, plans):
         try:
             with receiving(plans) as (side, messages, more):
                 more()

@@ -76,7 +76,7 @@ def digests(found: list[tuple[int, str]]) -> list[str]:
 
 def source_line(*overrides: str) -> str:
     """The source of the one camera, as in every pipeline, but without the element that paces it."""
-    (plan,) = compile_plans(configuration([*ONE, *overrides]).vehicle())
+    (plan,) = compile_plans(configuration([*ONE, *overrides]).setup())
     return launch(element for element in plan.source if element.name != "pace")
 
 
@@ -249,10 +249,10 @@ def test_a_disk_without_room_is_refused_before_the_start(small_disk):
 @pytest.mark.parametrize(("free", "fits"), [(86_000_000, False), (87_000_000, True)])
 def test_the_room_that_is_needed(tmp_path, monkeypatch, free, fits):
     """10 frames of 848x480: 6.1 MB raw; kept free are 64 MB and two seconds of 6.1 MB."""
-    vehicle = configuration([*ONE, "source=test", "fps_max=10", "recording.of_raw=1.7"]).vehicle()
+    setup = configuration([*ONE, "source=test", "fps_max=10", "recording.of_raw=1.7"]).setup()
     usage = shutil._ntuple_diskusage(10**9, 10**9 - free, free)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
-    check = (tmp_path, vehicle.cameras.values(), vehicle.recording, 1)
+    check = (tmp_path, setup.vehicle.cameras.values(), setup.recording, 1)
     if fits:
         recordings.check_space(*check)
     else:

@@ -83,13 +83,13 @@ def subscribing(ros, *words):
     """A vehicle's cameras, fed by topics. Yields (vehicle, plans, what was reported)."""
     from runner.vehicle.live import ros_cameras
 
-    with streaming(*robot(ros, *words), cameras=()) as (side, vehicle, plans, reported):
-        cameras = ros_cameras(vehicle, side.push_shared, reported.append)
+    with streaming(*robot(ros, *words), cameras=()) as (side, setup, plans, reported):
+        cameras = ros_cameras(setup, side.push_shared, reported.append)
         cameras.start()
         try:
             knobs = (("sending", True), ("size", (WIDTH, HEIGHT)), ("bitrate", 3000))
-            side.turn([Command(name, *knob) for name in vehicle.cameras for knob in knobs])
-            yield vehicle, plans, reported
+            side.turn([Command(name, *knob) for name in setup.vehicle.cameras for knob in knobs])
+            yield setup, plans, reported
         finally:
             cameras.close()
 
@@ -198,9 +198,9 @@ def take(received, seen):
 
 
 def test_pictures_arrive_in_order_with_the_times_of_their_stamps(ros):
-    with publishing(ros, front={}, rear={"late_s": 0.2}) as publisher, subscribing(ros) as (vehicle, _, reported):
+    with publishing(ros, front={}, rear={"late_s": 0.2}) as publisher, subscribing(ros) as (setup, _, reported):
         seen = {"front": [], "rear": []}
-        with live_frames([*robot(ros), f"media.port={vehicle.media.port}"]) as received:
+        with live_frames([*robot(ros), f"media.port={setup.media.port}"]) as received:
             until(lambda: take(received, seen) and min(map(len, seen.values())) > 60)
     for name, pictures in seen.items():
         stamps = [(number, stamp / 1e9) for topic, number, stamp in publisher.sent if topic == f"/{name}/image"]
@@ -557,7 +557,7 @@ def test_unauthenticated_nodes_of_other_machines_are_not_discovered(ros2):
 
 LISTENER = """\
 import sys, time
-from runner.core.model import RosSettings
+from runner.settings import RosSettings
 from runner.ros.process import NodeProcess
 node = NodeProcess(RosSettings(python=sys.argv[1]), lambda message, _: print(message["text"], flush=True), print,
                    inputs={"/heard": "text"})

@@ -13,9 +13,9 @@ from ros_domain import MARKS, NODE, SCRIPT
 from keyed import VEHICLE, WATCHER, issue
 from rig import SMALL_ROBOT, Operator, children_named, free_port, process, until, watching
 from runner.configuration.config import configuration
-from runner.core.model import Endpoint
 from runner.mqtt.broker import private_broker
 from runner.plans import compile_plans
+from runner.settings import Endpoint
 
 pytestmark = MARKS
 HEARD = [f"{NODE}/{name}" for name in ("state", "telemetry", "reply", "url/front", "url/rear")]
@@ -66,9 +66,9 @@ def test_requests_are_answered_and_a_late_subscriber_knows_all(ros, lines):
         operator.publish(f"{NODE}/request", text="{")
         until(lambda: "not JSON" in operator.newest("reply")["reason"])
 
-        media = configuration(words).vehicle()
-        assert operator.texts("url/front") == [f"rtsp://127.0.0.1:{media.media.port}/front"]
-        plan = next(plan for plan in compile_plans(media) if plan.camera.name == "rear")
+        setup = configuration(words).setup()
+        assert operator.texts("url/front") == [f"rtsp://127.0.0.1:{setup.media.port}/front"]
+        plan = next(plan for plan in compile_plans(setup) if plan.camera.name == "rear")
         assert f"location={operator.texts('url/rear')[0]}" in plan.receiver.replace('"', "")
         with watching(plan) as viewer:
             until(lambda: len(viewer.sizes) > 5)

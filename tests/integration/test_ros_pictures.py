@@ -9,8 +9,8 @@ import pytest
 from ros_domain import MARKS
 
 from rig import Operator, free_port, process, until
-from runner.core.model import Endpoint
 from runner.mqtt.broker import private_broker
+from runner.settings import Endpoint
 
 pytestmark = MARKS
 NODE = "/tod_runner_operator"

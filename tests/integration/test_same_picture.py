@@ -153,8 +153,8 @@ def test_a_clip_with_a_display_matrix_is_sent_upright(turn, top, tmp_path):
 def sources_line(clip: Path, width: int, height: int) -> str:
     """A camera's source, as it plays the clip."""
     size = [f"cameras.{CAMERA}.{key}={value}" for key, value in (("width_px", width), ("height_px", height))]
-    vehicle = configuration(["source=file", f"source.clip={clip}", *size, f"cameras.{CAMERA}.fps={FPS}"]).vehicle()
-    (plan,) = (plan for plan in compile_plans(vehicle) if plan.camera.name == CAMERA)
+    setup = configuration(["source=file", f"source.clip={clip}", *size, f"cameras.{CAMERA}.fps={FPS}"]).setup()
+    (plan,) = (plan for plan in compile_plans(setup) if plan.camera.name == CAMERA)
     return launch(with_clip_range(plan).source)
 
 

@@ -26,7 +26,6 @@ from soak.signals import MARK, marked_processes
 from rig import LOOPBACK6, free_port, needs_root, passes, process, small_robot, until
 from rtsp_client import RtspClient, client_hello, tls
 from runner.core.commands import Command
-from runner.core.model import Endpoint
 from runner.core.roles import Role
 from runner.drive.read import read_drive
 from runner.gst.pipeline import encrypt
@@ -41,6 +40,7 @@ from runner.records import Sample
 from runner.security import keyring
 from runner.security.authority import Authority
 from runner.security.keyring import Keyring, mqtt_password, rtsp_password
+from runner.settings import Endpoint
 
 SECRET_FILES = (keyring.KEY, keyring.SECRET, keyring.MEDIA_SECRET, keyring.PASSPHRASE, keyring.TOKEN)
 CAMERAS = ("front", "rear")
@@ -380,11 +380,11 @@ def sending(keys, *words, vehicle_keys=None):
     from runner.plans import compile_plans
 
     own = [*WORDS, f"media.port={free_port()}", f"keys={keys / NAME}", *words]
-    vehicle = configuration(own, check=check_plan).vehicle()
-    plans, reports = compile_plans(vehicle), []
+    setup = configuration(own, check=check_plan).setup()
+    plans, reports = compile_plans(setup), []
     side = VehicleSide(
         plans,
-        vehicle.media,
+        setup.media,
         lambda who, what: reports.append(f"{who}: {what}"),
         keyring=Keyring(vehicle_keys or keys / NAME),
     )

@@ -34,9 +34,9 @@ OFF_LOOPBACK = "192.0.2.1"  # TEST-NET-1 (RFC 5737): only used to find the route
 class Vehicle:
     """Several streaming cameras, and helpers of the tests."""
 
-    def __init__(self, side, vehicle, reported):
+    def __init__(self, side, setup, reported):
         self.side, self.reported = side, reported
-        self.port = vehicle.media.port
+        self.port = setup.media.port
 
     def url(self, camera=CAMERA):
         return f"rtsp://127.0.0.1:{self.port}/{camera}"
@@ -56,8 +56,8 @@ class Vehicle:
 @contextmanager
 def serving(*overrides, cameras=(CAMERA,)):
     small = [word for word in SMALL_FRONT if word.split(".")[1] in cameras]
-    with streaming(*small, *overrides, cameras=cameras) as (side, vehicle, _, reported):
-        served = Vehicle(side, vehicle, reported)
+    with streaming(*small, *overrides, cameras=cameras) as (side, setup, _, reported):
+        served = Vehicle(side, setup, reported)
         for camera in cameras:
             served.turn(camera, size=(240, 130), bitrate=500)
         yield served
@@ -644,8 +644,8 @@ def test_a_server_that_stops_during_requests_leaves_no_reading_thread(capfd):
                 tcp.recv(65_536)
 
     for _ in range(5):
-        with streaming(*SMALL_FRONT) as (_, vehicle, _, _):
-            address = (vehicle.media.host, vehicle.media.port)
+        with streaming(*SMALL_FRONT) as (_, setup, _, _):
+            address = (setup.media.host, setup.media.port)
             clients = [threading.Thread(target=ask, args=(address,), daemon=True) for _ in range(6)]
             for client in clients:
                 client.start()

@@ -25,7 +25,7 @@ def test_packets_carry_the_code_point(dscp, byte):
         operator.setsockopt(socket.IPPROTO_IP, socket.IP_RECVTOS, 1)
         operator.settimeout(20)
         words = (*WORDS, f"graph.first_port={operator.getsockname()[1]}", f"graph.dscp={dscp}")
-        (plan,) = compile_plans(configuration(words).vehicle())
+        (plan,) = compile_plans(configuration(words).setup())
         pipeline = Gst.parse_launch(plan.pipeline)
         pipeline.set_state(Gst.State.PLAYING)
         try:
@@ -38,7 +38,7 @@ def test_packets_carry_the_code_point(dscp, byte):
 def test_an_unanswered_call_is_repeated_every_second():
     from runner.gst import Gst
 
-    (plan,) = compile_plans(configuration([*WORDS, f"graph.first_port={free_port()}"]).vehicle())
+    (plan,) = compile_plans(configuration([*WORDS, f"graph.first_port={free_port()}"]).setup())
     pipeline = Gst.parse_launch(plan.pipeline)
     failed = []
 

@@ -12,7 +12,6 @@ from rich.console import Console
 from rig import RecordingListener, free_port, passes, until
 from runner.configuration.config import configuration
 from runner.core.events import Attention
-from runner.core.model import Endpoint
 from runner.gst.receiver import Reception
 from runner.mqtt.broker import private_broker
 from runner.mqtt.link import ControlLink
@@ -20,6 +19,7 @@ from runner.mqtt.messages import OFFLINE, topic
 from runner.operator.meter import MeasuredRates
 from runner.operator.station import SILENT_S, CameraRow, Listener, Station, _stages
 from runner.records import Arrival, Arrivals, CameraTelemetry
+from runner.settings import Endpoint
 from runner.verbs.table import _table
 
 pytestmark = pytest.mark.gst
@@ -92,10 +92,12 @@ class Vehicle:
 def both():
     broker = Endpoint("127.0.0.1", free_port())
     with private_broker(broker):
-        station = Station(configuration(["vehicle=delivery_robot", f"control.port={broker.port}"]).vehicle(), {})
+        setup = configuration(["vehicle=delivery_robot", f"control.port={broker.port}"]).setup()
+        station = Station(setup, {})
         listener = RecordingListener()
         station.listeners.append(listener)
         vehicle = Vehicle(broker)
+        vehicle.setup = setup
         station.connect()
         vehicle.publish("state", STATE)
         vehicle.live_until(lambda: station.state)
@@ -138,7 +140,7 @@ def test_retained_telemetry_is_no_heartbeat(both):
     station, vehicle, _ = both
     vehicle.publish("state", STATE | {"total_kbps": 2999})  # behind all telemetry: from now on that is retained
     until(lambda: station.state.total_kbps == 2999)
-    late = Station(station._vehicle, {})
+    late = Station(vehicle.setup, {})
     listener = RecordingListener()
     late.listeners.append(listener)
     late.connect()
@@ -352,8 +354,8 @@ def test_a_decision_is_one_note_however_many_cameras_it_changes(both):
 
 
 def test_a_camera_that_one_side_lacks_leaves_the_others_to_be_driven(both):
-    station, vehicle, _ = both
-    late = Station(station._vehicle, {"cameras.front.fps": 15, "cameras.mast.fps": 15})
+    _, vehicle, _ = both
+    late = Station(vehicle.setup, {"cameras.front.fps": 15, "cameras.mast.fps": 15})
     listener = RecordingListener()
     late.listeners.append(listener)
     cameras = {name: STATE["cameras"][name] for name in ("front", "rear")} | {"door": STATE["cameras"]["mast"]}
@@ -384,7 +386,7 @@ def test_the_stored_configuration_of_a_vehicle_that_has_ended_is_not_compared(bo
     vehicle.publish("configuration", {"run": "a", "settings": {"fps_max": 15}})
     vehicle.publish("state", OFFLINE)
     until(lambda: station.state is None)
-    late = Station(station._vehicle, {"fps_max": 10})
+    late = Station(vehicle.setup, {"fps_max": 10})
     listener = RecordingListener()
     late.listeners.append(listener)
     late.connect()

@@ -128,16 +128,16 @@ def test_a_vehicle_of_an_older_version_is_shown(monkeypatch, lists_both):
 def test_packets_carry_the_dscp_of_the_graph(host, udp):
     with (
         socket.socket(socket.AF_PACKET, socket.SOCK_DGRAM, socket.htons(0x0003)) as seen,
-        streaming(*SMALL, f'media.host="{host}"', "graph.dscp=46", cameras=(CAMERA,)) as (side, vehicle, _, _),
+        streaming(*SMALL, f'media.host="{host}"', "graph.dscp=46", cameras=(CAMERA,)) as (side, setup, _, _),
     ):
         seen.bind(("lo", 0))
         side.turn([Command(CAMERA, "sending", True), Command(CAMERA, "bitrate", 300)])
         addresses = {"::": ("::1", "127.0.0.1")}.get(host, (host,))
         for address in addresses:
             named = f"[{address}]" if ":" in address else address
-            with RtspClient(f"rtsp://{named}:{vehicle.media.port}/{CAMERA}") as viewer:
+            with RtspClient(f"rtsp://{named}:{setup.media.port}/{CAMERA}") as viewer:
                 assert viewer.open(udp=udp) == [200, 200, 200]
-                port = viewer.server_port if udp else vehicle.media.port
+                port = viewer.server_port if udp else setup.media.port
                 viewer.read()
                 # Beside other tests its buffer is soon full of their packets: it is read all the time.
                 until(lambda p=port, version=6 if ":" in address else 4: 46 in codes(seen, p, version))

@@ -36,18 +36,18 @@ class Sides:
         self.first_frames, self.reported = [], []
         ports = [f"media.port={free_port()}", f"graph.first_port={free_port(3)}"]
         overrides = [*SMALL_ROBOT, "source=test", "log.video=true", *ports, *words]
-        vehicle = configuration(overrides, conf, check=check_plan).vehicle()
-        self.vehicle = replace(vehicle, cameras={name: vehicle.cameras[name] for name in cameras})
-        self.plans = compile_plans(self.vehicle)
+        setup = configuration(overrides, conf, check=check_plan).setup()
+        setup = setup.with_cameras({name: setup.vehicle.cameras[name] for name in cameras})
+        self.plans, self.cameras = compile_plans(setup), cameras
         self.files = VideoFiles(directory, lambda *first: self.first_frames.append(first), lambda *shift: None)
-        self.sending = VehicleSide(self.plans, self.vehicle.media, self.report, self.files)
+        self.sending = VehicleSide(self.plans, setup.media, self.report, self.files)
         self.resize(320, 180)
 
     def report(self, camera, what):
         self.reported.append(f"{camera}: {what}")
 
     def resize(self, *size):
-        self.sending.turn(Command(name, "size", size) for name in self.vehicle.cameras)
+        self.sending.turn(Command(name, "size", size) for name in self.cameras)
 
     def stop(self):
         if self.sending:

@@ -53,10 +53,10 @@ WORDS = ("vehicle=delivery_robot", *NOISE, "graph=vp8", "fps_max=15")
 def sending(conf: Path):
     from runner.apply import VehicleSide, check_plan
 
-    vehicle = configuration([*WORDS, f"media.port={free_port()}"], conf, check=check_plan).vehicle()
-    (plan,) = (plan for plan in compile_plans(vehicle) if plan.camera.name == "rear")
+    setup = configuration([*WORDS, f"media.port={free_port()}"], conf, check=check_plan).setup()
+    (plan,) = (plan for plan in compile_plans(setup) if plan.camera.name == "rear")
     reported: list[str] = []
-    side = VehicleSide([plan], vehicle.media, lambda camera, what: reported.append(what))
+    side = VehicleSide([plan], setup.media, lambda camera, what: reported.append(what))
     try:
         yield side, plan, reported
     finally:
@@ -103,5 +103,5 @@ def test_an_undeclared_property_is_refused(conf, declared, problem):
 
     conf.write("graph/vp8.yaml", GRAPH + declared)
     with pytest.raises(ConfigError) as raised:
-        configuration(WORDS, conf.path, check=check_plan).vehicle()
+        configuration(WORDS, conf.path, check=check_plan).setup()
     assert problem in str(raised.value)

@@ -26,10 +26,10 @@ from system import CAMERAS, System, ended, newest, running
 
 import keyed
 from rig import Operator, clock_ahead, free_port, set_clock, until
-from runner.core.model import Endpoint
 from runner.link import limited_link
 from runner.link.limit import Limit, OneWay
 from runner.security.authority import VALID, Authority
+from runner.settings import Endpoint
 
 BACK_S, LONG_BACK_S, LONG_S = 3.0, 5.0, 20.0  # limits after the end of a fault, and of one at least LONG_S long
 MISSED = 3  # most frames missed by a camera that a fault should not affect

@@ -24,8 +24,8 @@ from typing import NamedTuple
 
 import keyed
 from rig import CHECKOUT, free_port
-from runner.core.model import Endpoint
 from runner.mqtt.broker import private_broker
+from runner.settings import Endpoint
 
 LIMIT_S = 3.0  # from the first signal to the end of the last process
 MARK = "TOD_SOAK_RUN"  # environment variable that marks the processes of one run

@@ -22,12 +22,12 @@ from paho.mqtt.enums import CallbackAPIVersion
 import keyed
 from rig import CHECKOUT, Operator, free_port, passes, until
 from rtsp_client import RtspClient
-from runner.core.model import Endpoint
 from runner.link import LimitedLink
 from runner.mqtt.broker import find_mosquitto
 from runner.mqtt.login import Login
 from runner.security.broker_files import broker_settings
 from runner.security.keyring import Keyring
+from runner.settings import Endpoint
 
 ROBOT = ("vehicle=delivery_robot", "source=test", "fps_max=15")
 CONSTANT = ("pqos=constant", "pqos.kbps=3000")

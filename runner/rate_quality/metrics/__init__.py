@@ -7,8 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from runner.core.model import suggest
-from runner.errors import UserError
+from runner.errors import UserError, suggest
 from runner.rate_quality.metrics.interface import Luma, Mask, Metric, PictureSize, QualityMeter
 
 __all__ = ["NAMES", "VMAF_MODEL", "Luma", "Mask", "Metric", "PictureSize", "QualityMeter", "find_metric"]

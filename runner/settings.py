@@ -1,0 +1,263 @@
+"""Settings of a run that no rule reads: addresses, page, logs, keys, ROS. Frozen, valid once built."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+from runner.core.model import Camera, Element, ModelError, Vehicle, check_unique
+
+if TYPE_CHECKING:
+    from ipaddress import IPv4Network, IPv6Network
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoint:
+    """Address at which a server listens and its clients reach it."""
+
+    host: str
+    port: int
+
+    def __str__(self) -> str:
+        """As in a URL: an IPv6 address is in brackets (RFC 3986, section 3.2.2)."""
+        return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
+
+
+@dataclass(frozen=True, slots=True)
+class Media(Endpoint):
+    """The vehicle's RTSP server.
+
+    rtp_ports          first and last UDP port for RTP and RTCP; a camera takes two
+    session_timeout_s  a viewer that sends neither requests nor RTCP for this long is dropped
+    max_viewers        simultaneous viewers of one camera outside the vehicle
+    secure             whether it serves RTSP over TLS, with SRTP
+    """
+
+    rtp_ports: tuple[int, int]
+    session_timeout_s: int
+    max_viewers: int
+    secure: bool = False
+
+    def __post_init__(self) -> None:
+        first, last = self.rtp_ports
+        if first >= last:
+            raise ModelError("rtp_ports", f"[{first}, {last}]", "must be [first, last], first below last")
+
+
+@dataclass(frozen=True, slots=True)
+class PageSettings:
+    """The operator's page.
+
+    host     address at which it is served
+    late_ms  age when drawn above which a picture is marked as late
+    """
+
+    serve: bool
+    port: int
+    late_ms: float
+    host: str = "127.0.0.1"
+
+    @property
+    def endpoint(self) -> Endpoint:
+        return Endpoint(self.host, self.port)
+
+
+@dataclass(frozen=True, slots=True)
+class Inputs:
+    """Keys and buttons of the operator's page, by action; None: the action has none.
+
+    keys     names in the browser's KeyboardEvent.key
+    buttons  numbers in the browser's Gamepad API, or directions of an axis as the page names them
+    """
+
+    keys: Mapping[str, str | None] = field(default_factory=dict)
+    buttons: Mapping[str, int | str | None] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for kind, given in (("keys", self.keys), ("buttons", self.buttons)):
+            taken: dict[str | int, str] = {}
+            for action, value in given.items():
+                if value is not None and value in taken:
+                    raise ModelError(f"{kind}.{action}", repr(value), f"is already assigned to {taken[value]}")
+                if value is not None:
+                    taken[value] = action
+
+
+@dataclass(frozen=True, slots=True)
+class LatencyLimit:
+    """Limits the speed by latency.
+
+    limit_ms  glass-to-glass latency up to which the vehicle may go at full speed
+    fixed_ms  the part of it that is not measured: exposure to capture time, decoding to light; None: unknown
+    """
+
+    limit_ms: float = 200.0
+    fixed_ms: float | None = None
+
+    def speed_factor(self, measured_ms: float | None) -> float | None:
+        """Advised share of full speed: the limit over the total latency, at most 1; None without `fixed_ms`.
+
+        measured_ms  from capture to decoding, at most; None: unknown, which advises to stop
+        """
+        if self.fixed_ms is None:
+            return None
+        return 0.0 if measured_ms is None else min(1.0, self.limit_ms / max(measured_ms + self.fixed_ms, 1e-3))
+
+
+@dataclass(frozen=True, slots=True)
+class MetricsPorts:
+    """TCP ports on 127.0.0.1 at which each side serves its metrics; None: not served."""
+
+    vehicle_port: int | None = None
+    operator_port: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class RosQos:
+    """QoS requested by a subscription to a ROS 2 topic; None: what its publishers offer.
+
+    depth  queue length; the oldest messages are dropped first
+    """
+
+    reliability: str | None = None
+    durability: str | None = None
+    depth: int = 10
+
+
+@dataclass(frozen=True, slots=True)
+class RosPrediction:
+    """Bitrate predictions on a ROS topic, accepted from one node only, given by its full name."""
+
+    topic: str
+    node: str
+
+
+ROS_PYTHON = {1: "/usr/bin/python3", 2: ".venv-ros2/bin/python"}  # by version
+OF_ROS_2 = {  # keys without effect in ROS 1, and why
+    "use_sim_time": "a node follows the parameter /use_sim_time of its master",
+    "discovery": "ROS_MASTER_URI names the master, which knows all nodes",
+    "qos": "subscribers cannot request QoS",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class RosSettings:
+    """The ROS node, which runs in its own process.
+
+    version       of ROS, 1 or 2
+    python        interpreter that can import rclpy or rospy; None: that of `make ros2` or `make ros1`
+    node          its name
+    namespace     absolute
+    remap         actual names of topics and nodes, by the names used here
+    use_sim_time  whether stamps refer to the time on /clock; ROS 2 only
+    discovery     range of discovery: off, localhost, subnet, system_default; ROS 2 only
+    qos           by topic; ROS 2 only
+    position      topic with the vehicle's position, for the verb `ros`; None: none
+    prediction    topic with predictions, for the verb `ros`; None: none
+    pictures      whether the operator's side publishes what it decodes
+    """
+
+    version: int = 2
+    python: str | None = None
+    node: str = "tod_runner"
+    namespace: str = "/"
+    remap: Mapping[str, str] = field(default_factory=dict)
+    use_sim_time: bool = False
+    discovery: str = "localhost"
+    qos: Mapping[str, RosQos] = field(default_factory=dict)
+    position: str | None = None
+    prediction: RosPrediction | None = None
+    pictures: bool = False
+
+    @property
+    def interpreter(self) -> str:
+        return self.python or ROS_PYTHON[self.version]
+
+    def misplaced(self) -> Iterator[ModelError]:
+        """Keys that are set but have no meaning in this version of ROS."""
+        if self.version == 1:
+            unset = RosSettings()
+            for key, rule in OF_ROS_2.items():
+                if getattr(self, key) != getattr(unset, key):
+                    yield ModelError(key, None, f"has no effect with ros.version=1: {rule}")
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """How frames are recorded without loss, as defined in YAML.
+
+    codec     its name, for display and for recording.json
+    of_raw    upper bound of a file's size as a share of the raw frames' size
+    elements  from raw frames to a Matroska stream, may hold {placeholders}
+    """
+
+    codec: str
+    of_raw: float
+    elements: tuple[Element, ...]
+
+    def __post_init__(self) -> None:
+        check_unique("elements", [element.name for element in self.elements])
+
+
+@dataclass(frozen=True, slots=True)
+class Dimensions:
+    """The vehicle seen from above, m: what the page draws on the ground.
+
+    wheelbase_m      between the axles
+    track_m          between the middles of the wheels of an axle
+    width_m          at its widest
+    front_m, rear_m  from the rear axle to the front and to the rear end
+    """
+
+    wheelbase_m: float
+    track_m: float
+    width_m: float
+    front_m: float
+    rear_m: float
+
+    def __post_init__(self) -> None:
+        if self.front_m < self.wheelbase_m:
+            raise ModelError("front_m", f"{self.front_m:g}", f"must reach the front axle, {self.wheelbase_m:g} m ahead")
+        if self.track_m > self.width_m:
+            raise ModelError("track_m", f"{self.track_m:g}", f"must be at most width_m, {self.width_m:g}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Setup:
+    """A vehicle, and the settings of its run.
+
+    recording   how `record` stores the frames of every camera
+    expires_s   age from which the vehicle drops a request, in addition to the round trip
+    log_video   whether the log of a drive holds the video of every camera
+    latency     limit of the speed by latency
+    keys        directory made for this side by `tod-runner keys`; None: nothing is encrypted or authenticated
+    insecure    whether that is intended although video or control leave this machine
+    private     network on whose addresses it is intended; None: none
+    strict      whether a vehicle starts only if every camera opens and its log can be written
+    metrics     ports at which both sides serve metrics for Prometheus
+    ros         the ROS node, for cameras whose source subscribes to topics
+    dimensions  None: unknown
+    inputs      keys and buttons of the operator's page
+    """
+
+    vehicle: Vehicle
+    media: Media
+    control: Endpoint
+    page: PageSettings
+    recording: Recording
+    expires_s: float
+    log_video: bool = False
+    latency: LatencyLimit = LatencyLimit()
+    keys: str | None = None
+    insecure: bool = False
+    private: IPv4Network | IPv6Network | None = None
+    strict: bool = False
+    metrics: MetricsPorts = MetricsPorts()
+    ros: RosSettings = RosSettings()
+    dimensions: Dimensions | None = None
+    inputs: Inputs = Inputs()
+
+    def with_cameras(self, cameras: Mapping[str, Camera]) -> Setup:
+        """The same, of a vehicle with these cameras."""
+        return replace(self, vehicle=replace(self.vehicle, cameras=cameras))
