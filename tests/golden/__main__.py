@@ -162,7 +162,8 @@ def drives(pool: ProcessPoolExecutor) -> Texts:
         for kept in sorted((HERE / "drives").glob("*.jsonl.xz")):
             path = Path(directory, kept.name.removesuffix(".xz"))
             path.write_bytes(lzma.decompress(kept.read_bytes()))
-            words += [["replay", f"input={path}"], ["replay", "modes=steady", f"input={path}"]]
+            changes = ([], ["modes=steady"], ["link=again"])
+            words += [["replay", *change, f"input={path}"] for change in changes]
         found = _outputs(pool, words)
         return {name.replace(directory, ""): text.replace(directory, "") for name, text in found.items()}
 
@@ -328,7 +329,11 @@ _GENERATED: Generators = {
     "weights_set": lambda chance, _camera, cameras, _kbps: {
         "weights": {name: chance.choice((0, 0.5, 1, 3)) for name in chance.sample(cameras, 2)}
     },
-    "link_measured": lambda _chance, camera, _cameras, kbps: {"camera": camera, "kbps": kbps},  # of older drives
+    "link_measured": lambda _chance, _camera, _cameras, kbps: {
+        "kbps": kbps,
+        **{"queue_ms": 0, "loss": 0, "rtt_ms": 60, "state": "clear"},
+        "evidence": {"kbit": round(0.04 * kbps, 3), "unqueued": 3},
+    },
     "operator_connected": lambda *_: {},
     "operator_disconnected": lambda *_: {},
     "clock_advanced": lambda *_: {},
