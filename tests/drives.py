@@ -251,8 +251,8 @@ def measured(side: str, lines: Lines) -> Lines:
             line["asked_kbps"] = 2 * line["total_kbps"]
     if side != "vehicle":
         return lines
-    events = ({"event": "link_measured", "kbps": 1000, "queue_ms": 60, "state": "filling"} for _ in lines)
-    return [each for line in lines for each in (line, {"t": line["t"], **next(events)})]
+    event = {"event": "link_measured", "kbps": 1000, "queue_ms": 60, "loss": 0, "state": "filling", "rtt_ms": 30}
+    return [each for line in lines for each in (line, {"t": line["t"], **event, "evidence": {}})]
 
 
 def believing(

@@ -8,11 +8,13 @@ from typing import Any
 
 import pytest
 
-from runner.core.events import EVENTS, BitratePredicted, CameraConfigured, RoiSet, WeightsSet, parse, to_json
+from runner.core.events import EVENTS, BitratePredicted, CameraConfigured, Evidence, RoiSet, WeightsSet, parse, to_json
 from runner.core.model import Roi
 from runner.drive.read import read_line
 from runner.schema import event_names, event_problem
 
+LINK = {"event": "link_measured", "kbps": 780, "queue_ms": 12.5, "loss": 0.01, "state": "filling", "rtt_ms": 48}
+LINK["evidence"] = Evidence(silent_s=0.2)._asdict()
 EXAMPLES: list[dict[str, Any]] = [
     {"t": 0.0, "event": "mode_selected", "mode": "automatic"},
     {"t": 0.1, "event": "bitrate_predicted", "kbps": 3000},
@@ -27,9 +29,7 @@ EXAMPLES: list[dict[str, Any]] = [
     {"t": 0.6, "event": "camera_configured", "camera": "front_left", "kbps": 800, "scaling": 0.25},
     {"t": 0.6, "event": "camera_configured", "camera": "front_left", "scaling": 0.25},
     {"t": 0.7, "event": "weights_set", "weights": {"front_left": 2.5}},
-    {"t": 0.8, "event": "link_measured", "camera": "a", "kbps": 780, "loss": 0.01, "rtt_ms": 48, "jitter_ms": 4},
-    {"t": 0.8, "event": "link_measured", "kbps": 780, "queue_ms": 12.5, "loss": 0.01, "state": "filling", "rtt_ms": 48},
-    {"t": 0.8, "event": "link_measured", "queue_ms": 0, "state": "stalled"},
+    {"t": 0.8, **LINK},
     {"t": 0.8, "event": "copies_counted", "copies": {"front_left": 2}},
     {"t": 0.8, "event": "source_reported", "camera": "front_left", "works": False, "reason": "no such device"},
     {"t": 0.8, "event": "control_passed", "operator": "me"},
@@ -116,7 +116,7 @@ def roi(**keys: Any) -> dict[str, Any]:
         (clock(event="weights_set", weights={}), "weights: {}: must not be empty"),
         (clock(event="weights_set", weights={"a": -1}), "weights.a: -1: must be at least 0"),
         (clock(event="weights_set", weights={"a": "1"}), "weights.a: '1': must be a number"),
-        (clock(event="link_measured", camera="a", kbps=1, loss=1.1), "loss: 1.1: must be at most 1"),
+        (LINK | {"t": 0, "loss": 1.1}, "loss: 1.1: must be at most 1"),
         (clock(event="position_reported", lat=91, lon=0), "lat: 91: must be at most 90"),
         (clock(event="position_reported", lat=0, lon=-181), "lon: -181: must be at least -180"),
         (clock(event="steering_reported", rad=90), "rad: 90: must be at most 1.5"),

@@ -46,8 +46,7 @@ def test_a_measurement_supersedes_an_older_one_but_not_across_a_change_of_the_mo
     first = make_request("a", "bitrate_predicted", kbps=1)
     assert inbox.put(first) is None
     assert inbox.put(make_request("a", "total_set", kbps=5)) is None
-    assert inbox.put(make_request("a", "link_measured", camera="x", kbps=1)) is None
-    assert inbox.put(make_request("a", "link_measured", camera="y", kbps=1)) is None
+    assert inbox.put(make_request("a", "steering_reported", rad=0.1)) is None
     assert inbox.put(make_request("a", "bitrate_predicted", kbps=2)) is first
     assert inbox.put(make_request("b", "bitrate_predicted", kbps=7)) is None
     inbox.put(make_request("a", "mode_selected", mode="single"))
@@ -55,8 +54,7 @@ def test_a_measurement_supersedes_an_older_one_but_not_across_a_change_of_the_mo
     own = [r.document for r in all_of(inbox) if r.sender == "a"]
     assert [(d["event"], d.get("kbps")) for d in own] == [
         ("total_set", 5),
-        ("link_measured", 1),
-        ("link_measured", 1),
+        ("steering_reported", None),
         ("bitrate_predicted", 2),
         ("mode_selected", None),
         ("bitrate_predicted", 3),

@@ -357,6 +357,7 @@ EVENTS: dict[str, dict[str, st.SearchStrategy[Any]]] = {
     "link_measured": {
         **KBPS,
         "queue_ms": st.sampled_from([0, 30, 300]),
+        "rtt_ms": st.sampled_from([10, 900]),
         "loss": st.sampled_from([0, 0.2]),
         "state": st.sampled_from(["clear", "filling", "draining", "stalled"]),
         "evidence": st.sampled_from([{}, carries(1000), carries(9000), {"silent_s": 0.5}, {"kbit": 40, "wait_s": 0.3}]),
@@ -381,11 +382,12 @@ FLOORS = tuple(
     for key, value in (("floor_kbps", 300), ("shed", number))
 )
 
+NO_QUEUE = {"kbps": 0, "queue_ms": 0, "loss": 0, "rtt_ms": 30, "state": "clear"}
 # The first measurement that the rule sees is 0.6 s old, and an event follows that it does not read.
 OLD_MEASUREMENT = [
     ({"event": "operator_disconnected"}, 0),
     ({"event": "mode_selected", "mode": "single"}, 0),
-    ({"event": "link_measured", "kbps": 0, "queue_ms": 0, "state": "clear", "evidence": carries(1000)}, 0),
+    ({"event": "link_measured", **NO_QUEUE, "evidence": carries(1000)}, 0),
     ({"event": "operator_connected"}, 0.6),
     ({"event": "steering_reported", "rad": 0.2}, 0),
 ]

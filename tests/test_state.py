@@ -93,7 +93,6 @@ REFUSED: list[tuple[str, str, dict[str, Any], str]] = [
         {"weights": {"top_left": 2, "x": 1}},
         f"unknown camera 'x'; expected one of {CAMERAS}",
     ),
-    ("automatic", "link_measured", {"camera": "x", "kbps": 1}, f"unknown camera 'x'; expected one of {CAMERAS}"),
     (
         "single",
         "roi_set",

@@ -19,6 +19,7 @@ from runner.core.model import Mode
 from runner.core.step import Run, start, step
 
 PAPER = ("modes=paper",)
+LINK = {"kbps": 500, "queue_ms": 300, "loss": 0.5, "state": "filling", "rtt_ms": 30}
 
 
 def predicted(kbps: float, *overrides: str) -> Drive:
@@ -184,9 +185,8 @@ def test_the_vehicles_own_weights_hold_until_others_are_set() -> None:
         ("operator_connected", {}),
         ("operator_disconnected", {}),
         ("clock_advanced", {}),
-        ("link_measured", {"camera": "front_left", "kbps": 1, "loss": 1, "rtt_ms": 9000, "jitter_ms": 500}),
-        ("link_measured", {"kbps": 500, "queue_ms": 300, "loss": 0.5, "state": "filling", "rtt_ms": 30}),
-        ("link_measured", {"queue_ms": 300, "state": "stalled"}),
+        ("link_measured", LINK | {"evidence": {"busy_kbit": 4, "busy_s": 0.04}}),
+        ("link_measured", LINK | {"state": "stalled", "evidence": {"silent_s": 0.3}}),
         ("position_reported", {"lat": 48.2, "lon": 11.6, "speed_mps": 8, "heading_deg": 90}),
         ("steering_reported", {"rad": 0.4}),
         ("attention_changed", {"attention": "hidden"}),
@@ -254,7 +254,7 @@ def test_nothing_is_decided_where_no_input_of_the_rules_changed(monkeypatch: pyt
     drive = predicted(3000)
     monkeypatch.setattr(step_module.rules, "decide", lambda *_: pytest.fail("decided again"))
     drive.accept("clock_advanced", t=5)
-    drive.accept("link_measured", camera="front_left", kbps=3)
+    drive.accept("link_measured", **LINK, evidence={})
     drive.accept("position_reported", lat=48, lon=11)
     drive.feed("total_set", kbps=3)
 

@@ -146,22 +146,19 @@ class Evidence(NamedTuple):
 class LinkMeasured(_Event):
     """The uplink, by what the operator's side received of all cameras, see `runner.core.evidence`.
 
-    kbps      received in the last 0.5 s, kbit/s. Older logs: of the link while a queue lasted
+    kbps      received in the last 0.5 s, kbit/s
     queue_ms  standing queue in front of the link
     loss      share of the packets of the last second that was lost, 0 to 1
     rtt_ms    round trip of the control link
-    evidence  of the link's capacity; None: in older logs
-    camera    set in older logs, which measured each camera; no rule reads these
+    evidence  of the link's capacity
     """
 
-    kbps: Kbps | None = None
-    queue_ms: float | None = None
-    loss: float | None = None
-    state: LinkState | None = None
-    rtt_ms: float | None = None
-    jitter_ms: float | None = None
-    evidence: Evidence | None = None
-    camera: str | None = None
+    kbps: Kbps
+    queue_ms: float
+    loss: float
+    state: LinkState
+    rtt_ms: float
+    evidence: Evidence
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -287,10 +284,9 @@ def parse(document: Mapping[str, Any]) -> Event:
         values["attention"] = Attention(values["attention"])
     if kind is ModeSelected:
         values["mode"] = Mode(values["mode"])
-    elif kind is LinkMeasured and "state" in values:
+    elif kind is LinkMeasured:
         values["state"] = LinkState(values["state"])
-        if "evidence" in values:
-            values["evidence"] = Evidence(**values["evidence"])
+        values["evidence"] = Evidence(**values["evidence"])
     elif kind is RoiSet:
         values["roi"] = Roi(*(int(values.pop(key)) for key in _ROI))
     elif kind is WeightsSet:

@@ -55,7 +55,7 @@ def is_measured(state: State, link: LinkMeasured | None, past: Belief | None) ->
     """
     if link is None:
         return past is not None and _is_recent(past, state.t)
-    return link.evidence is not None and state.operator_since is not None and state.t - link.t < START_S
+    return state.operator_since is not None and state.t - link.t < START_S
 
 
 def _is_recent(belief: Belief, t: float) -> bool:
@@ -90,7 +90,7 @@ def updated(
     if link is None or link.evidence is None:
         return belief._replace(total=min(belief.total, most, ceiling))
     if link.t > belief.reported:
-        belief = beliefs.observe(belief, link.t, _of_every_copy(state, link.evidence), (link.rtt_ms or 0.0) / 1000)
+        belief = beliefs.observe(belief, link.t, _of_every_copy(state, link.evidence), link.rtt_ms / 1000)
     return beliefs.decide(belief, state.t, link.evidence.silent_s, floors, ceiling)
 
 
@@ -143,7 +143,7 @@ def _believed(belief: Belief, cameras: tuple[Camera, ...]) -> Believed:
 def _why(belief: Belief, believed: Believed, link: LinkMeasured | None) -> str:
     if belief.total >= belief.most:
         return "all that the cameras can use"
-    if link and link.evidence and link.evidence.silent_s:
+    if link and link.evidence.silent_s:
         return f"nothing has arrived for {link.evidence.silent_s:.1f} s"
     if believed.policer_kbps is not None and believed.policer_kbps < believed.kbps:
         return f"the link drops what exceeds {believed.policer_kbps}"

@@ -123,11 +123,8 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
             for name in weights:
                 _known(vehicle, name)
             return {"weights": {**state.weights, **weights}}
-        case ev.LinkMeasured(camera=name):
-            if name is None:
-                return {"link": event}
-            _known(vehicle, name)
-            return {}
+        case ev.LinkMeasured():
+            return {"link": event}
         case ev.ControlPassed(operator=operator):
             # Another place, network path and person. If the link is not measured, it is as if they had just connected.
             is_new = bool(operator) and state.link is None and state.operator_since is not None

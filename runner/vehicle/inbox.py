@@ -15,12 +15,7 @@ ROUND_S = 0.1
 MAX_PER_ROUND = 32  # requests processed per sender and round: a flood leaves CPU time for others
 MAX_SENDERS = 64  # senders with queued requests; requests of further senders are refused
 MODE_CHANGING = "mode_selected"
-MEASUREMENTS = (
-    "position_reported",
-    "steering_reported",
-    "bitrate_predicted",
-    "link_measured",
-)  # only the newest one counts
+MEASUREMENTS = ("position_reported", "steering_reported", "bitrate_predicted")  # only the newest one counts
 
 Answer = Callable[[Outcome], None]
 
@@ -46,10 +41,10 @@ class Request(NamedTuple):
         return self.sender
 
     @property
-    def measures(self) -> tuple[Any, Any] | None:
-        """The quantity it measures, if a newer measurement supersedes it."""
+    def measures(self) -> str | None:
+        """Its event, if it measures a quantity, so that a newer measurement supersedes it."""
         name = self.document.get("event")
-        return (name, self.document.get("camera")) if name in MEASUREMENTS else None
+        return name if name in MEASUREMENTS else None
 
     @property
     def changes_mode(self) -> bool:

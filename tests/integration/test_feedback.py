@@ -163,5 +163,6 @@ def test_an_operator_may_not_state_what_the_link_carries(broker):
     with process("vehicle", *words):
         operator = Operator(broker)
         operator.state(lambda state: state["online"])
-        reply = operator.ask("1", event="link_measured", kbps=100, queue_ms=500, state="filling")
+        numbers = {"kbps": 100, "queue_ms": 500, "loss": 0, "rtt_ms": 30}
+        reply = operator.ask("1", event="link_measured", state="filling", evidence={}, **numbers)
     assert (reply["result"], reply["reason"]) == ("refused", "link_measured: only the vehicle itself makes this event")
