@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -113,11 +112,6 @@ class Draft(NamedTuple):
     def replaced(self, **changes: Any) -> Draft:
         """The draft with these parts replaced."""
         return self._replace(**changes)
-
-    def but(self, **changes: Any) -> Draft:
-        """Deprecated: use `replaced`."""
-        warnings.warn("Draft.but is deprecated, use Draft.replaced", DeprecationWarning, stacklevel=2)
-        return self.replaced(**changes)
 
     def noted(self, note: str, **changes: Any) -> Draft:
         """The draft with these parts replaced and the reason added."""
