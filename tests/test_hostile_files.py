@@ -137,7 +137,7 @@ def test_a_parameter_missing_in_a_list_of_ones_own(conf: UserConf, tod: Command)
     problems = tod("print", "source=test", "modes=mine", conf.word).problems
     assert {problem.partition(": ")[0] for problem in problems} == {str(conf.path / "modes/mine.yaml")}
     assert "automatic.pause_without_operator.after_s: missing: required by this rule" in problems[0]
-    assert "automatic.cap_by_link: was replaced by follow_link, see docs/rules.md" in problems[1]
+    assert "automatic.cap_by_link: unknown rule" in problems[1]
 
 
 @pytest.mark.parametrize(

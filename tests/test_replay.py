@@ -14,7 +14,6 @@ import pytest
 from helpers import Command, UserConf, process, vehicle
 from shared_data import shared
 
-from runner.configuration.replaced_rules import with_successors
 from runner.core.events import BitratePredicted, to_json
 from runner.core.model import Vehicle
 from runner.pqos import Pqos, build_pqos
@@ -521,45 +520,6 @@ def test_another_kind_of_camera_stays_in_its_place(tod: Command, drive: Path, tm
         key: was[key] for key in ("place", "pose", "device")
     }
     assert (now["height_px"], now["weight"]) == (720, 2)
-
-
-def test_a_drive_of_older_rules_is_replayed_with_the_rule_that_replaced_them(tod: Command, tmp_path: Path) -> None:
-    old = tmp_path / "old"
-    events = [
-        predicted(0, 3000),
-        {"t": 0.1, "event": "operator_connected"},
-        {"t": 0.2, "event": "link_measured", "kbps": 900, "queue_ms": 80, "state": "filling", "rtt_ms": 30},
-        {"t": 9, "event": "clock_advanced"},
-    ]
-    (story := tmp_path / "old.jsonl").write_text(lines(events))
-    assert tod("replay", "vehicle=delivery_robot", "source=test", f"input={story}", f"log={old}").status == 0
-    (log := old / "drive.jsonl").write_text("".join(_with_older_rules(log.read_text().splitlines())))
-    done = tod("replay", f"input={old}", f"log={tmp_path / 'new'}")
-    assert done.err == f"{log}: follow_link replaces cap_at_lower_bound, cap_by_link, fade_when_stale; decisions may differ from the drive's\n"  # fmt: skip  # noqa: E501
-    again = tod("replay", f"input={old}")
-    assert [json.loads(line)["total_kbps"] for line in again.out.splitlines()] == [3000, 1500, 1500, 500]
-
-
-def test_lists_of_rules_in_older_drives_become_mappings() -> None:
-    hold, pause = ({"hold_upscaling": {"for_s": 3}}, {"pause_without_operator": {"after_s": 1}})
-    config, replaced = with_successors({"modes": {"automatic": [hold, pause, {"hold_upscaling": {"for_s": 9}}]}})
-    again = {"hold_upscaling_2": {"rule": "hold_upscaling", "for_s": 9}}
-    assert replaced == []
-    assert list(config["modes"]["automatic"].items()) == [*hold.items(), *pause.items(), *again.items()]
-
-
-def _with_older_rules(log: list[str]) -> Iterator[str]:
-    began = json.loads(log[0])
-    modes = began["config"]["modes"] = {
-        mode: [{name: numbers} for name, numbers in rules.items()] for mode, rules in began["config"]["modes"].items()
-    }
-    modes["automatic"][1:2] = [
-        {"cap_at_lower_bound": {}},
-        {"cap_by_link": {"reserve_kbps": 0, "alone_after_s": 2, "least_trust": 0.5, "start": 0.5}},
-        {"fade_when_stale": {"after_s": 2, "halve_every_s": 1, "floor_kbps": 500}},
-    ]
-    modes["collective"][1] = {"cap_by_link": {"reserve_kbps": 0, "start": 0.5}}
-    return (f"{line}\n" for line in (json.dumps(began), *log[1:]))
 
 
 def test_a_drive_is_never_overwritten(tod: Command, drive: Path, story: Path) -> None:

@@ -126,7 +126,7 @@ class Builder:
         media = self.part(("media",), _media)
         if media is None:
             return None
-        keys, insecure = document.get("keys"), document.get("insecure", False)  # older drives lack them
+        keys, insecure = document.get("keys"), document.get("insecure", False)
         private = None if isinstance(insecure, bool) else self.part(("insecure",), _network)
         media = replace(media, secure=keys is not None)
         control = Endpoint(document["control"]["host"], document["control"]["port"])
@@ -134,11 +134,10 @@ class Builder:
         self.built = set(built)
         recording = self.part(("recording",), _recording)
         page = PageSettings(**document["page"])
-        # Older drives have no inputs.
-        inputs = self.part(("inputs",), lambda data: Inputs(**_yielding(data))) if "inputs" in document else None
+        inputs = self.part(("inputs",), lambda data: Inputs(**data)) if "inputs" in document else None
         known = document.get("dimensions") is not None
         dimensions = self.part(("dimensions",), lambda data: Dimensions(**data)) if known else None
-        ros = _ros(document.get("ros", {}))  # older drives lack it
+        ros = _ros(document.get("ros", {}))
         for error in ros.misplaced():
             self._report(("ros",), error)
         listening = {"page.port": page.port} if page.serve else {}
@@ -160,13 +159,13 @@ class Builder:
             media=media,
             control=control,
             page=page,
-            latency=LatencyLimit(**document.get("latency", {})),  # older drives lack it
+            latency=LatencyLimit(**document.get("latency", {})),
             recording=recording,
             log_video=document["log"]["video"],
             expires_s=float(document["control"]["expires_s"]),
             keys=keys,
             insecure=insecure is True,
-            strict=document.get("strict", False),  # older drives lack it
+            strict=document.get("strict", False),
             private=private,
             metrics=MetricsPorts(**document.get("metrics", {})),
             ros=ros,
@@ -518,11 +517,3 @@ def _split(key: str) -> schema.Path:
     for piece in filter(None, key.replace("]", "").replace("[", ".#").split(".")):
         parts.append(int(piece[1:]) if piece[0] == "#" else piece)
     return tuple(parts)
-
-
-def _yielding(inputs: Mapping[str, Any]) -> dict[str, Any]:
-    """The inputs, where a digit that another action has selects no camera: configurations may predate `camera_1`."""
-    keys = inputs.get("keys") or {}
-    digits = {f"camera_{key}": key for key in map(str, range(1, 10))}
-    taken = {value for action, value in keys.items() if digits.get(action) != value}
-    return {**inputs, "keys": {it: None if digits.get(it) == key and key in taken else key for it, key in keys.items()}}

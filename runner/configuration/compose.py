@@ -12,12 +12,10 @@ from runner.configuration.files import GROUPS, bases_of, chosen_by, conf_directo
 from runner.configuration.interpolation import value_at
 from runner.configuration.origin import PICKED, Composed, Part, nested
 from runner.configuration.overrides import Override, choice_problems, parse_overrides, rule_problems
-from runner.configuration.replaced_rules import with_successors
 from runner.configuration.resolve import resolved
 from runner.configuration.yaml_file import label, load_file, read
 from runner.core.model import Mode
 from runner.errors import COMMAND_LINE, ConfigError, Problem, suggest
-from runner.resources import directory
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -74,10 +72,7 @@ def recompose(base: dict[str, Any], name: str, overrides: Sequence[str], user: P
 
     base    the document, as stored with a drive; name: its location, for messages
     raises  ConfigError
-
-    Keys that an earlier version did not have are taken from the packaged config.yaml.
     """
-    base, _ = with_successors(_completed(base))
     if not overrides:
         return Composed(base, [Part(name, (), base)])
     from omegaconf import OmegaConf
@@ -102,14 +97,6 @@ def recompose(base: dict[str, Any], name: str, overrides: Sequence[str], user: P
     parts = [_part(override) for override in reversed(parsed) if override.deletes or not override.choice]
     document = cast("dict[str, Any]", OmegaConf.to_container(config))
     return Composed(document, [*parts, Part(name, (), base)])
-
-
-def _completed(document: dict[str, Any]) -> dict[str, Any]:
-    """A document with the keys of config.yaml's own sections (media, control, ...) that it lacks."""
-    packaged = load_file(directory("conf") / "config.yaml")
-    sections = {key: value for key, value in packaged.items() if isinstance(value, dict)}
-    known = {key: document[key] for key in sections if isinstance(document.get(key), dict)}
-    return {**document, **{key: {**sections[key], **value} for key, value in known.items()}}
 
 
 def _mounted(kind: dict[str, Any], config: DictConfig, package: str) -> dict[str, Any]:

@@ -11,7 +11,6 @@ from dataclasses import replace
 from enum import StrEnum
 from typing import Any
 
-from runner.configuration.replaced_rules import REPLACED, SUCCESSOR
 from runner.core.model import Mode, ModelError, exact
 from runner.core.rules import GIVEN, Rule, RuleCall, registry
 from runner.errors import suggest
@@ -34,8 +33,6 @@ def find_rule(name: str) -> Rule:
             except Exception as error:  # a user's package may raise anything on import
                 rule = f"{entry.value} cannot be imported: {type(error).__name__}: {error}"
                 raise ModelError("", repr(name), rule) from None
-    if name in REPLACED:
-        raise ModelError("", repr(name), f"was replaced by {SUCCESSOR}, see docs/rules.md")
     if name not in registry.RULES:
         raise ModelError("", repr(name), f"unknown rule{suggest(name, registry.RULES)}{OWN_RULES}")
     return registry.RULES[name]

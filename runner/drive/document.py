@@ -47,13 +47,8 @@ def number(value: float | None, digits: int = 4) -> float | None:
 
 
 def rules(drive: Series) -> dict[str, list[str]]:
-    """By mode, the names of its rules; older logs list them."""
-    modes = drive.config.get("modes") or {}
-    return {mode: _names(entries) for mode, entries in modes.items()}
-
-
-def _names(entries: Mapping[str, Any] | Sequence[Mapping[str, Any]]) -> list[str]:
-    return list(entries) if isinstance(entries, Mapping) else [name for entry in entries for name in entry]
+    """By mode, the names of its rules."""
+    return {mode: list(entries) for mode, entries in (drive.config.get("modes") or {}).items()}
 
 
 def _drive(drive: DriveStatistics, checks: Sequence[ClaimCheck]) -> dict[str, Any]:

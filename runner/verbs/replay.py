@@ -50,7 +50,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
 from msgspec import UNSET
 
 from runner.configuration.config import Base, configuration
-from runner.configuration.replaced_rules import SUCCESSOR, with_successors
 from runner.core.decision import Decision
 from runner.core.events import NAMES, BitratePredicted, Event, LinkMeasured, PositionReported, parse, to_json
 from runner.core.model import Vehicle
@@ -94,7 +93,6 @@ def run(arguments: Arguments) -> int:
     with _input(arguments) as (name, text):
         lines, began = _begin(text, name)
         began = began and _corrected(began, arguments)
-        _tell_replaced(began, name)
         one = _prepare(arguments, name, began, _positions(arguments, began))
         _check(arguments)
         with _output(arguments) as output:
@@ -110,7 +108,6 @@ def _sweep(arguments: Arguments) -> int:
     with _input(arguments) as (name, text):
         _, began = _begin(text, name)
     began = began and _corrected(began, arguments)
-    _tell_replaced(began, name)
     positions = _positions(arguments, began)
     runs = prepare_all(arguments, lambda own: _prepare(own, name, began, positions))
     logged = [one._replace(arguments=one.arguments.in_directory(str(n), ["log"])) for n, (_, one) in enumerate(runs)]
@@ -194,16 +191,6 @@ def _corrected(began: Began, arguments: Arguments) -> Began:
         # Wrong lines are skipped here as `events` skips them, which reads no line of this kind.
         valid = (step for step in steps if is_log(step) and step["log"] == KINDS[ClockSet] and not log_problem(step))
         return replace(began, time=began.time + sum(step["by_s"] for step in valid))
-
-
-def _tell_replaced(began: Began | None, name: str) -> None:
-    """Say on standard error which rules of a drive are no longer run."""
-    _, replaced = with_successors(began.config) if began else (None, [])
-    if replaced:
-        print(
-            f"{name}: {SUCCESSOR} replaces {', '.join(replaced)}; decisions may differ from the drive's",
-            file=sys.stderr,
-        )
 
 
 def _base(name: str, began: Began | None) -> Base | None:
@@ -330,7 +317,7 @@ def events(lines: Iterable[str], name: str, uplink: MeasuredUplink | None = None
                 is_empty = False
                 yield to_json(measured), measured
             continue
-        if uplink and document["event"] == NAMES[LinkMeasured] and "camera" not in document:
+        if uplink and document["event"] == NAMES[LinkMeasured]:
             continue
         is_empty = False
         yield document, parse(document)
