@@ -10,9 +10,9 @@ from functools import partial
 from itertools import chain
 from typing import TYPE_CHECKING
 
-from gi.repository import GLib, Gst, GstRtsp, GstSdp
+from gi.repository import Gst, GstRtsp, GstSdp
 
-from runner.graph import FEEDBACK, Plan, video_codec
+from runner.graph import Plan, video_codec
 from runner.gst.arriving import NTP_EPOCH_S
 from runner.gst.caps import structure
 from runner.gst.packet_times import state_arrivals
@@ -36,9 +36,7 @@ if TYPE_CHECKING:
 STALL_S = 2.0  # a camera that should send but neither sends nor answers for longer is rebuilt
 DIALLED_STALL_S = 1.0  # likewise where the vehicle dials: it calls again, but a listener keeps its first caller
 OVER_TCP = "over TCP, since UDP was refused: are the vehicle's media.rtp_ports in use?"
-OLDER = "the vehicle runs an older version, which has no path with feedback: the plain one is used"
 GRACE_S = 0.75  # time for the first frame once a camera is expected to send
-_WITH_FEEDBACK = f"/{FEEDBACK}"  # end of an address
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,8 +122,6 @@ class Receiver:
         self._over_udp = self._feedback = False  # transport and profile of the session
         self._kernel_times = False  # whether packets state when the kernel received them
         self._may_use_udp = False  # until it is known which the session uses
-        self._medium = 0  # of those that the vehicle offers
-        self._is_older = self._older_reported = False  # whether the vehicle lacks the path with feedback
         self._on_unit, self._on_picture = on_unit, on_picture
         self._name = name = plan.camera.name
         self._codec = video_codec(plan.camera.graph)
@@ -245,24 +241,10 @@ class Receiver:
     def _is_repaired(self) -> bool:
         return self._repairs and self._over_udp and self._feedback
 
-    def _adapts(self, error: GLib.Error) -> bool:
-        """Whether a vehicle of an older version has answered that it lacks the path with feedback."""
-        is_missing = error.matches(Gst.ResourceError.quark(), Gst.ResourceError.NOT_FOUND)
-        self._is_older = is_missing and self._location.endswith(_WITH_FEEDBACK)
-        return self._is_older
-
-    @property
-    def _location(self) -> str:
-        return str(self._client.get_property("location"))
-
     def _on_description(self, _client: Gst.Element, sdp: GstSdp.SDPMessage) -> None:
-        """Choose the profile with feedback: an older vehicle lists the stream once for each profile."""
+        """Note whether the vehicle grants the profile with feedback."""
         media = range(sdp.medias_len())
-        with_feedback = [number for number in media if sdp.get_media(number).get_proto().endswith("AVPF")]
-        self._feedback, self._medium = bool(with_feedback), next(iter(with_feedback), 0)
-        if self._is_older and not self._older_reported:
-            self._older_reported = True
-            self._on_report(self._name, OLDER)
+        self._feedback = any(sdp.get_media(number).get_proto().endswith("AVPF") for number in media)
 
     def _on_built(self, pipeline: Gst.Pipeline) -> Gst.Pad:
         self._before = self._count() if self._built else Reception()
@@ -285,15 +267,12 @@ class Receiver:
         self._may_use_udp = False
         if is_rtsp_client(self._client):
             self._may_use_udp = bool(self._client.get_property("protocols") & GstRtsp.RTSPLowerTrans.UDP)
-            if self._is_older:
-                self._client.set_property("location", self._location.removesuffix(_WITH_FEEDBACK))
             self._client.connect("on-sdp", self._on_description)
-            self._client.connect("select-stream", lambda _client, number, _caps: number == self._medium)
             handle_stream_end(self._client, self._on_source_gone)
             limit_teardown(pipeline)
             opening = Opening()
             opening.follow(pipeline.get_bus())
-            self._supervised.before_stop, self._supervised.adapts = opening.wait, self._adapts
+            self._supervised.before_stop = opening.wait
         if self._operator and self._client.find_property("user-agent"):
             self._client.set_property("user-agent", user_agent(self._operator))
         if self._video:
@@ -341,7 +320,7 @@ class Receiver:
             return
         try:
             if self._filter is None:
-                self._filter = SenderFilter(Gst.Uri.from_string(self._location).get_host())
+                self._filter = SenderFilter(Gst.Uri.from_string(self._client.get_property("location")).get_host())
             self._filter.attach(used_socket.get_fd())
         except OSError as error:
             self._on_report(self._name, f"packets from hosts other than the vehicle are not dropped: {error}")

@@ -37,7 +37,6 @@ class SupervisedPipeline:
     on_report  called once with each reason, until the pipeline works again
     rebuilt    how often a pipeline that had worked was rebuilt
     must_wait   whether it must not be built again yet
-    adapts      called with an error of this pipeline: whether the next one avoids it, which is then built at once
     before_stop  called before this pipeline is stopped, in the thread that stops it
     """
 
@@ -56,7 +55,6 @@ class SupervisedPipeline:
         self._outage = Outage(on_report)
         self.rebuilt = 0
         self.must_wait: Callable[[], bool] = lambda: False
-        self.adapts: Callable[[GLib.Error], bool] = lambda _: False
         self.before_stop: Callable[[], object] = lambda: None
 
     def start(self) -> None:
@@ -100,12 +98,9 @@ class SupervisedPipeline:
             self._lost = now
         if self._worked or now - self._lost > PATIENCE_S:
             self._outage.report_failure(why, self._lost)
-        self._rebuild(max(0.0, self._begun + RETRY_S - now))
-
-    def _rebuild(self, after_s: float) -> None:
-        self._ended = time.monotonic()
+        self._ended = now
         self._tear_down()
-        self._retry = later(after_s, self._retry_start)
+        self._retry = later(max(0.0, self._begun + RETRY_S - now), self._retry_start)
 
     def _retry_start(self) -> None:
         if self._change and self._change.is_alive() and time.monotonic() - self._ended < STOPPED_S:
@@ -121,10 +116,7 @@ class SupervisedPipeline:
         if concerns_file(message) or self._retry or self._stopped:
             return
         error = message.parse_error()[0] if message.type == Gst.MessageType.ERROR else None
-        if error and self.adapts(error):
-            self._rebuild(0)
-        else:
-            self.restart(error.message if error else STREAM_ENDED)
+        self.restart(error.message if error else STREAM_ENDED)
 
     def _on_first_buffer(self, pad: Gst.Pad, _buffer: PassingBuffer) -> bool:
         """From a streaming thread."""

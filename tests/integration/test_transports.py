@@ -12,8 +12,7 @@ import pytest
 from rig import free_port, needs_root, over_tcp, streaming, until
 from rtsp_client import RtspClient
 from runner.core.commands import Command
-from runner.gst.patient_media import PatientMedia
-from runner.gst.receiver import OLDER, OVER_TCP
+from runner.gst.receiver import OVER_TCP
 
 pytestmark = pytest.mark.gst
 CAMERA = "rear"
@@ -95,22 +94,6 @@ def test_when_a_frame_began_is_known_over_udp_only(transport, known):
     assert {frame.first is not None for frame in frames[5:]} == {known}
     begin, end = frames[5].arrived, frames[-1].arrived
     assert sum(size for at, size in packets if begin < at <= end) == sum(frame.bytes for frame in frames[6:])
-
-
-@pytest.mark.parametrize("lists_both", [True, pytest.param(False, marks=[pytest.mark.soak, pytest.mark.players])])
-def test_a_vehicle_of_an_older_version_is_shown(monkeypatch, lists_both):
-    """It has no path with feedback, and may list its stream once for each profile, as the library does."""
-    monkeypatch.setattr("runner.gst.server.FEEDBACK", "another")
-    if lists_both:
-        monkeypatch.setattr("runner.gst.camera_media.CameraMedia", PatientMedia)
-    with driving() as (side, operator, _, reported):
-        until(lambda: received(operator).frames > 5, every_s=0.1)
-        assert (received(operator).buffer_ms is not None) is lists_both
-        for connection in list(side._server._connections.values()):
-            connection.close()
-        until(lambda: received(operator).rebuilt == 1, every_s=0.1)
-        until(lambda: any("works again" in line for line in reported))
-        assert [line for line in reported if "older" in line or "Not" in line] == [f"operator: {CAMERA}: {OLDER}"]
 
 
 @needs_root  # to see packets as they are sent
