@@ -130,7 +130,7 @@ class VehicleState:
     """State of a vehicle that is online.
 
     cause       the event that triggered the decision
-    asked_kbps  the total of the prediction or the operator; None in older logs
+    asked_kbps  the total of the prediction or the operator
     total_kbps  the same after all rules, such as what the measured link carries
     fault       why the rules could not decide, so that an earlier decision stays in force
     attention   of the driver; absent: the operator in control states none
@@ -143,10 +143,10 @@ class VehicleState:
     cause: str
     mode: Mode
     total_kbps: Number
+    asked_kbps: Number
     cameras: Mapping[str, CameraState]
     fault: str | None = None
     online: bool = True
-    asked_kbps: Number | None = None
     attention: Attention | UnsetType = UNSET
     operator: str | UnsetType = UNSET
     certificate_ends: float | UnsetType = UNSET
@@ -155,7 +155,7 @@ class VehicleState:
     @property
     def total_words(self) -> str:
         """The total in kbit/s, and the requested one if that is more: 1800 of 3000."""
-        less = self.asked_kbps is not None and self.total_kbps < self.asked_kbps
+        less = self.total_kbps < self.asked_kbps
         return f"{self.total_kbps:.6g} of {self.asked_kbps:.6g}" if less else f"{self.total_kbps}"
 
 
@@ -294,12 +294,12 @@ class CameraSample:
     """Reception of one camera. Rates cover the last second, counters run since the start.
 
     lost        RTP packets that never arrived
-    damaged     frames whose picture shows packet loss, until it is healed; None in older logs
+    damaged     frames whose picture shows packet loss, until it is healed
     buffer_ms   how long a picture waits for retransmitted packets; None: no retransmission
     foreign     packets from senders other than the vehicle, dropped
     rebuilt     how often the receiver's pipeline was rebuilt
     latency_ms  capture to decode of the last sampled frame; None: unknown
-    stages_ms   the parts of it; None in older logs
+    stages_ms   the parts of it
     arrivals    in a log, of each access unit since the previous sample: time, and ms since its capture if known
 
     Latencies are accurate to within the sample's `clock_bound_ms`.
@@ -318,9 +318,9 @@ class CameraSample:
     foreign: int = 0
     frames: int = 0
     bytes: int = 0
-    damaged: int | None = None
+    damaged: int = 0
     buffer_ms: int | None = None
-    stages_ms: LatencyStages | None = None
+    stages_ms: LatencyStages = LatencyStages()
     arrivals: tuple[tuple[float, float | None], ...] = ()
 
 
@@ -331,8 +331,7 @@ class Sample:
     dropped         invalid messages on the control link
     speed_factor    as in `SpeedAdvice`; None: not advised
     clock_ahead_ms  how far the vehicle's clock is ahead; None: unknown, as are all latencies
-    clock_bound_ms  maximum error of that and of each latency; None: unknown. Older logs lack it: there
-                    `clock_ahead_ms` was derived from negative latencies, and latencies are differences of both clocks
+    clock_bound_ms  maximum error of that and of each latency; None: unknown
     """
 
     t: float

@@ -157,7 +157,7 @@ class _Made:
         if event.t >= OPERATOR_LATER_S or not self.operator_log:
             shifted = max(0.0, round(event.t - OPERATOR_LATER_S + 0.02, 6))
             cameras = {name: CameraState.at(setting, 1, {}, None) for name, setting in decision.settings.items()}
-            state = VehicleState(shifted, cause, decision.mode, made.total_kbps, cameras)
+            state = VehicleState(shifted, cause, decision.mode, made.total_kbps, plain(decision.asked), cameras)
             self.operator_log.append(line_to_json(state))
 
     def _predicted(self) -> float:

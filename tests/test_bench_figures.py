@@ -57,7 +57,7 @@ def received(*arrivals: float, ms: float = 50.0, damaged: int = 0) -> ReceivedSe
     t = np.arange(0, 20, 0.25)
     broken = np.array([sum(at <= now for at in arrivals[:damaged]) for now in t], dtype=float)
     unused = dict.fromkeys(("kbps", "width", "height", "latency_ms", "bound_ms", "frames", "bytes"), NOTHING)
-    rest = dict.fromkeys(("lost", "rebuilt", "clocks_ms"), NOTHING)
+    rest = dict.fromkeys(("lost", "rebuilt"), NOTHING)
     arrival_t = np.array(arrivals)
     return ReceivedSeries(
         t=t, damaged=broken, arrival_t=arrival_t, arrival_ms=np.full(len(arrivals), ms), **unused, **rest

@@ -47,7 +47,7 @@ def test_a_side_serves_its_figures_and_its_health() -> None:
     figures.serve(lambda: problems[-1] if problems else None)
     try:
         figures.take(TELEMETRY)
-        figures.take(VehicleState(1.0, "", Mode.AUTOMATIC, 2000, {}, believed=BELIEVED))
+        figures.take(VehicleState(1.0, "", Mode.AUTOMATIC, 2000, 2000, {}, believed=BELIEVED))
         figures.show_online(True)
         status, text = fetch(port, "/metrics")
         assert status == 200

@@ -230,7 +230,7 @@ def interrupted(begin: float, end: float, kbps: float = 400, seconds: float = 25
     rates = np.where(t < 1, NAN, (frames - np.searchsorted(arrived, t - 1, "right")) * kbps / 10)
     zero, size, latency = np.zeros(t.shape), np.full(t.shape, 2.0), np.full(arrived.shape, 50.0)
     received = ReceivedSeries(
-        t, rates, size, size, size, size, frames, frames * kbps * 12.5, zero, zero, zero, arrived, latency, latency
+        t, rates, size, size, size, size, frames, frames * kbps * 12.5, zero, zero, zero, arrived, latency
     )
     decided = camera(kbps, 0.5).decided
     return CameraSeries("one", decided, received, None)

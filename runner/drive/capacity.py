@@ -78,7 +78,7 @@ def limited_samples(drive: Series) -> list[CapacitySample]:
     t, kbps = sample_times(drive), drive.actual.y
     limited = np.zeros(t.shape, dtype=bool)
     for camera in received:
-        limited |= _lost(t, camera.t, camera.lost) | _queued(t, camera.arrival_t, camera.clocks_ms)
+        limited |= _lost(t, camera.t, camera.lost) | _queued(t, camera.arrival_t, camera.arrival_ms)
     limited &= _measured_limit(drive, t) & ~_held_up(drive, t)
     return _samples(t, np.where(limited, kbps, np.nan), _positions_at(drive.positions, t - WINDOW_S / 2))
 

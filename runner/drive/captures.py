@@ -77,14 +77,9 @@ def received(side: Side, camera: str) -> list[UnitTimes]:
         if camera in sample.cameras
         for t, ms in sample.cameras[camera].arrivals
         if ms is not None
-        for arrived in (side.corrected(side.began.time + t + _ahead_s(sample), sample.t),)
+        for arrived in (side.corrected(side.began.time + t + (sample.clock_ahead_ms or 0.0) / 1000, sample.t),)
     )
     return sorted(found)
-
-
-def _ahead_s(sample: Sample) -> float:
-    """How far the vehicle's clock was ahead. In older logs latencies are the difference of both clocks."""
-    return 0.0 if sample.clock_bound_ms is None else (sample.clock_ahead_ms or 0.0) / 1000
 
 
 def matched(sent: Mapping[bytes, Sequence[int]], pictures: Sequence[bytes], file_times: Sequence[int]) -> Iterator[int]:

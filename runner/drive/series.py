@@ -38,7 +38,7 @@ from runner.records import (
     Telemetry,
     VehicleState,
 )
-from runner.system.clocks import CLOCKS_APART_MS, STEP_S, TRUSTED_AGAIN_S
+from runner.system.clocks import STEP_S
 
 FloatSeries = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -87,12 +87,11 @@ class ReceivedSeries:
     kbps                     over the second before
     width, height            px of the picture, 0 before the first
     latency_ms               capture to decode of the last sampled frame, nan if unknown
-    bound_ms                 by how much latencies may be wrong, nan if unknown; older logs did not measure it
+    bound_ms                 by how much latencies may be wrong, nan if unknown
     frames, bytes            counters at each sample
     lost, rebuilt            packets, counters at each sample
-    damaged                  counter of frames whose picture shows a loss, nan in older logs
+    damaged                  counter of frames whose picture shows a loss
     arrival_t, arrival_ms    arrival of each access unit, s, and its latency from capture to arrival, likewise
-    clocks_ms                as logged: in older logs arrival by the operator's clock minus capture by the vehicle's
     """
 
     t: FloatSeries
@@ -108,7 +107,6 @@ class ReceivedSeries:
     damaged: FloatSeries
     arrival_t: FloatSeries
     arrival_ms: FloatSeries
-    clocks_ms: FloatSeries
 
 
 @dataclass(frozen=True, slots=True)
@@ -318,7 +316,7 @@ def _series(drive: Drive, label: str) -> Series:
     samples = [at for at in _by_steady_clock(operator) if 0 <= at[0] <= end]
     telemetry = vehicle.of(Telemetry)
     names = list(config.get("cameras") or decisions[0][1].cameras)
-    cameras = _with_known_latencies({name: _camera(name, config, decisions, samples, telemetry) for name in names})
+    cameras = {name: _camera(name, config, decisions, samples, telemetry) for name in names}
     return Series(
         label=label,
         path=str(drive.path),
@@ -334,7 +332,7 @@ def _series(drive: Drive, label: str) -> Series:
         believed=_believed(decisions),
         measured="received" if samples else "sent" if telemetry else "",
         capped=_capped(operator),
-        measured_t=np.array([t for t, event in vehicle.of(LinkMeasured) if event.kbps is not None], dtype=float),
+        measured_t=np.array([t for t, _ in vehicle.of(LinkMeasured)], dtype=float),
         held_up=tuple(_held_up(vehicle, samples)),
         link=_link([at for at in link.of(LinkSample) if 0 <= at[0] <= end]),
         positions=_positions(_Shifted(leading.lines, 0.0), samples),
@@ -342,7 +340,7 @@ def _series(drive: Drive, label: str) -> Series:
         reasons=tuple(_reasons(decisions)),
         notes=tuple(sorted((t, note.text) for side in sides.values() for t, note in side.of(Note))),
         refused=max((line.refused for _, line in (telemetry or samples)), default=0),
-        warnings=(*drive.warnings, *_warnings(drive.sides, samples, cameras)),
+        warnings=(*drive.warnings, *_warnings(drive.sides, samples)),
         versions={name: side.began.versions for name, side in drive.sides.items()},
         ended={name: side.ended for name, side in drive.sides.items()},
         config=config,
@@ -363,20 +361,11 @@ def _unset(line: Sample, set_s: Sequence[float]) -> Iterator[tuple[str, CameraSa
         yield name, replace(camera, arrivals=tuple(near))
 
 
-def _warnings(sides: Mapping[str, Side], samples: Sequence[Any], cameras: Mapping[str, CameraSeries]) -> Iterator[str]:
+def _warnings(sides: Mapping[str, Side], samples: Sequence[Any]) -> Iterator[str]:
     """Problems with the clocks of the two sides."""
     if {"vehicle", "operator"} <= sides.keys() and not samples:
         spans = " and ".join(f"{FILES[side]} is of {sides[side].span}" for side in ("vehicle", "operator"))
         yield f"the logs do not overlap: {spans}: different drives, or clocks far apart; the operator's is left out"
-    received = [camera.received for camera in cameras.values() if camera.received]
-    if _compared(received):
-        return
-    lowest = min((float(np.nanmin(got.clocks_ms)) for got in received if np.isfinite(got.clocks_ms).any()), default=0.0)
-    reported_ms = max((sample.clock_ahead_ms or 0.0 for _, sample in samples), default=0.0)
-    ahead_ms = max(-lowest, reported_ms)
-    if ahead_ms > -CLOCKS_APART_MS:
-        rule = f"latencies are unknown up to {TRUSTED_AGAIN_S:g} s before and after"
-        yield f"the vehicle's clock was ahead of the operator's by at least {ahead_ms:.0f} ms: {rule}"
 
 
 def _line(points: Iterable[tuple[float, float | None]]) -> TimeSeries:
@@ -417,7 +406,7 @@ def _believed(decisions: Sequence[tuple[float, DecisionMade | VehicleState]]) ->
 
 def _capped(operator: _Shifted) -> TimeSeries:
     states = operator.of(VehicleState)
-    return _line((t, state.total_kbps < state.asked_kbps) for t, state in states if state.asked_kbps is not None)
+    return _line((t, state.total_kbps < state.asked_kbps) for t, state in states)
 
 
 def _held_up(vehicle: _Shifted, samples: Sequence[tuple[float, Sample]]) -> Iterator[tuple[float, float]]:
@@ -539,52 +528,23 @@ def _received(received: Sequence[tuple[float, Sample, CameraSample]]) -> Receive
     t = np.array([t for t, *_ in received], dtype=float)
     frames = counted(column("frames"))
     moved = np.diff(frames, prepend=0) > 0  # otherwise the latency is that of a frame already counted
+    bound_ms = np.array([line.clock_bound_ms for _, line, _ in received], dtype=float)
     return ReceivedSeries(
         t=t,
         kbps=_settled(t, column("kbps"), frames),
         **{key: column(key) for key in ("width", "height")},
         latency_ms=np.where(moved, column("latency_ms"), np.nan),
-        bound_ms=np.array([line.clock_bound_ms for _, line, _ in received], dtype=float),
+        bound_ms=bound_ms,
         frames=frames,
         **{key: counted(column(key)) for key in ("bytes", "lost", "rebuilt", "damaged")},
         arrival_t=arrivals[:, 0],
-        arrival_ms=arrivals[:, 1],
-        clocks_ms=arrivals[:, 1],
+        arrival_ms=_within(arrivals[:, 1], bound_ms),
     )
-
-
-def _with_known_latencies(cameras: Mapping[str, CameraSeries]) -> dict[str, CameraSeries]:
-    """Remove negative latencies; in older logs also those around them, for all cameras, which share one clock."""
-    received = {name: camera.received for name, camera in cameras.items() if camera.received}
-    compared = _compared(received.values())
-    ahead = [got.arrival_t[got.clocks_ms < CLOCKS_APART_MS] for got in received.values()]
-    ahead += [got.t[got.latency_ms < CLOCKS_APART_MS] for got in received.values()]
-    apart = np.sort(np.concatenate([np.empty(0), *ahead]))
-    known = dict(cameras)
-    for name, got in received.items():
-        if compared:
-            arrival_ms, latency_ms = _within(got.arrival_ms, got.bound_ms), got.latency_ms
-        else:
-            arrival_ms = _known(got.arrival_t, got.arrival_ms, apart)
-            latency_ms = _known(got.t, got.latency_ms, apart)
-        known[name] = replace(cameras[name], received=replace(got, arrival_ms=arrival_ms, latency_ms=latency_ms))
-    return known
 
 
 def _within(ms: FloatSeries, bound_ms: FloatSeries) -> FloatSeries:
     """Latencies that are negative only within their bound; nan where a clock was set between capture and arrival."""
     return np.where(ms < -float(np.nanmax(bound_ms, initial=0.0)) - 1000 * STEP_S, np.nan, np.maximum(ms, 0.0))
-
-
-def _compared(received: Iterable[ReceivedSeries]) -> bool:
-    """Whether the operator's side compared its clock with the vehicle's."""
-    return any(bool(np.isfinite(got.bound_ms).any()) for got in received)
-
-
-def _known(t: FloatSeries, ms: FloatSeries, apart: FloatSeries) -> FloatSeries:
-    """Latencies, nan if negative or within `TRUSTED_AGAIN_S` before or after a negative one."""
-    near = np.searchsorted(apart, t + TRUSTED_AGAIN_S, "right") > np.searchsorted(apart, t - TRUSTED_AGAIN_S)
-    return np.where(near | (ms < 0), np.nan, ms)
 
 
 def _sent(sent: Sequence[tuple[float, CameraTelemetry]]) -> Sent:

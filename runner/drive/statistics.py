@@ -52,7 +52,7 @@ class Freeze(NamedTuple):
 class Latency(NamedTuple):
     """Percentiles of latencies, ms.
 
-    bound  by how much each may be wrong, for 95 % of the time; nan in older logs, which did not measure it
+    bound  by how much each may be wrong, for 95 % of the time; nan if unknown
     """
 
     median: float = NAN

@@ -60,7 +60,7 @@ def vehicle_state(run: Run, t: float, cause: str) -> VehicleState:
     }
     total, asked = plain(decision.total), plain(decision.asked)
     believed = decision.believed or UNSET
-    return VehicleState(t, cause, decision.mode, total, cameras, asked_kbps=asked, believed=believed)
+    return VehicleState(t, cause, decision.mode, total, asked, cameras, believed=believed)
 
 
 def segments(size: int) -> Iterator[int]:

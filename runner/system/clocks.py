@@ -10,8 +10,6 @@ MOST_DRIFT = 5e-4  # of two clocks: crystals drift by 100 ppm; adjtime(3) slews 
 SET_S = 5e-4  # a clock that moved by more than this plus the drift between two exchanges was set or slewed faster
 STEP_S = 5e-3  # one that moved by this much was set, perhaps in the middle of an exchange
 KEPT_S = 10.0  # how long an exchange is used; without a newer one the difference is unknown
-CLOCKS_APART_MS = -1.0  # in logs without exchanges: negative ages above this are noise, below it the clocks differ
-TRUSTED_AGAIN_S = 10.0  # in such logs, time around a negative age during which ages are unknown
 
 
 class Exchange(NamedTuple):

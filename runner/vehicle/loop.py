@@ -544,12 +544,11 @@ class ControlLoop:
         }
         fault = self._run.fault
         total, asked = plain(decision.total), plain(decision.asked)
-        decided = (decision.mode, total, cameras, fault)
+        decided = (decision.mode, total, asked, cameras, fault)
         return VehicleState(
             self._now(),
             self._cause,
             *decided,
-            asked_kbps=asked,
             attention=self._run.state.attention or UNSET,
             operator=self._in_control or UNSET,
             believed=decision.believed or UNSET,

@@ -75,7 +75,8 @@ class Station(SimpleNamespace):
             name: CameraState.at(setting, 1, applied_to_json(name, run.commanded[name]), None)
             for name, setting in run.decision.settings.items()
         }
-        return VehicleState(1.0, "", run.decision.mode, plain(run.decision.total), cameras)
+        totals = (plain(run.decision.total), plain(run.decision.asked))
+        return VehicleState(1.0, "", run.decision.mode, *totals, cameras)
 
     def encoded(self, name, picture):
         """An H.264 keyframe of a native picture, cropped and scaled as the vehicle would send it."""

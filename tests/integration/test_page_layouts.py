@@ -73,7 +73,8 @@ class Station(SimpleNamespace):
             name: CameraState.at(setting, 1, applied_to_json(name, run.commanded[name]), None)
             for name, setting in run.decision.settings.items()
         }
-        state = VehicleState(1.0, "", run.decision.mode, plain(run.decision.total), cameras, believed=BELIEVED)
+        totals = (plain(run.decision.total), plain(run.decision.asked))
+        state = VehicleState(1.0, "", run.decision.mode, *totals, cameras, believed=BELIEVED)
         own = {"user": "anna", "answer_s": 1.0, "link_state": LinkState()}
         super().__init__(state=state, note=print, attention=None, requests=[], seen=[], **own)
 

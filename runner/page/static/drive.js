@@ -78,7 +78,7 @@ function refreshSpeed() {
 
 function totalWords() {
   const { total_kbps, asked_kbps } = (isOnline() ? store.state : null) ?? {};
-  const isLimited = total_kbps !== undefined && Number.isFinite(asked_kbps) && total_kbps < (asked_kbps ?? 0);
+  const isLimited = total_kbps !== undefined && total_kbps < (asked_kbps ?? 0);
   return `${whole(total_kbps)}${isLimited ? ` of ${whole(asked_kbps)}` : ""} kbit/s`;
 }
 

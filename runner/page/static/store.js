@@ -52,7 +52,7 @@ let sampledAt = -Infinity; // page time of the last sample
  * @property {string} [fault]
  * @property {number} [slow_fps]
  * @property {Applied} applied
- * @typedef {{online: boolean, mode: string, total_kbps: number, asked_kbps?: number|null, cameras: Record<string, Decision>, operator?: string, believed?: Believed}} State
+ * @typedef {{online: boolean, mode: string, total_kbps: number, asked_kbps: number, cameras: Record<string, Decision>, operator?: string, believed?: Believed}} State
  *   operator: the one that the vehicle has in control
  * @typedef {object} Believed of the uplink; see `Believed` in runner/core/decision.py
  * @property {number} kbps
@@ -63,7 +63,7 @@ let sampledAt = -Infinity; // page time of the last sample
  * @property {number|null} gain
  * @property {number|null} policer_kbps
  * @typedef {{fps: number, kbps: number, allocated_kbps: number, scaling: number|null, width: number, height: number,
- *   latency_ms: number|null, lost: number, rebuilt: number, buffer_ms: number|null, stages_ms?: Stages|null}} CameraSample
+ *   latency_ms: number|null, lost: number, rebuilt: number, buffer_ms: number|null, stages_ms: Stages}} CameraSample
  * @typedef {Record<"capture"|"encode"|"link"|"buffer"|"decode", number|null>} Stages
  * @typedef {object} Sample
  * @property {number} time s since 1970

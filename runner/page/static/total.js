@@ -25,7 +25,7 @@ const slider = makeSlider({
 });
 
 /** The total as set, which a rule may lower. */
-const requestedTotal = () => (mode() ? (store.state?.asked_kbps ?? store.state?.total_kbps) : undefined);
+const requestedTotal = () => (mode() ? store.state?.asked_kbps : undefined);
 const maxTotal = () => (store.hello?.cameras ?? []).reduce((sum, { b_full_kbps }) => sum + b_full_kbps, 0);
 
 /** Why the operator cannot set the total; null: they can. */
