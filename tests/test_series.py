@@ -236,7 +236,8 @@ def test_setting_the_operators_clock_makes_no_freeze(tmp_path: Path, set_s: int)
             entry |= {"clock_ahead_ms": 5 - 1000.0 * set_s * after if known else None, "clock_bound_ms": 0.4}
             for camera in entry["cameras"].values():
                 camera["arrivals"] = [[at + set_s * after, ms] for at, ms in camera["arrivals"]]
-        return lines
+        set_at = [{"t": 8.0, "log": "clock_set", "by_s": set_s}] if side == "operator" else []
+        return sorted([*lines, *set_at], key=lambda entry: entry["t"])
 
     drive = series(read_drive(write_drive(tmp_path / "drive", seconds=20, change=is_set)))
     plain = series(read_drive(write_drive(tmp_path / "plain", seconds=20)))

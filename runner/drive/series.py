@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from runner.core.events import BitratePredicted, Event, LinkMeasured, PositionReported
 from runner.core.model import Mode
 from runner.drive.log import FILES
-from runner.drive.read import SET_S, Drive, Side
+from runner.drive.read import Drive, Side
 from runner.errors import UserError
 from runner.pqos.bandwidth_map import EARTH_M
 from runner.records import (
@@ -518,11 +518,7 @@ def _received(received: Sequence[tuple[float, Sample, CameraSample]]) -> Receive
     def column(key: str) -> FloatSeries:
         return np.array([getattr(camera, key) for *_, camera in received], dtype=float)
 
-    pairs = [
-        (at + t - line.t - set_s, ms)
-        for (t, line, camera), set_s in zip(received, _clock_set_s(received), strict=True)
-        for at, ms in camera.arrivals
-    ]
+    pairs = [(at + t - line.t, ms) for t, line, camera in received for at, ms in camera.arrivals]
     arrivals = np.array(pairs, dtype=float).reshape(-1, 2)
     arrivals = arrivals[np.argsort(arrivals[:, 0], kind="stable")]
     t = np.array([t for t, *_ in received], dtype=float)
@@ -552,23 +548,6 @@ def _sent(sent: Sequence[tuple[float, CameraTelemetry]]) -> Sent:
     frames = counted(np.array([camera.frames for _, camera in sent], dtype=float))
     sizes = counted(np.array([camera.bytes for _, camera in sent], dtype=float))
     return Sent(t, frames, sizes, rate(t, sizes))
-
-
-def _clock_set_s(received: Sequence[tuple[float, Sample, CameraSample]]) -> list[float]:
-    """By sample, by how much the operator's wall clock, by which arrivals are logged, has been set so far, s.
-
-    Samples are logged by its monotonic clock, soon after their newest arrival; where the two are further apart, and the
-    difference to the vehicle's clock has changed alike, the clock was set.
-    """
-    ahead_ms = [line.clock_ahead_ms for _, line, _ in received]
-    first = next((ms for ms in ahead_ms if ms is not None), None)
-    found, following = [], first
-    for (_, line, camera), ms in zip(reversed(received), reversed(ahead_ms), strict=True):
-        following = following if ms is None else ms  # unknown for a second after a change
-        late = max((at for at, _ in camera.arrivals), default=line.t) - line.t
-        moved = 0.0 if first is None or following is None else (first - following) / 1000
-        found.append(moved if abs(late) > SET_S and abs(late - moved) < SET_S else 0.0)
-    return found[::-1]
 
 
 def _settled(t: FloatSeries, kbps: FloatSeries, frames: FloatSeries) -> FloatSeries:
