@@ -69,6 +69,8 @@ STALE = "no prediction for 2 s"
             f"Mode single: rear 0.5 -> 0.25 ({WHY})",
         ),
         (state(PREDICTED, mode="single"), "Mode single; Prediction 900 kbit/s: total 3000 kbit/s"),
+        (state("attention_changed", rear=camera(0.25)), f"Attention changed: rear 0.5 -> 0.25 ({WHY})"),
+        (state("total_set", rear=camera(0.25)), f"total_set: rear 0.5 -> 0.25 ({WHY})"),  # of another version
         (state("tide_turned high 3", rear=camera(0.25)), f"tide_turned high 3: rear 0.5 -> 0.25 ({WHY})"),
     ],
 )
@@ -76,5 +78,5 @@ def test_a_decision_is_one_phrase(after: VehicleState, text: str | None) -> None
     assert decision_note(state(), after) == text
 
 
-def test_every_event_has_a_phrase() -> None:
-    assert CAUSES.keys() == EVENTS.keys()
+def test_phrases_are_of_events() -> None:
+    assert CAUSES.keys() <= EVENTS.keys()

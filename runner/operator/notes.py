@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from runner.core.events import EVENTS
 from runner.records import CameraState, VehicleState
 
-# First words of a note, by the event that caused the decision; fields as in `runner.core.events.describe`.
+# First words of a note, by the event that caused the decision, where its name is not enough; fields as in
+# `runner.core.events.describe`.
 CAUSES = {
     "bitrate_predicted": "Prediction {kbps} kbit/s",
     "mode_selected": "Mode {mode}",
@@ -14,14 +16,8 @@ CAUSES = {
     "camera_switched": "{camera} switched",
     "roi_set": "ROI of {camera} set",
     "camera_configured": "{camera} configured",
-    "weights_set": "Weights set",
-    "link_measured": "Link measured",
     "copies_counted": "Number of viewers changed",
     "source_reported": "{camera}'s source",
-    "control_passed": "Control passed",
-    "attention_changed": "Attention changed",
-    "operator_connected": "Operator connected",
-    "operator_disconnected": "Operator disconnected",
     "clock_advanced": "Time elapsed",
 }
 
@@ -60,8 +56,11 @@ def decision_note(before: VehicleState, state: VehicleState) -> str | None:
 def _cause(described: str) -> str:
     """The event's phrase; its unchanged text if the event is unknown."""
     event, *words = described.split(" ")
+    if event not in EVENTS:
+        return described
+    phrase = CAUSES.get(event, event.replace("_", " ").capitalize())
     try:
-        return CAUSES[event].format_map(dict(zip(words[::2], words[1::2], strict=False)))
+        return phrase.format_map(dict(zip(words[::2], words[1::2], strict=False)))
     except KeyError:
         return described
 
