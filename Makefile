@@ -4,6 +4,7 @@
 # make javascript  only the checks of the pages' scripts
 # make soak   long repetitions of faults that a drive must survive, 80 minutes; SOAK=0.1 make soak is a tenth, KEYS=1 encrypts
 # make deadspot UPLINK=FILE.csv  two drives over a recorded uplink: the picture of the README
+# make generated  the schemas and types that scripts/schemas makes of events and records
 # make setup  install what driving needs; the command is then .venv/bin/tod-runner
 # make ros2   ROS 2 in an environment of its own, .venv-ros2; docs/ros.md
 # make ros1   ROS 1, which is end-of-life, as Debian's packages
@@ -17,7 +18,7 @@ NODE_READY := node_modules/.ready
 # Tests start hundreds of processes; without cached bytecode each would compile the project again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test timed untimed compiled golden units check fast coverage lint javascript setup bench deadspot uplink-given soak ros1 ros2 clean
+.PHONY: demo test generated timed untimed compiled golden units check fast coverage lint javascript setup bench deadspot uplink-given soak ros1 ros2 clean
 
 demo: $(READY)
 	$(BIN)/tod-runner demo
@@ -38,6 +39,9 @@ untimed: $(TEST_READY)
 # Workers of pytest start at the same time, and each would compile all tests. What cannot be imported fails there.
 compiled: $(TEST_READY)
 	@$(BIN)/pytest --collect-only -qq > /dev/null || true
+
+generated: $(READY)
+	$(BIN)/python scripts/schemas --write
 
 golden: $(TEST_READY)
 	$(BIN)/python tests/golden

@@ -1,9 +1,8 @@
 """Records that both sides publish and log: state, telemetry, replies, samples, lines of a drive. Pure.
 
 Each record is a frozen dataclass whose fields are the keys of its JSON. Only this module writes and reads that JSON;
-schemas/control.schema.json and schemas/drive.schema.json describe the same records. Bitrates are kbit/s, sizes px,
-times s. `t` counts from the start of the run or of the log that contains the record; at an operator's station, which
-has no such start, from 1970.
+its schemas, control and drive, are made from the classes below: from their docstrings, and the limits in their types.
+A key whose field has a default may be missing. Bitrates are kbit/s, sizes px, times s.
 """
 
 from __future__ import annotations
@@ -11,29 +10,44 @@ from __future__ import annotations
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, TypeVar
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 import msgspec
 from msgspec import UNSET, UnsetType
 
 from runner.core.commands import Command, KnobValues
 from runner.core.decision import NOTHING, Believed, Decision, Setting
-from runner.core.events import Attention, PositionReported
-from runner.core.model import Mode, Roi, plain
+from runner.core.events import Attention, Latitude, Longitude, PositionReported, Steering
+from runner.core.model import Count, Limits, Mode, NonNegative, Roi, Share, plain
 
 Number = int | float
+Amount = Annotated[Number, Limits(0)]
+# s since the start of the run or of the log; at an operator's station, which has no such start, since 1970.
+Time = Annotated[float, Limits(0), "s since the start of the run, or of the log that contains this"]
+Since1970 = Annotated[float, Limits(0, 2**32 - 1)]
+Clock = Annotated[float, Limits(-(10**12), 10**12)]  # s by some clock, or a difference of clocks
+Size = Annotated[int, Limits(0, 10**8)]  # bytes or packets of a report
+Span = Annotated[float, Limits(0, 3600)]
+Packets = Annotated[int, Limits(0, 10**9)]
+File = Annotated[str, "relative to the directory of the drive"]
+CameraName = Annotated[str, "name of the camera"]
 Json = dict[str, Any]
 SLOW, SLOW_S = 0.7, 2.0  # a camera is slow if it has delivered less than this share of its rate for so long, s
-Applied = Mapping[str, Any]  # by knob, the value read back; empty for a camera without a pipeline
+Applied = Annotated[Mapping[str, Any], "by knob, the value read back; empty for a camera without a pipeline"]
 T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """Position of the vehicle in degrees (WGS-84), and, if known, speed in m/s and heading in degrees."""
+    """Position of the vehicle; None: unknown.
 
-    lat: float
-    lon: float
+    lat, lon     degrees (WGS-84)
+    speed_mps    as its receiver reports it, m/s; absent: unknown
+    heading_deg  the same, degrees clockwise from north
+    """
+
+    lat: Latitude
+    lon: Longitude
     speed_mps: float | UnsetType = UNSET
     heading_deg: float | UnsetType = UNSET
 
@@ -48,16 +62,25 @@ class Position:
 
 @dataclass(frozen=True, slots=True)
 class CameraDecision:
-    """The decision for one camera, see `runner.core.decision.Setting`."""
+    """The decision for one camera, see `runner.core.decision.Setting`.
+
+    on             whether the camera is switched on
+    sending        whether anything of it is encoded
+    demand_kbps    Eq. (1), kbit/s
+    kbps           allocated, kbit/s
+    scaling        selected factor; None while the camera is off or its source cannot be opened
+    width, height  of the encoded picture, px; 0 while the camera is off
+    reason         why, in words
+    """
 
     on: bool
     sending: bool
-    demand_kbps: Number
-    kbps: int
-    scaling: Number | None
+    demand_kbps: Amount
+    kbps: Count
+    scaling: Annotated[Number, Limits(above=0, most=1)] | None
     roi: Roi
-    width: int
-    height: int
+    width: Count
+    height: Count
     reason: str
 
     @classmethod
@@ -66,24 +89,40 @@ class CameraDecision:
 
 
 @dataclass(frozen=True, slots=True)
-class DecisionMade:
-    """Log line: a decision, its cause, and the resulting commands.
+class Turned:
+    """A knob of a camera that was turned.
 
-    believed  absent: no rule believes anything of the uplink
+    value  the new one
     """
 
-    t: float
+    camera: CameraName
+    knob: Annotated[str, Limits(among=("sending", "roi", "size", "bitrate")), "name of the knob"]
+    value: Any
+
+
+@dataclass(frozen=True, slots=True)
+class DecisionMade:
+    """A decision that changed something, its cause, and the resulting commands.
+
+    cause       the event that it comes from, in words
+    total_kbps  before the cap at demand, kbit/s
+    cameras     settings by camera
+    commands    knobs that were turned
+    believed    absent: no rule believes anything of the uplink
+    """
+
+    t: Time
     cause: str
     mode: Mode
-    total_kbps: Number
+    total_kbps: Amount
     cameras: Mapping[str, CameraDecision]
-    commands: list[Json]
+    commands: tuple[Turned, ...]
     believed: Believed | UnsetType = UNSET
 
     @classmethod
     def of(cls, t: float, cause: str, decision: Decision, commands: tuple[Command, ...]) -> DecisionMade:
         cameras = {name: CameraDecision.of(setting) for name, setting in decision.settings.items()}
-        turned = [command.to_json() for command in commands]
+        turned = tuple(Turned(**command.to_json()) for command in commands)
         believed = decision.believed or UNSET
         return cls(t, cause, decision.mode, plain(decision.total), cameras, turned, believed)
 
@@ -95,15 +134,17 @@ class DecisionMade:
 class CameraState(CameraDecision):
     """The decision for one camera, the values read back as applied, and the fault of its source, if any.
 
-    untimed   True: its source provides no capture times, so latency is unknown; absent otherwise
+    weight    in the allocation
+    fault     None: none known
+    untimed   true: its source provides no capture times, so latency is unknown; absent otherwise
     slow_fps  rate of its pictures, Hz, while the camera is slow; absent otherwise
     """
 
-    weight: Number
+    weight: Amount
     applied: Applied
     fault: str | None = None
     untimed: bool | UnsetType = UNSET
-    slow_fps: int | UnsetType = UNSET
+    slow_fps: Annotated[int, Limits(1)] | UnsetType = UNSET
 
     @classmethod
     def at(
@@ -129,9 +170,11 @@ class CameraState(CameraDecision):
 class VehicleState:
     """State of a vehicle that is online.
 
-    cause       the event that triggered the decision
-    asked_kbps  the total of the prediction or the operator
+    cause       the event that triggered the decision, in words
+    asked_kbps  the total of the prediction or the operator, kbit/s
     total_kbps  the same after all rules, such as what the measured link carries
+    cameras     decisions and applied values by camera
+    online      false: the vehicle is offline, and its state unknown
     fault       why the rules could not decide, so that an earlier decision stays in force
     attention   of the driver; absent: the operator in control states none
     operator    id of the operator in control; absent: none
@@ -139,11 +182,11 @@ class VehicleState:
     believed    of the uplink; absent: nothing
     """
 
-    t: float = field(compare=False)
+    t: Time = field(compare=False)
     cause: str
     mode: Mode
-    total_kbps: Number
-    asked_kbps: Number
+    total_kbps: Amount
+    asked_kbps: Amount
     cameras: Mapping[str, CameraState]
     fault: str | None = None
     online: bool = True
@@ -163,7 +206,7 @@ class VehicleState:
 class Offline:
     """Operator log line: the vehicle is offline."""
 
-    t: float
+    t: Time
     online: bool = False
 
 
@@ -171,12 +214,13 @@ class Offline:
 class CameraTelemetry:
     """Values read back as applied, and the encoder's output since its pipeline was built.
 
-    capture_ms, encode_ms  of the last sampled picture, from its capture to the encoder, and through it; None: unknown
+    frames, bytes  that the encoder has put out
+    capture_ms, encode_ms  ms of the last sampled picture from its capture to the encoder, and through it; None: unknown
     """
 
     applied: Applied
-    frames: int
-    bytes: int
+    frames: Count
+    bytes: Count
     capture_ms: float | None = None
     encode_ms: float | None = None
 
@@ -185,18 +229,20 @@ class CameraTelemetry:
 class Telemetry:
     """Measured on the vehicle, a few times a second: also its heartbeat.
 
-    refused       requests refused since the start
-    errors        exceptions caught by the control loop since the start
-    speed_factor  as in `SpeedAdvice`; None: not advised
+    predicted_kbps  last prediction of the total, kbit/s; None before the first
+    cameras         measured values by camera
+    refused         requests refused since the start
+    errors          exceptions caught by the control loop since the start
+    speed_factor    as in `SpeedAdvice`; None: not advised
     """
 
-    t: float
-    predicted_kbps: Number | None
+    t: Time
+    predicted_kbps: Amount | None
     position: Position | None
     cameras: Mapping[str, CameraTelemetry]
-    refused: int
-    errors: int = 0
-    speed_factor: float | None = None
+    refused: Count
+    errors: Count = 0
+    speed_factor: Share | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,13 +251,15 @@ class SpeedAdvice:
 
     The driving function must assume 0 once `expires_s` have passed without a newer one.
 
-    latency_ms  glass to glass, at most; None: unknown
+    speed_factor  the share
+    latency_ms    glass to glass, at most, ms; None: unknown
+    expires_s     how long it may be used, s
     """
 
-    t: float
-    speed_factor: float
-    latency_ms: float | None
-    expires_s: float
+    t: Time
+    speed_factor: Share
+    latency_ms: NonNegative | None
+    expires_s: Annotated[float, Limits(above=0)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,22 +270,29 @@ class SteeringAngle:
     rad  as in `runner.core.events.SteeringReported`
     """
 
-    at: float
-    rad: float
+    at: Clock
+    rad: Steering
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Outcome of a request: applied, refused, expired or timed out, and why."""
+    """Outcome of a request.
 
-    t: float
-    result: str
+    result  applied: read back from the elements
+    reason  why, in words
+    """
+
+    t: Time
+    result: Annotated[str, Limits(among=("applied", "refused", "expired", "timed out"))]
     reason: str
 
 
 @dataclass(frozen=True, slots=True)
 class Reply(Outcome):
-    """The answer to the request with that id."""
+    """The answer to a request.
+
+    id  the request's; "": it had none
+    """
 
     id: str
 
@@ -246,25 +301,29 @@ class Reply(Outcome):
 class ClockAnswer:
     """The vehicle's clock, for an operator that compares it with its own, see `runner.system.clocks`.
 
-    sent                of the report that is answered
+    sent                of the report that is answered, s since 1970 by the operator's clock
     received, answered  s since 1970, by the vehicle's clock
     set_s               how far that clock is ahead of the vehicle's monotonic clock
     error_s             its maximum error against UTC according to the kernel; None: not synchronised
     """
 
-    sent: float
-    received: float
-    answered: float
-    set_s: float
-    error_s: float | None
+    sent: Clock
+    received: Clock
+    answered: Clock
+    set_s: Clock
+    error_s: NonNegative | None
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Settings on which both sides' configurations must agree, by path; `run` distinguishes vehicles of one name."""
+    """Settings on which both sides' configurations must agree.
+
+    run       random name of the vehicle's process: distinguishes vehicles of one name
+    settings  by path, such as cameras.front.fps
+    """
 
     run: str
-    settings: Mapping[str, Any]
+    settings: Mapping[str, str | int | float | bool | list[Any] | None]
 
 
 # --- from the operator's side -----------------------------------------------------------------------------------------
@@ -293,58 +352,69 @@ class LatencyStages:
 class CameraSample:
     """Reception of one camera. Rates cover the last second, counters run since the start.
 
+    fps         frames received, Hz
+    kbps        encoded video received, kbit/s
+    allocated_kbps, demand_kbps, scaling  as the vehicle has decided; None while the camera is off or nothing is known
+    width, height  of the decoded picture, px; 0 before the first
     lost        RTP packets that never arrived
+    frames, bytes  access units received, and their size
     damaged     frames whose picture shows packet loss, until it is healed
-    buffer_ms   how long a picture waits for retransmitted packets; None: no retransmission
+    buffer_ms   how long a picture waits for retransmitted packets, ms; None: no retransmission
     foreign     packets from senders other than the vehicle, dropped
     rebuilt     how often the receiver's pipeline was rebuilt
-    latency_ms  capture to decode of the last sampled frame; None: unknown
+    latency_ms  capture to decode of the last sampled frame, ms; None: unknown
     stages_ms   the parts of it
-    arrivals    in a log, of each access unit since the previous sample: time, and ms since its capture if known
+    arrivals    in a log, of each access unit since the previous sample: time, s, and ms since its capture if known
 
     Latencies are accurate to within the sample's `clock_bound_ms`.
     """
 
-    fps: float
-    kbps: float
-    allocated_kbps: Number
-    demand_kbps: Number
+    fps: NonNegative
+    kbps: NonNegative
+    allocated_kbps: Amount
+    demand_kbps: Amount
     scaling: Number | None
-    width: int
-    height: int
+    width: Count
+    height: Count
     latency_ms: float | None
-    lost: int
-    rebuilt: int
-    foreign: int = 0
-    frames: int = 0
-    bytes: int = 0
-    damaged: int = 0
-    buffer_ms: int | None = None
-    stages_ms: LatencyStages = LatencyStages()
-    arrivals: tuple[tuple[float, float | None], ...] = ()
+    lost: Count
+    rebuilt: Count
+    frames: Count
+    bytes: Count
+    damaged: Count
+    stages_ms: LatencyStages
+    arrivals: tuple[tuple[float, float | None], ...]
+    foreign: Count = 0
+    buffer_ms: Count | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Sample:
     """What the operator's side measures a few times a second.
 
+    predicted_kbps  as in `Telemetry`
+    allocated_kbps  sum over the cameras, kbit/s
+    actual_kbps     received in the last second, sum over the cameras, kbit/s
+    refused         as in `Telemetry`
+    cameras         what was received, by camera
     dropped         invalid messages on the control link
     speed_factor    as in `SpeedAdvice`; None: not advised
-    clock_ahead_ms  how far the vehicle's clock is ahead; None: unknown, as are all latencies
-    clock_bound_ms  maximum error of that and of each latency; None: unknown
+    clock_ahead_ms  how far the vehicle's clock is ahead, ms; None: unknown, as are all latencies
+    clock_bound_ms  maximum error of that and of each latency, ms; None: unknown. Older logs lack it: there
+                    `clock_ahead_ms` was derived from negative latencies, and latencies are differences of both clocks
     """
 
-    t: float
-    predicted_kbps: Number | None
-    allocated_kbps: Number
-    actual_kbps: float
+    t: Time
+    predicted_kbps: Amount | None
+    allocated_kbps: Amount
+    actual_kbps: NonNegative
     position: Position | None
-    refused: int
+    refused: Count
     cameras: Mapping[str, CameraSample]
-    dropped: int = 0
+    dropped: Count = 0
     clock_ahead_ms: float | None = None
-    clock_bound_ms: float | None = None
-    speed_factor: float | None = None
+    clock_bound_ms: NonNegative | None = None
+    speed_factor: Share | None = None
 
 
 class Arrival(NamedTuple):
@@ -433,15 +503,15 @@ class UnitReceived(NamedTuple):
     """
 
     camera: str
-    ago_s: float
-    delay_s: float
-    bytes: int
+    ago_s: Span
+    delay_s: Clock
+    bytes: Size
     whole: bool = True
-    train_s: float = 0.0
-    train_packets: int = 0
-    train_bytes: int = 0
-    carried_packets: int = 0
-    carried_bytes: int = 0
+    train_s: Span = 0.0
+    train_packets: Size = 0
+    train_bytes: Size = 0
+    carried_packets: Size = 0
+    carried_bytes: Size = 0
 
     @classmethod
     def of(
@@ -465,38 +535,40 @@ class ReceptionReport:
     as_of          s, the operator's estimate of the vehicle's time, see `runner.vehicle.operators`
     units          in order of arrival
     packets, lost  RTP packets of all cameras received, and initially missing: some may have been recovered
-    latency_ms     upper bound of the age of the oldest displayed picture, capture to decoding; absent: unknown
+    latency_ms     upper bound of the age of the oldest displayed picture, capture to decoding, ms; absent: unknown
     damaged        cameras whose newest picture shows unrecovered packet loss; absent: none
     sent           s since 1970 by the operator's clock; present if the vehicle should answer with a `ClockAnswer`
     run            random number of this run of the operator's side, to which delays and times are relative
-    offset_s       the constant that delays are less by; absent: no unit
+    offset_s       the constant that delays are less by, s; absent: no unit
     """
 
-    at: float
-    as_of: float
-    units: tuple[UnitReceived, ...]
-    packets: int
-    lost: int
-    latency_ms: float | UnsetType = UNSET
-    damaged: tuple[str, ...] | UnsetType = UNSET
-    sent: float | UnsetType = UNSET
-    run: int | UnsetType = UNSET
-    offset_s: float | UnsetType = UNSET
+    at: Clock
+    as_of: Clock
+    units: Annotated[tuple[UnitReceived, ...], Limits(most=2000)]
+    packets: Packets
+    lost: Packets
+    latency_ms: Annotated[float, Limits(0, 10**12)] | UnsetType = UNSET
+    damaged: Annotated[tuple[str, ...], Limits(most=1000, unique=True)] | UnsetType = UNSET
+    sent: Clock | UnsetType = UNSET
+    run: Annotated[int, Limits(0, 2**32 - 1)] | UnsetType = UNSET
+    offset_s: Clock | UnsetType = UNSET
 
 
 @dataclass(frozen=True, slots=True)
 class ReceptionReported:
-    """Vehicle's log line: a reception report that arrived at t, and whether its operator was in control.
+    """A reception report that arrived at the vehicle at t.
 
-    late_s        of each unit: by how much longer than usual the vehicle at least took to send it; absent: by nothing
+    operator      id of its sender
+    in_control    whether that operator was in control; only its reports are used
+    late_s        of each unit: s by which the vehicle at least took longer than usual to send it; absent: none was late
     all_received  nothing was on its way when the report was made; absent: unknown, or not so, or the report has units
     """
 
-    t: float
+    t: Time
     operator: str
     in_control: bool
     report: ReceptionReport
-    late_s: tuple[float, ...] | UnsetType = UNSET
+    late_s: Annotated[tuple[NonNegative, ...], Limits(most=2000)] | UnsetType = UNSET
     all_received: bool | UnsetType = UNSET
 
 
@@ -507,14 +579,18 @@ class ReceptionReported:
 class Began:
     """First line of a log: side, versions and configuration.
 
+    side      who wrote it
+    format    version of the format
     time      its start, s since 1970
+    versions  of the software in use, by name
+    config    the composed configuration
     replayed  words of the replay that decided it anew, without input and output; absent: it was driven
     """
 
-    t: float
-    side: str
-    format: int
-    time: float
+    t: Time
+    side: Annotated[str, Limits(among=("vehicle", "operator", "link"))]
+    format: Annotated[int, Limits(1)]
+    time: Since1970
     versions: Mapping[str, str]
     config: Mapping[str, Any]
     replayed: tuple[str, ...] | UnsetType = UNSET
@@ -522,20 +598,26 @@ class Began:
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """A note for the user."""
+    """A note for the user.
 
-    t: float
+    text  one sentence
+    """
+
+    t: Time
     text: str
 
 
 @dataclass(frozen=True, slots=True)
 class VideoBegan:
-    """A video file has started; `captured`: capture time of its first frame, s since 1970."""
+    """A video file has started.
 
-    t: float
-    camera: str
-    file: str
-    captured: float
+    captured  capture time of its first frame, s since 1970
+    """
+
+    t: Time
+    camera: CameraName
+    file: File
+    captured: Since1970
 
 
 @dataclass(frozen=True, slots=True)
@@ -546,51 +628,62 @@ class VideoShifted:
     captured  capture time of this one, s since 1970
     """
 
-    t: float
-    camera: str
-    file: str
-    after_s: float
-    captured: float
+    t: Time
+    camera: CameraName
+    file: File
+    after_s: NonNegative
+    captured: Since1970
 
 
 @dataclass(frozen=True, slots=True)
 class LinkSample:
-    """A limited link: its rate, the queueing delay of a packet, and what it has forwarded, dropped and lost so far.
+    """State of the limited link between the sides; counters run since it was made.
 
+    kbps       rate in force, kbit/s
+    queue_ms   how long a packet that arrives now waits, ms
+    bytes, packets  forwarded from vehicle to operator
+    dropped    packets that its queue dropped
+    lost       packets lost at random, after the queue
     tcp_bytes  that competing TCP flows have delivered, without headers
     """
 
-    t: float
-    kbps: float
-    queue_ms: float
-    bytes: int
-    packets: int
-    dropped: int
-    lost: int = 0
-    tcp_bytes: int = 0
+    t: Time
+    kbps: NonNegative
+    queue_ms: NonNegative
+    bytes: Count
+    packets: Count
+    dropped: Count
+    lost: Count = 0
+    tcp_bytes: Count = 0
 
 
 @dataclass(frozen=True, slots=True)
 class ClockSet:
-    """The wall clock of this side's machine was set, forward by `by_s`; `t` does not follow it."""
+    """The wall clock of this side's machine was set; `t` does not follow it.
 
-    t: float
-    by_s: float
+    by_s  how far forward, s
+    """
+
+    t: Time
+    by_s: Annotated[float, Limits(1 - 2**32, 2**32 - 1)]
 
 
 @dataclass(frozen=True, slots=True)
 class LinesDropped:
-    """Number of lines that were not written because the disk was too slow."""
+    """Lines were not written because the disk was too slow.
 
-    t: float
-    lines: int
+    lines  their number
+    """
+
+    t: Time
+    lines: Annotated[int, Limits(1)]
 
 
 @dataclass(frozen=True, slots=True)
 class Ended:
     """Last line of a log that was closed."""
 
-    t: float
+    t: Time
 
 
 Record = (

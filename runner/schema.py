@@ -231,7 +231,7 @@ def log_kinds() -> tuple[str, ...]:
 
 @cache
 def event_names() -> tuple[str, ...]:
-    return tuple(name for name in schema_document("event")["$defs"] if name != "t")
+    return tuple(schema_document("event")["properties"]["event"]["enum"])
 
 
 def schema_names() -> list[str]:

@@ -21,6 +21,7 @@ from runner.records import (
     CameraState,
     CameraTelemetry,
     DecisionMade,
+    LatencyStages,
     LinkSample,
     Position,
     Sample,
@@ -235,6 +236,8 @@ class _Made:
             rebuilt=count["rebuilt"],
             frames=count["got"],
             bytes=count["got_bytes"],
+            damaged=0,
+            stages_ms=LatencyStages(),
             arrivals=tuple(arrivals),
         )
 

@@ -36,7 +36,7 @@ from runner.page.history import MAX_SAMPLES, History
 from runner.page.login import COOKIE, PageLogin
 from runner.page.server import LOGIN_POLICY, POLICY, PageServer, hosts
 from runner.page.viewer import CATCH_UP, HEADER, KEY, MAX_UNITS, RESTART, PageViewer
-from runner.records import CameraSample, Outcome, Position, Sample
+from runner.records import CameraSample, LatencyStages, Outcome, Position, Sample
 from runner.security import keyring
 from runner.security.authority import Authority
 from runner.security.keyring import Keyring
@@ -801,6 +801,11 @@ def sample(time, position=None):
         latency_ms=None,
         lost=0,
         rebuilt=0,
+        frames=0,
+        bytes=0,
+        damaged=0,
+        stages_ms=LatencyStages(),
+        arrivals=(),
     )
     return Sample(time, None, 0, 0, position, 0, {"front": camera})
 

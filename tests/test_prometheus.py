@@ -28,7 +28,7 @@ from runner.settings import Endpoint
 pytest.importorskip("prometheus_client")
 
 CAMERA = CameraTelemetry(applied={}, frames=10, bytes=2000, encode_ms=4.0)
-BELIEVED = Believed(2431, 0.1, 0.05, bias=-0.2, error=0.1)
+BELIEVED = Believed(2431, 0.1, 0.05, bias=-0.2, error=0.1, gain=None, policer_kbps=None)
 TELEMETRY = Telemetry(1.0, None, None, {"front": CAMERA, "rear": CAMERA}, refused=3)
 
 

@@ -8,7 +8,7 @@ from fractions import Fraction
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from runner.core.model import Kbps, Mode, Roi
+from runner.core.model import Count, Kbps, Mode, NonNegative, Roi, Share
 
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 
@@ -43,20 +43,20 @@ class Believed:
     """What is believed of the uplink, and what predictions of it have proved to be worth; see `runner.core.belief`.
 
     kbps          capacity, kbit/s of video, as predictions are
-    deviation     of ln(kbps)
-    margin        ln, by which less is sent
+    deviation     standard deviation of ln(kbps): how sure the belief is
+    margin        by how much less is sent, as a difference of logarithms
     bias, error   mean of ln(capacity / prediction) of the last seconds, and the deviation from it; None: not known yet
     gain          share of a prediction's change that comes true, 0 to 1; None: it has not changed enough to know
     policer_kbps  rate above which the link drops packets, kbit/s of video; None: none was found
     """
 
-    kbps: int
-    deviation: float
-    margin: float
-    bias: float | None = None
-    error: float | None = None
-    gain: float | None = None
-    policer_kbps: int | None = None
+    kbps: Count
+    deviation: NonNegative
+    margin: NonNegative
+    bias: float | None
+    error: NonNegative | None
+    gain: Share | None
+    policer_kbps: Count | None
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,28 +1,42 @@
-"""Events: one vocabulary for the control link, the drive log and `replay` (schemas/event.schema.json).
+"""Events: one vocabulary for the control link, the drive log and `replay`.
 
-An `Event` is valid once built; `parse` turns JSON that the schema accepts into one.
+An `Event` is valid once built; `parse` turns JSON that schemas/event.schema.json accepts into one. That schema is made
+from the classes below: from their docstrings, and the limits in their types.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from enum import StrEnum
 from fractions import Fraction
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, get_args
 
-from runner.core.model import Kbps, Mode, Roi, exact, plain
+from runner.core.model import Count, Kbps, Limits, Mode, NonNegative, Roi, Share, exact, plain
+
+LEAST_ERROR = 0.01  # of a prediction's deviation
+Rate = Annotated[Kbps, Limits(0)]
+Latitude = Annotated[float, Limits(-90, 90)]
+Longitude = Annotated[float, Limits(-180, 180)]
+Steering = Annotated[float, Limits(-1.5, 1.5)]
+CameraName = Annotated[str, Limits(1), "name of a camera of the vehicle"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Event:
-    """Something that happened `t` seconds after the start of the run; `t` never decreases."""
+    """Something that happened.
 
-    t: float
+    t  s since the start of the run; never decreases
+    """
+
+    t: NonNegative
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModeSelected(_Event):
+    """The operator selects the video rate control mode."""
+
     mode: Mode
 
 
@@ -30,67 +44,98 @@ class ModeSelected(_Event):
 class BitratePredicted(_Event):
     """Prediction of the bitrate available for all cameras together, from pQoS.
 
-    kbps        the prediction
-    lower_kbps  likely lower bound, if the source knows it
-    valid_s     how long it may be used, if the source knows it
-    bias, error mean of ln(capacity / kbps), and the deviation from it, if the source knows them
+    kbps        the prediction, kbit/s
+    lower_kbps  likely lower bound, if the source knows it; used by modes that go beyond the paper, kbit/s
+    valid_s     how long it may be used, if the source knows it; used by modes that go beyond the paper, s
+    bias, error mean of ln(capacity / kbps), and the standard deviation from it, if the source knows them; used by
+                follow_link until it knows better
     """
 
-    kbps: Kbps
-    lower_kbps: Kbps | None = None
-    valid_s: float | None = None
-    bias: float | None = None
-    error: float | None = None
+    kbps: Rate
+    lower_kbps: Rate | None = None
+    valid_s: NonNegative | None = None
+    bias: Annotated[float, Limits(-10, 10)] | None = None
+    error: Annotated[float, Limits(LEAST_ERROR, 10)] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PositionReported(_Event):
-    """WGS-84 position of the vehicle; heading in degrees clockwise from north."""
+    """Where the vehicle is.
 
-    lat: float
-    lon: float
-    speed_mps: float | None = None
-    heading_deg: float | None = None
+    lat, lon     degrees north and east (WGS-84)
+    speed_mps    speed over ground, m/s
+    heading_deg  direction of travel, degrees clockwise from north
+    """
+
+    lat: Latitude
+    lon: Longitude
+    speed_mps: NonNegative | None = None
+    heading_deg: Annotated[float, Limits(0, 360)] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SteeringReported(_Event):
-    """Angle of the front wheels (bicycle model), rad, positive to the left."""
+    """The front wheels are turned.
 
-    rad: float
+    rad  their angle (bicycle model), rad, positive to the left
+    """
+
+    rad: Steering
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TotalSet(_Event):
-    """The operator's total for mode collective."""
+    """The operator sets the total bitrate, mode collective.
 
-    kbps: Kbps
+    kbps  of all cameras, kbit/s
+    """
+
+    kbps: Rate
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraSwitched(_Event):
-    camera: str
+    """The operator switches a camera on or off, any mode.
+
+    on  true: on, false: off
+    """
+
+    camera: CameraName
     on: bool
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RoiSet(_Event):
-    camera: str
+    """The operator sets the region of interest of a camera, mode single.
+
+    It must lie inside the full image and be at least 16x16; otherwise the event is refused.
+    """
+
+    camera: CameraName
     roi: Roi
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraConfigured(_Event):
-    """The operator's bitrate and scaling factor of one camera, mode single; None: unchanged."""
+    """The operator sets bitrate, scaling factor or both of a camera, mode single; None: unchanged.
 
-    camera: str
-    kbps: Kbps | None = None
-    scaling: Fraction | None = None
+    kbps     from 1 to its b_full, kbit/s
+    scaling  factor of its resolution, in ]0, 1]
+    """
+
+    camera: CameraName
+    kbps: Rate | None = None
+    scaling: Annotated[Fraction, Limits(0)] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WeightsSet(_Event):
-    weights: Mapping[str, Fraction]
+    """The operator changes explicit camera weights; cameras not named keep theirs.
+
+    weights  by camera, no unit; 0 gives the camera nothing beyond its floor in modes A and C
+    """
+
+    weights: Annotated[Mapping[str, Annotated[Fraction, Limits(0)]], Limits(1)]
 
 
 class LinkState(StrEnum):
@@ -122,23 +167,23 @@ class Evidence(NamedTuple):
     backlog   the newest frame was sent before a stall had ended
     """
 
-    busy_kbit: float = 0.0
-    busy_s: float = 0.0
-    train_kbit: float = 0.0
-    train_s: float = 0.0
-    trains: int = 0
-    idle_kbit: float = 0.0
-    idle_s: float = 0.0
-    idle: int = 0
-    unqueued: int = 0
-    kbit: float = 0.0
-    wait_s: float = 0.0
-    longest_s: float = 0.0
-    shorter_s: float = 0.0
+    busy_kbit: NonNegative = 0.0
+    busy_s: NonNegative = 0.0
+    train_kbit: NonNegative = 0.0
+    train_s: NonNegative = 0.0
+    trains: Count = 0
+    idle_kbit: NonNegative = 0.0
+    idle_s: NonNegative = 0.0
+    idle: Count = 0
+    unqueued: Count = 0
+    kbit: NonNegative = 0.0
+    wait_s: NonNegative = 0.0
+    longest_s: NonNegative = 0.0
+    shorter_s: NonNegative = 0.0
     growth: float = 0.0
-    lost_kbit: float = 0.0
+    lost_kbit: NonNegative = 0.0
     age_s: float = 0.0
-    silent_s: float = 0.0
+    silent_s: NonNegative = 0.0
     backlog: bool = False
 
 
@@ -147,42 +192,50 @@ class LinkMeasured(_Event):
     """The uplink, by what the operator's side received of all cameras, see `runner.core.evidence`.
 
     kbps      received in the last 0.5 s, kbit/s
-    queue_ms  standing queue in front of the link
+    queue_ms  standing queue in front of the link, ms
     loss      share of the packets of the last second that was lost, 0 to 1
-    rtt_ms    round trip of the control link
+    state     of that queue; stalled: nothing arrives
+    rtt_ms    round trip of the control link, ms
     evidence  of the link's capacity
     """
 
-    kbps: Kbps
-    queue_ms: float
-    loss: float
+    kbps: Rate
+    queue_ms: NonNegative
+    loss: Share
     state: LinkState
-    rtt_ms: float
+    rtt_ms: NonNegative
     evidence: Evidence
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CopiesCounted(_Event):
-    """Number of copies of each camera's stream that leave the vehicle, one per viewer; 1 for cameras not named."""
+    """Another number of viewers receives a camera's stream.
 
-    copies: Mapping[str, int]
+    copies  by camera, how many leave the vehicle, one per viewer; 1 for cameras not named
+    """
+
+    copies: Mapping[str, Annotated[int, Limits(1, 1000)]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SourceReported(_Event):
-    """Whether a camera's source can be opened; until it is reported, it can.
+    """A camera's source cannot be opened, or can be again; until this is reported, it can.
 
+    works   whether it can
     reason  why it cannot, for the operator; None: it can
     """
 
-    camera: str
+    camera: CameraName
     works: bool
     reason: str | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControlPassed(_Event):
-    """Another operator is in control, "" for none; measurements of the previous one are no longer valid."""
+    """Another operator is in control; measurements of the previous one are no longer valid.
+
+    operator  its id; "": none is present
+    """
 
     operator: str
 
@@ -199,21 +252,27 @@ class Attention(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AttentionChanged(_Event):
-    """The attention stated by the operator in control has changed; None: none stated, for example without a page."""
+    """The attention stated by the operator in control has changed.
+
+    attention  None: none stated, for example without a page
+    """
 
     attention: Attention | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OperatorConnected(_Event):
-    """attention  stated by the operator's page with its heartbeat; the vehicle derives `AttentionChanged` from it"""
+    """The operator's side is connected.
+
+    attention  stated by the operator's page with its heartbeat; the vehicle derives `AttentionChanged` from it
+    """
 
     attention: Attention | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OperatorDisconnected(_Event):
-    pass
+    """The operator's side has disconnected, or the control link to it is lost."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -241,24 +300,8 @@ Event = (
     | OperatorDisconnected
     | ClockAdvanced
 )
-EVENTS: dict[str, type[Event]] = {
-    "mode_selected": ModeSelected,
-    "bitrate_predicted": BitratePredicted,
-    "position_reported": PositionReported,
-    "steering_reported": SteeringReported,
-    "total_set": TotalSet,
-    "camera_switched": CameraSwitched,
-    "roi_set": RoiSet,
-    "camera_configured": CameraConfigured,
-    "weights_set": WeightsSet,
-    "link_measured": LinkMeasured,
-    "copies_counted": CopiesCounted,
-    "source_reported": SourceReported,
-    "control_passed": ControlPassed,
-    "attention_changed": AttentionChanged,
-    "operator_connected": OperatorConnected,
-    "operator_disconnected": OperatorDisconnected,
-    "clock_advanced": ClockAdvanced,
+EVENTS: dict[str, type[Event]] = {  # mode_selected: ModeSelected
+    re.sub(r"\B[A-Z]", r"_\g<0>", kind.__name__).lower(): kind for kind in get_args(Event)
 }
 OWN = (
     LinkMeasured,

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from runner.core.events import LEAST_ERROR
 from runner.core.learned import WRONG
 from runner.drive.series import Flags, FloatSeries, Positions, Series, TimeSeries, held
 from runner.pqos.bandwidth_map import offset
@@ -25,7 +26,6 @@ SURE = 0.2  # deviation, ln, of a belief that counts: there was evidence in the 
 USED = 0.99  # share of what the cameras can use: rounded, it is all
 EVERY_S = 0.25  # between two samples of a belief
 AGAIN_S = 10.0  # a square that is entered again after this time has been passed twice
-LEAST_ERROR = 0.01  # as schemas/event.schema.json
 
 
 class CapacitySample(NamedTuple):

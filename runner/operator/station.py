@@ -574,6 +574,7 @@ def _camera_sample(row: CameraRow, measured: CameraTelemetry | None) -> CameraSa
         foreign=received.foreign,
         frames=received.frames,
         bytes=received.bytes,
+        arrivals=(),
         damaged=received.damaged,
         buffer_ms=received.buffer_ms,
         stages_ms=_stages(received, measured),

@@ -17,6 +17,7 @@ from runner.records import (
     Arrival,
     CameraSample,
     CameraTelemetry,
+    LatencyStages,
     LinkSample,
     ReceptionReported,
     Sample,
@@ -139,6 +140,7 @@ class DriveFiles(Recorder):
                 frames=received.frames,
                 bytes=received.bytes,
                 damaged=round(damaged.get(name, 0.0) * float(self._vehicle.cameras[name].fps)),
+                stages_ms=LatencyStages(),
                 arrivals=arrivals,
             )
         allocated = sum(setting.kbps for setting in decision.settings.values())

@@ -61,7 +61,7 @@ image = pytest.importorskip("PIL.Image")
 WORDS = ("source=test", "modes=paper", "fps_max=1")  # as the page knows it; pictures are sent more often
 CAMERAS = ("front", "rear", "mast")
 EVERY_S = 0.3
-BELIEVED = Believed(31999, 0.1, 0.2, -0.44, 0.35, 0.31)  # in as many words as it gets
+BELIEVED = Believed(31999, 0.1, 0.2, -0.44, 0.35, 0.31, None)  # in as many words as it gets
 
 
 class Station(SimpleNamespace):
@@ -607,7 +607,8 @@ def wide(cameras):
     """A sample in which captions, stages and totals are as long as they get."""
     stages = LatencyStages(100.5, 100.5, 100.5, 100.5, 100.5)
     rates = (40.0, 5999.0, 5999, 5999, 0.125, 1920, 1200)
-    one = CameraSample(*rates, latency_ms=1250.0, lost=12345, rebuilt=12, buffer_ms=120, stages_ms=stages)
+    counted = {"lost": 12345, "rebuilt": 12, "frames": 0, "bytes": 0, "damaged": 0, "arrivals": ()}
+    one = CameraSample(*rates, latency_ms=1250.0, **counted, buffer_ms=120, stages_ms=stages)
     figures = {"cameras": dict.fromkeys(cameras, one), "speed_factor": 0.85, "clock_bound_ms": 120.0}
     return Sample(0.0, 31999, 31999, 31999.0, Position(49.0, 8.4, 100.0), 0, **figures)
 

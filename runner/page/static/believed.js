@@ -14,7 +14,7 @@ const about = (kbps) => Number(kbps.toPrecision(2));
 
 /**
  * Link: about 2400 kbit/s, 10 % kept free. Predictions here are 20 % too high.
- * @param {import("./store.js").Believed|undefined} believed
+ * @param {import("./records.js").Believed|undefined} believed
  * @returns {string} "" while too little is known
  */
 export function believedWords(believed) {

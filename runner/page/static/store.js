@@ -9,7 +9,9 @@ let sampledAt = -Infinity; // page time of the last sample
 
 /**
  * The part of the station's messages that the page uses.
- * @typedef {{x: number, y: number, width: number, height: number}} Region in px of the full image
+ * @typedef {import("./records.js").CameraState & {applied: Applied}} Decision
+ * @typedef {import("./records.js").VehicleState & {cameras: Record<string, Decision>}} State
+ * @typedef {import("./records.js").Sample & {time: number}} Sample time: s since 1970
  * @typedef {object} Camera of hello
  * @property {string} name
  * @property {number} index among the vehicle's cameras, of which a monitor shows some
@@ -37,43 +39,7 @@ let sampledAt = -Infinity; // page time of the last sample
  * @property {boolean} [sending]
  * @property {number} [bitrate] kbit/s
  * @property {{width: number, height: number}} [size] px
- * @property {Region} [roi]
- * @typedef {object} Decision of one camera
- * @property {boolean} on
- * @property {boolean} sending
- * @property {number} demand_kbps
- * @property {number} kbps
- * @property {number|null} scaling
- * @property {Region} roi
- * @property {number} width px
- * @property {number} height px
- * @property {number} weight
- * @property {string} reason
- * @property {string} [fault]
- * @property {number} [slow_fps]
- * @property {Applied} applied
- * @typedef {{online: boolean, mode: string, total_kbps: number, asked_kbps: number, cameras: Record<string, Decision>, operator?: string, believed?: Believed}} State
- *   operator: the one that the vehicle has in control
- * @typedef {object} Believed of the uplink; see `Believed` in runner/core/decision.py
- * @property {number} kbps
- * @property {number} deviation
- * @property {number} margin
- * @property {number|null} bias
- * @property {number|null} error
- * @property {number|null} gain
- * @property {number|null} policer_kbps
- * @typedef {{fps: number, kbps: number, allocated_kbps: number, scaling: number|null, width: number, height: number,
- *   latency_ms: number|null, lost: number, rebuilt: number, buffer_ms: number|null, stages_ms: Stages}} CameraSample
- * @typedef {Record<"capture"|"encode"|"link"|"buffer"|"decode", number|null>} Stages
- * @typedef {object} Sample
- * @property {number} time s since 1970
- * @property {number|null} predicted_kbps
- * @property {number} allocated_kbps
- * @property {number} actual_kbps
- * @property {{lat: number, lon: number, speed_mps?: number}|null} position
- * @property {number|null} clock_bound_ms error bound of the latencies; null: they are unknown
- * @property {number|null} speed_factor advised share of full speed
- * @property {Record<string, CameraSample>} cameras
+ * @property {import("./records.js").Roi} [roi]
  * @typedef {{fault: string|null, expiring: string[]}} Link of the station to the broker: why there is none, and which certificates expire soon
  * @typedef {{time: number, text: string, level: string, own: boolean}} Note own: the page's, not the station's
  */
