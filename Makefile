@@ -4,7 +4,7 @@
 # make javascript  only the checks of the pages' scripts
 # make soak   long repetitions of faults that a drive must survive, 80 minutes; SOAK=0.1 make soak is a tenth, KEYS=1 encrypts
 # make deadspot UPLINK=FILE.csv  two drives over a recorded uplink: the picture of the README
-# make generated  the schemas and types that scripts/schemas makes of events and records
+# make generated  the schemas and types that scripts/schemas makes of classes
 # make setup  install what driving needs; the command is then .venv/bin/tod-runner
 # make ros2   ROS 2 in an environment of its own, .venv-ros2; docs/ros.md
 # make ros1   ROS 1, which is end-of-life, as Debian's packages

@@ -194,7 +194,7 @@ class LinkMeasured(_Event):
     kbps      received in the last 0.5 s, kbit/s
     queue_ms  standing queue in front of the link, ms
     loss      share of the packets of the last second that was lost, 0 to 1
-    state     of that queue; stalled: nothing arrives
+    state     stalled: nothing arrives
     rtt_ms    round trip of the control link, ms
     evidence  of the link's capacity
     """
