@@ -9,16 +9,17 @@ from fractions import Fraction
 from importlib.metadata import version
 from pathlib import Path
 from statistics import fmean
-from typing import Any
+from typing import Annotated, Any, Literal, NotRequired, TypedDict, cast
 
-from runner.core.model import Camera, plain
+from runner.core.model import Camera, Limits, NonNegative, plain
 from runner.errors import UserError, reason
 from runner.rate_quality.cache import digest
 from runner.rate_quality.choice import Choice
 from runner.rate_quality.curves import Crossing, Ladder, Point
+from runner.rate_quality.metrics import NAMES
 from runner.rate_quality.sequence import Sequence as Clip
 
-FORMAT_VERSION = 1
+FORMAT_VERSION: Literal[1] = 1
 SCHEMA = "rate_quality"
 MARK = "Measured by `tod-runner model`"  # in each camera YAML written by this module
 
@@ -60,8 +61,177 @@ class Measured:
         return [*self.notes, *self.choice.warnings]
 
 
-def to_json(measured: Measured) -> dict[str, Any]:
-    """The model file, see schemas/rate_quality.schema.json."""
+Factor = Annotated[float, Limits(above=0, most=1), "of the resolution"]
+
+
+class ClipDocument(TypedDict):
+    """A clip.
+
+    file       its name
+    topic      of the pictures, if the file is a bag
+    depth_m    distance that is white in its pictures of distances, m, if it is not 20
+    colorimetry  as GStreamer names it, to which a full-range clip was converted
+    sha256     of the file
+    width, height  of its pictures, px
+    fps        frames a second
+    codec      of the clip
+    lossless   whether that codec is; otherwise the clip was already compressed
+    frames     their number
+    si, ti     spatial and temporal information, largest of all frames (ITU-T P.910)
+    si_mean, ti_mean  the same, mean over the frames
+    """
+
+    file: str
+    topic: NotRequired[str]
+    depth_m: NotRequired[float]
+    colorimetry: NotRequired[str]
+    sha256: str
+    width: float
+    height: float
+    fps: float
+    codec: str
+    lossless: bool
+    frames: int
+    si: float
+    ti: float
+    si_mean: float
+    ti_mean: float
+
+
+class EncoderDocument(TypedDict):
+    """What encoded and decoded.
+
+    graph     the live graph from crop to decoder, at the first factor and bitrate
+    versions  by element, of its plugin
+    """
+
+    graph: str
+    versions: Mapping[str, str]
+
+
+class PointDocument(TypedDict):
+    """One encoding; each metric adds its mean over the scored frames under its own name.
+
+    target_kbps  bitrate that the encoder was given, kbit/s
+    actual_kbps  actual bitrate, kbit/s
+    second_kbps  the same in the second in which it was highest; older models lack it
+    encode_ms    processor time of the encoder for each frame, ms
+    psnr         of luma, dB
+    mssim        of luma (Wang 2004)
+    vmaf         higher is better
+    brisque      lower is better
+    """
+
+    scaling: Factor
+    target_kbps: Annotated[int, Limits(1)]
+    actual_kbps: NonNegative
+    second_kbps: NotRequired[NonNegative]
+    encode_ms: NonNegative
+    psnr: NotRequired[float]
+    mssim: NotRequired[float]
+    vmaf: NotRequired[float]
+    brisque: NotRequired[float]
+
+
+class CrossingDocument(TypedDict):
+    """A crossing.
+
+    lower, upper  smaller and larger factor
+    kbps          its bitrate, kbit/s
+    low, high     5th and 95th percentile over resampled time blocks of the sequence, kbit/s
+    """
+
+    lower: Factor
+    upper: Factor
+    kbps: float
+    low: float
+    high: float
+
+
+class LadderDocument(TypedDict):
+    """A choice.
+
+    b_min_kbps   lower bounds, kbit/s
+    regret_max   most quality lost against the best of all factors
+    regret_mean  the same on average over log bitrate
+    """
+
+    scaling: Annotated[list[Factor], "factors"]
+    b_min_kbps: list[float]
+    regret_max: float
+    regret_mean: float
+
+
+class DroppedDocument(TypedDict):
+    """A factor that is not worth using.
+
+    reason  why
+    """
+
+    scaling: Factor
+    reason: str
+
+
+class CoresDocument(TypedDict):
+    """Processor time of a factor.
+
+    cores  share of a core, the most of all bitrates
+    """
+
+    scaling: Factor
+    cores: float
+
+
+class Document(TypedDict):
+    """What `tod-runner model` has measured for a camera: every point, the factors that were chosen, and why.
+
+    version      of the format
+    tod_runner   version of tod-runner that measured
+    name         of the model
+    content      digest of sequences, masks and encoder: models with equal digests were measured on the same ones
+    sequences    by camera, the clip that was measured on
+    masks        by camera, SHA-256 of the mask that excludes part of its picture
+    metric       that chose
+    metrics      by name, how exactly it is computed
+    plan         which encodings were made
+    metric_every  one frame in this many was scored
+    points       every encoding, by factor and target
+    scaling      factors that are worth using, in ascending order
+    b_min_kbps   bitrates from which each is used, kbit/s
+    b_full_kbps  bitrate at which the quality is b_full_quality, or the largest measured, kbit/s
+    b_full_quality  that b_full was chosen for, in units of the metric
+    crossings    where the larger of two factors begins to look better
+    regret       the best choice for each number of factors
+    dropped      factors that are not worth using
+    cores        what the encoder needs at the sequence's frame rate
+    warnings     notes on using the model
+    """
+
+    version: Literal[1]
+    tod_runner: str
+    name: str
+    content: str
+    sequences: Annotated[Mapping[str, ClipDocument], Limits(1)]
+    masks: Mapping[str, str]
+    encoder: EncoderDocument
+    metric: Annotated[str, Limits(among=NAMES)]
+    metrics: Annotated[Mapping[str, str], Limits(1)]
+    plan: Annotated[str, Limits(among=("adaptive", "full"))]
+    metric_every: Annotated[int, Limits(1)]
+    points: list[PointDocument]
+    scaling: list[Factor]
+    b_min_kbps: list[Annotated[int, Limits(0)]]
+    b_full_kbps: Annotated[int, Limits(1)]
+    b_full_quality: float
+    crossings: list[CrossingDocument]
+    regret: list[LadderDocument]
+    dropped: list[DroppedDocument]
+    cores: list[CoresDocument]
+    warnings: list[str]
+
+
+def to_json(measured: Measured) -> Document:
+    """The model file; schemas/rate_quality.schema.json is made from these classes."""
     choice = measured.choice
     sequences = {name: _clip_to_json(clip) for name, clip in measured.clips.items()}
     return {
@@ -73,7 +243,7 @@ def to_json(measured: Measured) -> dict[str, Any]:
         ),
         "sequences": sequences,
         "masks": dict(measured.masks),
-        "encoder": dict(measured.encoder),
+        "encoder": cast(EncoderDocument, dict(measured.encoder)),
         "metric": measured.metric,
         "metrics": dict(measured.metrics),
         "plan": measured.plan,
@@ -153,13 +323,14 @@ def dumps(document: Mapping[str, Any]) -> bytes:
     return ("{\n" + ",\n".join(parts) + "\n}\n").encode()
 
 
-def _clip_to_json(clip: Clip) -> dict[str, Any]:
+def _clip_to_json(clip: Clip) -> ClipDocument:
     properties = {key: value for key, value in asdict(clip).items() if key != "path" and value not in ("", None)}
     rounded = {key: round(value, 3) for key, value in properties.items() if key.startswith(("si", "ti"))}
-    return {"file": Path(clip.path).name, **properties, "fps": plain(Fraction(clip.fps)), **rounded}
+    found = {"file": Path(clip.path).name, **properties, "fps": plain(Fraction(clip.fps)), **rounded}
+    return cast(ClipDocument, found)
 
 
-def _point_to_json(point: Point) -> dict[str, Any]:
+def _point_to_json(point: Point) -> PointDocument:
     scores = {name: round(fmean(values), 6) for name, values in point.scores.items()}
     return {
         "scaling": plain(point.scaling),
@@ -167,16 +338,16 @@ def _point_to_json(point: Point) -> dict[str, Any]:
         "actual_kbps": round(point.actual_kbps, 2),
         "second_kbps": round(point.second_kbps, 2),
         "encode_ms": round(point.encode_ms, 4),
-        **scores,
+        **cast(PointDocument, scores),
     }
 
 
-def _crossing_to_json(crossing: Crossing) -> dict[str, Any]:
-    rates = {key: round(getattr(crossing, key), 1) for key in ("kbps", "low", "high")}
-    return {"lower": plain(crossing.lower), "upper": plain(crossing.upper), **rates}
+def _crossing_to_json(crossing: Crossing) -> CrossingDocument:
+    kbps, low, high = (round(of, 1) for of in (crossing.kbps, crossing.low, crossing.high))
+    return {"lower": plain(crossing.lower), "upper": plain(crossing.upper), "kbps": kbps, "low": low, "high": high}
 
 
-def _ladder_to_json(ladder: Ladder) -> dict[str, Any]:
+def _ladder_to_json(ladder: Ladder) -> LadderDocument:
     return {
         "scaling": [plain(factor) for factor in ladder.scaling],
         "b_min_kbps": [0, *(round(bound, 1) for bound in ladder.bounds)],
