@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from itertools import islice, repeat
 from typing import Any
 
 from runner.schema import Path
@@ -93,31 +94,22 @@ def expands_within(document: Any, most: int) -> bool:
     millions.
     """
     try:
-        return _Sizes(document).of(()) <= most
+        return sum(1 for _ in islice(_expanded(document, document, (), frozenset()), most + 1)) <= most
     except RecursionError:
         return False
 
 
-class _Sizes:
-    """Number of values below each path, counted once. A cycle counts as 0: OmegaConf reports it."""
+def _expanded(document: Any, value: Any, path: Path, above: frozenset[Path]) -> Iterator[None]:
+    """One step for each value at and below a path, and for those that interpolations there refer to.
 
-    def __init__(self, document: Any) -> None:
-        self._document = document
-        self._known: dict[Path, int] = {}
-
-    def of(self, path: Path) -> int:
-        if path not in self._known:
-            self._known[path] = 0
-            self._known[path] = 1 + sum(self._inner(self._value(path), path))
-        return self._known[path]
-
-    def _inner(self, value: Any, path: Path) -> Iterator[int]:
-        if isinstance(value, dict | list):
-            keys = value if isinstance(value, dict) else range(len(value))
-            yield from (self.of((*path, key)) for key in keys)
-        elif isinstance(value, str):
-            yield len(value) // CHARACTERS
-            yield from map(self.of, references(value, path))
-
-    def _value(self, path: Path) -> Any:
-        return value_at(self._document, path)  # None: OmegaConf reports that there is no such key
+    above  paths whose interpolations are being followed: a circle is not, OmegaConf reports it
+    """
+    yield
+    if isinstance(value, dict | list):
+        for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from _expanded(document, inner, (*path, key), above)
+    elif isinstance(value, str):
+        yield from repeat(None, len(value) // CHARACTERS)
+        for target in references(value, path):
+            if target not in above:  # None: OmegaConf reports that there is no such key
+                yield from _expanded(document, value_at(document, target), target, above | {target})

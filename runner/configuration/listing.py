@@ -10,8 +10,10 @@ import yaml
 
 from runner import schema
 from runner.configuration.origin import Composed
+from runner.configuration.yaml_file import resolve_exponents
 
 WIDEST = 100  # characters of a line before its comment, if its value can be split over several lines
+TEXT = "tag:yaml.org,2002:str"
 UNSTATED = "in none of the files and overrides"
 
 
@@ -70,20 +72,16 @@ def _flow(value: Any) -> str:
 
 @cache
 def dumper() -> Any:
-    """OmegaConf's dumper, which quotes what OmegaConf would otherwise read as a number."""
-    from omegaconf._utils import get_omega_conf_dumper
+    """A dumper that quotes what OmegaConf, or YAML 1.1, would otherwise read as something else than text."""
 
-    plain: Any = get_omega_conf_dumper()
-
-    class OneLine(plain):  # type: ignore[misc]
+    class OneLine(yaml.SafeDumper):
         def ignore_aliases(self, data: Any) -> bool:
             return True
 
     def text(dumper: Any, data: str) -> Any:
-        node = plain.yaml_representers[str](dumper, data)
-        if len(data.splitlines()) > 1 or data.endswith("\n"):
-            node.style = '"'
-        return node
+        lines = len(data.splitlines()) > 1 or data.endswith("\n")
+        return dumper.represent_scalar(TEXT, data, '"' if lines else "'" if data in ("y", "Y", "n", "N") else None)
 
     OneLine.add_representer(str, text)
+    resolve_exponents(OneLine)
     return OneLine

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pickle
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from functools import cache, lru_cache
 from itertools import takewhile
@@ -25,6 +25,8 @@ MAX_BYTES = 100_000  # about twenty times the longest packaged file
 MAX_VALUES = 10_000  # with every alias (*NAME) expanded
 DEEPEST = 32  # levels of lists and mappings
 _NAME = re.compile(r"[\w /@:.,${}?-]+")  # of a file or a group, in a defaults list
+EXPONENT = re.compile(r"[-+]?[0-9]+(_[0-9]+)*(\.[0-9_]*)?[eE][-+]?[0-9]+$")
+DATE = "tag:yaml.org,2002:timestamp"
 _PACKAGE = re.compile(r"#\s*@package\s+(\S+)")
 
 
@@ -134,10 +136,15 @@ def _read(path: Path, _modified_ns: int, _bytes: int) -> YamlFile:
 
 
 def _content(text: str) -> Any:
-    in_python, in_c = _loaders()
+    in_c, in_python = _loaders()
     with suppress(yaml.YAMLError):  # the parser in Python has more detailed messages
-        return yaml.load(text, Loader=in_c)
-    return yaml.load(text, Loader=in_python)
+        return _loaded(text, in_c)
+    return _loaded(text, in_python)
+
+
+def _loaded(text: str, loader: Any) -> Any:
+    _check_size(yaml.parse(text, loader))
+    return yaml.load(text, loader)
 
 
 def _package(text: str) -> str | None:
@@ -152,58 +159,71 @@ def _yaml_problem(error: yaml.YAMLError, file: str) -> Problem:
     return Problem(file, f"line {mark.line + 1}" if mark else "", None, " ".join(str(what).split()))
 
 
+def _check_size(events: Iterable[Any]) -> None:
+    """Check the limits on the values of a file before any is built, so that nothing too large is.
+
+    An alias counts as many values as it refers to.
+    """
+    values, sizes = 0, dict[str | None, int]()  # so far; by anchor
+    above: list[tuple[str | None, int]] = []  # of the lists and mappings around an event: anchor, values before
+    for event in events:
+        if isinstance(event, yaml.CollectionEndEvent):
+            anchor, before = above.pop()
+            sizes[anchor] = values - before
+        if not isinstance(event, yaml.NodeEvent):
+            continue
+        if len(above) == DEEPEST:
+            raise _error_at(event, f"must be nested at most {DEEPEST} levels deep")
+        if isinstance(event, yaml.AliasEvent):
+            if any(event.anchor == anchor for anchor, _ in above):
+                raise _error_at(event, f"an alias, *{event.anchor}, is part of the value it refers to")
+            values += sizes.get(event.anchor, 0)
+        elif isinstance(event, yaml.CollectionStartEvent):
+            above.append((event.anchor, values))
+            values += 1
+        else:
+            values, sizes[event.anchor] = values + 1, 1
+        if values > MAX_VALUES:
+            raise _error_at(event, f"must contain at most {MAX_VALUES} values, with aliases expanded")
+
+
 @cache
 def _loaders() -> tuple[Any, Any]:
-    """A loader with the parser in Python, and one with the parser in C, which takes an eighth of the time."""
-    from omegaconf._utils import get_yaml_loader
+    """A loader with the parser in C, which takes an eighth of the time, and one with the parser in Python."""
+    return _loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)), _loader(yaml.SafeLoader)
 
-    class Limited(get_yaml_loader()):  # type: ignore[misc]
-        """Counts nodes while composing, so that nothing too large is built."""
 
-        def __init__(self, stream: Any) -> None:
-            super().__init__(stream)
-            self._depth = self._values = 0
-            self._sizes: dict[int, int] = {}  # values below a node, by its id
+def _loader(plain: Any) -> Any:
+    """A loader of YAML as OmegaConf reads it: no dates, and no key twice."""
 
-        def compose_node(self, parent: Any, index: Any) -> Any:
-            event, before = self.peek_event(), self._values
-            self._depth += 1
-            if self._depth > DEEPEST:
-                raise _limit_error(event, f"must be nested at most {DEEPEST} levels deep")
-            node = super().compose_node(parent, index)
-            self._depth -= 1
-            if isinstance(event, yaml.AliasEvent):
-                if id(node) not in self._sizes:
-                    raise _limit_error(event, f"an alias, *{event.anchor}, is part of the value it refers to")
-                self._values += self._sizes[id(node)]
-            else:
-                self._values += 1
-                self._sizes[id(node)] = self._values - before
-            if self._values > MAX_VALUES:
-                raise _limit_error(event, f"must contain at most {MAX_VALUES} values, with aliases expanded")
-            return node
+    class Loader(plain):  # type: ignore[misc]
+        def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+            keys = [key for key, _ in node.value if key.tag == self.DEFAULT_SCALAR_TAG]
+            found = set[str]()
+            for key in keys:
+                if key.value in found:
+                    raise _error_at(key, f"found duplicate key {key.value}")
+                found.add(key.value)
+            return super().construct_mapping(node, deep)
 
         def construct_yaml_int(self, node: Any) -> int:
             number: int = super().construct_yaml_int(node)
             if abs(number) >= 10**schema.LONGEST_WHOLE:
-                raise _limit_error(node, f"must have at most {schema.LONGEST_WHOLE} digits")
+                raise _error_at(node, f"must have at most {schema.LONGEST_WHOLE} digits")
             return number
 
-    Limited.add_constructor("tag:yaml.org,2002:int", Limited.construct_yaml_int)
-
-    if not yaml.__with_libyaml__:
-        return Limited, Limited
-    from yaml.cyaml import CParser  # type: ignore[attr-defined]
-
-    class Quick(Limited):
-        def __init__(self, stream: Any) -> None:
-            super().__init__(stream)
-            parser = CParser(stream)
-            self.check_event, self.peek_event, self.get_event = parser.check_event, parser.peek_event, parser.get_event
-
-    return Limited, Quick
+    Loader.add_constructor("tag:yaml.org,2002:int", Loader.construct_yaml_int)
+    resolve_exponents(Loader)
+    resolvers = Loader.yaml_implicit_resolvers.items()
+    Loader.yaml_implicit_resolvers = {key: [one for one in known if one[0] != DATE] for key, known in resolvers}
+    return Loader
 
 
-def _limit_error(place: Any, rule: str) -> yaml.MarkedYAMLError:
+def resolve_exponents(of: Any) -> None:
+    """Let a loader or dumper take 1e3 for a number as OmegaConf does. YAML 1.1 requires 1.0e+3."""
+    of.add_implicit_resolver("tag:yaml.org,2002:float", EXPONENT, list("-+0123456789"))
+
+
+def _error_at(place: Any, rule: str) -> yaml.MarkedYAMLError:
     """An error at an event or a node."""
     return yaml.MarkedYAMLError(problem=rule, problem_mark=place.start_mark)
