@@ -141,7 +141,7 @@ def _compose(overrides: Sequence[Override], directories: Sequence[Path]) -> tupl
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
-    from runner.configuration.hydra_files import only_what_composing_needs, search
+    from runner.configuration.hydra_files import search, without_launchers
 
     # OmegaConf's resolver for environment variables is not supported: only files define values.
     OmegaConf.clear_resolver("oc.env")
@@ -151,7 +151,7 @@ def _compose(overrides: Sequence[Override], directories: Sequence[Path]) -> tupl
     words = [o.hydra(chosen) for o in overrides]
     GlobalHydra.instance().clear()
     try:
-        with initialize_config_dir(str(directories[-1]), version_base="1.3"), only_what_composing_needs():
+        with initialize_config_dir(str(directories[-1]), version_base="1.3"), without_launchers():
             config = hydra_compose("config", words, return_hydra_config=True)
     except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError(_list_problems(error, directories) or [_hydra_problem(error, directories)]) from None
