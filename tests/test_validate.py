@@ -6,17 +6,14 @@ import importlib.util
 import os
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager
-from itertools import chain, product
+from multiprocessing import parent_process
 from pathlib import Path
 
 import pytest
 from helpers import CONF, Command, UserConf, process
 
-from runner.configuration import yaml_file
-from runner.configuration.combinations import SECTIONS, Combinations, words_of
-from runner.configuration.compose import compose
 from runner.configuration.config import configuration
-from runner.configuration.files import GROUPS, options
+from runner.configuration.files import GROUPS
 from runner.configuration.rule_lists import OWN_RULES
 from runner.plans import compile_plans
 from runner.system import spawned
@@ -53,7 +50,7 @@ def test_what_is_packaged_is_valid() -> None:
 
 # --- many runs --------------------------------------------------------------------------------------------------------
 
-RUNS = "".join(f"    run{n}: [control.port={2000 + n}]\n" for n in range(validate.RUNS_PER_WORKER))
+RUNS = "".join(f"    run{n}: [control.port={2000 + n}]\n" for n in range(2 * validate.PER_WORKER))
 EXPERIMENT = """# @package _global_
 defaults: [driving_test, _self_]
 experiment:
@@ -85,7 +82,7 @@ def test_worker_processes_report_the_same_as_one_process(
     for cores in ({0, 1}, {0}):
         monkeypatch.setattr(os, "sched_getaffinity", lambda _pid, cores=cores: cores)
         assert problems(tod, conf) == expected
-    assert pools == [1]
+    assert pools == [2]
 
 
 @pytest.mark.slow
@@ -101,14 +98,19 @@ def test_without_shared_memory_one_process_checks_everything(
     assert problems(tod, conf) == ["~/experiment/many.yaml: experiment.runs.fast: control.port=-1: must be at least 1"]
 
 
-def die(*_: object) -> None:
-    os._exit(1)
+CHECK = validate._check
+
+
+def die(task: validate.ValidationTask, user: Path | None) -> validate.Result:
+    if parent_process():
+        os._exit(1)
+    return CHECK(task, user)
 
 
 @pytest.mark.slow
 def test_a_worker_process_that_dies_is_reported(tod: Command, conf: UserConf, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _pid: {0, 1})
-    monkeypatch.setattr(validate, "_check_run", die)
+    monkeypatch.setattr(validate, "_check", die)
     conf.write("experiment/many.yaml", EXPERIMENT + RUNS)
     result = tod("validate", conf.word)
     assert result.status == 1
@@ -317,69 +319,7 @@ def test_a_study_is_checked(tod: Command, conf: UserConf) -> None:
     assert problem.endswith(": must be strictly increasing")
 
 
-# --- how often Hydra composes -----------------------------------------------------------------------------------------
-
-FLEET = Path(__file__).parent / "fleet"  # 2 vehicles, 6 kinds of camera, 4 modes, 3 graphs, 3 sources, 2 pqos
-FILES = {group: [(group, name) for name in options(group, [FLEET])] for group in GROUPS}
-
-
-@pytest.fixture
-def composed(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, ...]]:
-    """The words of each configuration that Hydra composes."""
-    import hydra
-
-    words: list[tuple[str, ...]] = []
-    original = hydra.compose
-
-    def counted(name: str, overrides: list[str], **options: object) -> object:
-        words.append(tuple(overrides))
-        return original(name, overrides, **options)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(hydra, "compose", counted)
-    return words
-
-
-def test_independent_files_are_composed_and_read_once(
-    tod: Command, composed: list[tuple[str, ...]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    read: list[object] = []
-    content = yaml_file._content
-    monkeypatch.setattr(yaml_file, "_content", lambda text: read.append(text) or content(text))
-    yaml_file._read.cache_clear()
-    result = tod("validate", f"conf={FLEET}")
-    assert (result.status, result.out.splitlines()[0]) == (0, "valid: 20 files, 39 configurations")
-    assert len(composed) == 1
-    assert len(read) == len(set(read)) <= 20 + sum(map(count, (".", *GROUPS)))
-
-
-@pytest.mark.slow
-def test_assembled_documents_equal_those_that_hydra_composes() -> None:
-    combinations = Combinations([], FLEET, chain(*FILES.values()))
-    crossed = product(*(FILES[group] for group in ("vehicle", "graph", "source")))
-    alone = [(choice,) for group in ("cameras", *SECTIONS) for choice in FILES[group]]
-    for choices in [(), *alone, *list(crossed)[::4]]:
-        assembled = combinations.assembled(dict(choices))
-        assert assembled is not None, choices
-        assert assembled.document == compose(words_of(dict(choices)), FLEET).document, choices
-
-
-@pytest.mark.parametrize(
-    "name, text",
-    [
-        ("modes/mine.yaml", "# @package _global_\nmodes: {}\nmedia: {port: 9}\n"),
-        ("modes/mine.yaml", "defaults: [paper, /pqos@pqos: constant, _self_]\n"),
-        ("source/mine.yaml", "defaults: [test, _self_]\nframe: '${graph.mtu_bytes}'\n"),
-        ("vehicle/mine.yaml", "# @package _global_\ndefaults: [tum_q7, override /modes: paper, _self_]\n"),
-        ("vehicle/mine.yaml", "# @package _global_\ndefaults: [tum_q7, _self_]\ngraph: {mtu_bytes: 900}\n"),
-        ("config.yaml", (CONF / "config.yaml").read_text() + "graph: {mtu_bytes: 900}\n"),
-        ("config.yaml", (CONF / "config.yaml").read_text().replace("port: 8554", "port: '${graph.first_port}'")),
-    ],
-)
-def test_files_that_refer_to_other_groups_are_not_assembled(conf: UserConf, name: str, text: str) -> None:
-    conf.write(name, text)
-    group, _, file = name.removesuffix(".yaml").rpartition("/")
-    choices = {group: file} if group else {"modes": "paper"}
-    assert Combinations([], conf.path, choices.items()).assembled(choices) is None
+# --- combinations -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow

@@ -21,17 +21,6 @@ def references(text: str, path: Path) -> Iterator[Path]:
         yield (*above, *(int(step) if step.isdigit() else step for step in _STEP.findall(key)))
 
 
-def stays_inside(content: Any, path: Path = ()) -> bool:
-    """Whether every interpolation in a file's content refers to a place in that content, by a relative path."""
-    if isinstance(content, dict | list):
-        entries = content.items() if isinstance(content, dict) else enumerate(content)
-        return all(stays_inside(inner, (*path, key)) for key, inner in entries)
-    if not isinstance(content, str):
-        return True
-    found = _REFERENCE.findall(content)
-    return len(found) == content.count("${") and all(0 < len(dots) <= len(path) for dots, _ in found)
-
-
 def value_at(document: Any, path: Path, otherwise: Any = None) -> Any:
     """The value at a path of a document; `otherwise` if there is none."""
     for key in path:

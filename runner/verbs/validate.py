@@ -25,30 +25,38 @@ comes from another version of tod-runner, a warning is printed to standard error
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field
-from functools import lru_cache
-from itertools import product
+from contextlib import ExitStack, suppress
+from itertools import chain, product, repeat
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from runner import schema
 from runner.configuration.build import PlanCheck
-from runner.configuration.combinations import Combinations, reaches, words_of
 from runner.configuration.compose import compose
 from runner.configuration.config import Configuration
-from runner.configuration.files import GROUPS, LAYOUT, bases_of, built_on, conf_directories, find_file, options
+from runner.configuration.files import (
+    GROUPS,
+    LAYOUT,
+    bases_of,
+    built_on,
+    chosen_by,
+    conf_directories,
+    find_file,
+    options,
+)
 from runner.configuration.overrides import choosable
 from runner.configuration.yaml_file import label, load_file, load_node
+from runner.configuration.yaml_file import read as read_yaml
 from runner.core.model import ModelError
 from runner.errors import COMMAND_LINE, ArgumentError, ConfigError, MissingBindings, Problem, RunError, suggest
 from runner.graph import Plan
 from runner.verbs import Arguments
 
 if TYPE_CHECKING:
-    from concurrent.futures import Executor, Future
+    from concurrent.futures import Executor
 
 FOLDERS = (*GROUPS, LAYOUT)  # of checked files
 DATA = ("maps", "traces")  # folders for data that pqos files name; a bandwidth map may be YAML
@@ -62,9 +70,10 @@ READERS: dict[str, ConfigReader] = {  # by group, the reader of its part of the 
     "study": Configuration.study,
     "link": Configuration.link,
 }
-RUNS_PER_WORKER = 10  # starting a worker takes as long as checking so many runs
+MOUNT = "validated"  # name under which a kind of camera is mounted
+REFERENCE = re.compile(r"\$\{\s*(\w+)")
+PER_WORKER = 10  # starting a worker takes as long as checking so many configurations
 MOST_WORKERS = 8  # each takes 130 MB
-RunResult = tuple[list[Problem], dict[str, None]]  # problems and notes
 ChosenFiles = tuple[tuple[str, str], ...]  # group and file
 
 
@@ -92,7 +101,9 @@ class ValidationTask(NamedTuple):
 
     @property
     def words(self) -> tuple[str, ...]:
-        return (*self.overrides, *words_of(dict(self.choices)), *(self.run.words if self.run else ()))
+        places = {"cameras": f"+cameras@cameras.{MOUNT}"}
+        chosen = (f"{places.get(group, group)}={name}" for group, name in self.choices)
+        return (*self.overrides, *chosen, *(self.run.words if self.run else ()))
 
     @property
     def readers(self) -> Sequence[ConfigReader]:
@@ -102,24 +113,30 @@ class ValidationTask(NamedTuple):
         return [READERS.get(group, Configuration.setup) for group, _ in self.choices]
 
 
+class Result(NamedTuple):
+    """What was found in a configuration: problems, notes, and the runs of its experiment if there are no problems."""
+
+    problems: list[Problem]
+    notes: dict[str, None]
+    runs: list[ExperimentRun]
+
+
 def run(arguments: Arguments) -> int:
     everything = arguments.choice("all") == "true"
     files, configurations, notes = 0, 0, dict[str, None]()
-    _composed.cache_clear()
     for conf, named in _directories(arguments).items():
         _warn_of_other_schemas(conf)
         directories = conf_directories(conf)
         found, checked = check_files(directories if everything else directories[:1], named)
         if found:
             raise ConfigError(found)
-        tasks = _Tasks(tuple(arguments.overrides), conf, everything, named)
-        checker = _Checker(conf, Combinations(arguments.overrides, conf, tasks.choices))
-        if problems := checker.check_all(list(tasks)):
+        results = _check_all(_Tasks(tuple(arguments.overrides), conf, everything, named).selected(), conf)
+        if problems := [problem for result in results.values() for problem in result.problems]:
             raise ConfigError(problems)
-        files, configurations = files + checked, configurations + len({task.words for task in tasks})
-        notes |= checker.notes
+        files, configurations = files + checked, configurations + len({task.words for task in results})
+        notes |= {note: None for result in results.values() for note in result.notes}
     print(f"valid: {_counted(files, 'file')}, {_counted(configurations, 'configuration')}")
-    print("\n".join(sorted(notes)), end="\n" if notes else "")  # workers find theirs in any order
+    print("\n".join(sorted(notes)), end="\n" if notes else "")
     return 0
 
 
@@ -270,7 +287,7 @@ class _Tasks:
     def __init__(
         self, overrides: tuple[str, ...], user: Path | None, everything: bool, named: Collection[Path] | None
     ) -> None:
-        self._overrides, self._user, self._everything, self._named = overrides, user, everything, named
+        self._overrides, self._everything, self._named = overrides, everything, named
         self._directories = conf_directories(user)
         searched = self._directories if everything else self._directories[:-1]
         fixed = _fixed_groups(overrides)
@@ -279,22 +296,16 @@ class _Tasks:
         words = (word.lstrip("+").partition("=") for word in overrides)
         chosen = ((key.lstrip("/").partition("@")[0], name) for key, _, name in words)
         self._given = [each for each in chosen if each[0] in GROUPS and each[1] in options(each[0], self._directories)]
-        self._tasks = list(dict.fromkeys(filter(self._is_selected, self._all())))
 
-    def __iter__(self) -> Iterator[ValidationTask]:
-        return iter(self._tasks)
-
-    @property
-    def choices(self) -> list[tuple[str, str]]:
-        """Groups and files that any of the tasks chooses."""
-        return list(dict.fromkeys(choice for task in self._tasks for choice in task.choices))
+    def selected(self) -> list[ValidationTask]:
+        return list(dict.fromkeys(filter(self._is_selected, self._all())))
 
     def _all(self) -> Iterator[ValidationTask]:
         """Single files before combinations; the same task may occur twice."""
         yield ValidationTask(self._overrides)
         for group, names in self._files.items():
             for name in names:
-                yield from self._of_one_file(group, name)
+                yield self._of_one_file(group, name)
         vehicles: Sequence[str | None] = self._files.get("vehicle", [])
         others: list[Sequence[str | None]] = [self._files.get(group) or [None] for group in CROSSED[1:]]
         if self._vehicle_fixed or not (vehicles or self._everything):
@@ -305,21 +316,18 @@ class _Tasks:
         if self._everything:
             yield from self._reached()
 
-    def _of_one_file(self, group: str, name: str) -> Iterator[ValidationTask]:
-        """A file with the choices of the command line; an experiment also with each of its runs."""
+    def _of_one_file(self, group: str, name: str) -> ValidationTask:
+        """A file with the choices of the command line."""
         packaged = name not in options(group, self._directories[:-1])
         overrides = STANDALONE[group] if packaged and group in STANDALONE else self._overrides
-        task = ValidationTask(overrides, ((group, name),))
-        yield task
-        if group == "experiment":
-            yield from (task._replace(run=run) for run in _runs(name, task.words, self._user))
+        return ValidationTask(overrides, ((group, name),))
 
     def _reached(self) -> Iterator[ValidationTask]:
         """Files that refer to other groups or choose from them, with every choice of those."""
         for group, names in self._files.items():
             for name in names if group not in STANDALONE else ():
                 with suppress(ConfigError):  # reported for the file alone
-                    for other in reaches(find_file(self._directories, group, name)):
+                    for other in _reaches(find_file(self._directories, group, name)):
                         for choice in self._files.get(other, ()):
                             yield ValidationTask(self._overrides, ((group, name), (other, choice)))
 
@@ -342,120 +350,87 @@ def _fixed_groups(words: Iterable[str]) -> set[str]:
     return keys | ({"vehicle"} if "cameras" in keys else set())
 
 
-_composed = lru_cache(maxsize=32)(compose)  # experiments are also composed to list their runs
+def _reaches(path: Path) -> set[str]:
+    """Groups other than its own whose choice may affect a file: it refers to, chooses from or fills them.
 
-
-def _runs(experiment: str, overrides: tuple[str, ...], user: Path | None) -> Iterator[ExperimentRun]:
-    """The runs of an experiment; none if it cannot be composed, which another task reports."""
-    try:
-        section = _composed(overrides, user).document.get("experiment")
-    except ConfigError:
-        return
-    file = label(find_file(conf_directories(user), "experiment", experiment))
-    runs = section.get("runs") if isinstance(section, dict) else None
-    for name, words in (runs if isinstance(runs, dict) else {}).items():
-        if isinstance(words, list) and all(isinstance(word, str) for word in words):
-            yield ExperimentRun(file, f"experiment.runs.{name}", tuple(words))
-
-
-@dataclass
-class _Checker:
-    """Checks configurations one after the other. If experiments have many runs, worker processes check those meanwhile.
-
-    broken  files that are invalid or cannot be composed: combinations with them are not checked
-    fine    sections that the schemas accept, by key and identity
+    raises  ConfigError if it cannot be read
     """
-
-    user: Path | None
-    combinations: Combinations
-    notes: dict[str, None] = field(default_factory=dict)
-    broken: set[tuple[str, str]] = field(default_factory=set)
-    fine: set[tuple[str, int]] = field(default_factory=set)
-
-    def __post_init__(self) -> None:
-        self._registry = _registry_check(self.notes)
-
-    def check_all(self, tasks: Sequence[ValidationTask]) -> list[Problem]:
-        """All problems, in the order of the tasks."""
-        found: dict[ValidationTask, list[Problem]] = {}
-        with _in_workers([task for task in tasks if task.run], self.user) as pending:
-            for task in sorted(tasks, key=pending.__contains__):
-                if self.broken.isdisjoint(task.choices):
-                    found[task] = self._collect(pending[task]) if task in pending else self._check(task)
-        return [problem for task in tasks for problem in found.get(task, ())]
-
-    def _collect(self, future: Future[RunResult]) -> list[Problem]:
-        problems, notes = future.result()
-        self.notes |= notes
-        return problems
-
-    def _check(self, task: ValidationTask) -> list[Problem]:
-        if self._is_fine_assembled(task):
-            return []
-        problems = _check_composed(task, self.user, self._registry)
-        if problems and len(task.choices) == 1 and not task.run:
-            self.broken |= set(task.choices)
-        return problems
-
-    def _is_fine_assembled(self, task: ValidationTask) -> bool:
-        """Whether a configuration assembled from sections is valid; an invalid one is composed and checked again."""
-        if task.run or task.overrides != self.combinations.overrides:
-            return False
-        assembled = self.combinations.assembled(dict(task.choices))
-        if assembled is None:
-            return False
-        sections = {(key, id(value)) for key, value in assembled.document.items()}
-        fits = {key for key, _ in sections & self.fine}
-        config = Configuration(assembled, self.user, runnable=False, bags=True, check=self._registry, fits=fits)
-        if _problems(config, task.readers):
-            return False
-        self.fine |= sections
-        return True
+    content, package = read_yaml(path)
+    named = set(REFERENCE.findall(str(content)))
+    named |= {key.split()[1].lstrip("/").partition("@")[0] for key, _ in chosen_by(path) if key.startswith("override ")}
+    if package == "_global_":
+        named |= set(content) if isinstance(content, dict) else set()
+    elif package:
+        named.add(package.partition(".")[0])
+    return named.intersection(GROUPS) - {path.parent.name, "cameras"}
 
 
-@contextmanager
-def _in_workers(
-    runs: Sequence[ValidationTask], user: Path | None
-) -> Iterator[Mapping[ValidationTask, Future[RunResult]]]:
-    """The runs that worker processes check on other cores; none if starting those takes longer than the checks.
+def _check_all(tasks: Sequence[ValidationTask], user: Path | None) -> dict[ValidationTask, Result]:
+    """What was found in each configuration, and in the runs of experiments, in the order of the tasks.
 
+    A file that is invalid alone is combined with no other, and the runs of an invalid experiment are not checked.
     raises  RunError if a worker process dies
     """
     from concurrent.futures import BrokenExecutor
 
+    alone = [task for task in tasks if len(task.choices) < 2]
     try:
-        with ExitStack() as stack:
-            pool = _open_pool(len(runs), stack)
-            yield {run: pool.submit(_check_run, run, user) for run in runs} if pool else {}
+        with _Workers(user) as workers:
+            found = workers.check(alone)
+            broken = {choice for task in alone if found[task].problems for choice in task.choices}
+            runs = {task: [task._replace(run=run) for run in found[task].runs] for task in alone}
+            combined = [task for task in tasks if task not in found and broken.isdisjoint(task.choices)]
+            found |= workers.check([*chain.from_iterable(runs.values()), *combined])
     except BrokenExecutor:
         raise RunError("a worker process ended without a result: it may have run out of memory") from None
+    return {each: found[each] for task in tasks for each in (task, *runs.get(task, ())) if each in found}
 
 
-def _open_pool(runs: int, stack: ExitStack) -> Executor | None:
-    workers = min(len(os.sched_getaffinity(0)) - 1, runs // RUNS_PER_WORKER, MOST_WORKERS)
-    if not workers:
-        return None
-    from runner.system.spawned import process_pool
+class _Workers(ExitStack):
+    """Checks configurations: in worker processes on all cores, once there are enough to be worth their start."""
 
-    try:
-        return stack.enter_context(process_pool(workers))
-    except OSError:  # no shared memory for its queue, as in some containers
-        return None
+    def __init__(self, user: Path | None) -> None:
+        super().__init__()
+        self._user = user
+        self._pool: Executor | None = None
+
+    def check(self, tasks: Sequence[ValidationTask]) -> dict[ValidationTask, Result]:
+        self._pool = self._pool or self._open_pool(len(tasks))
+        in_order = self._pool.map if self._pool else map
+        return dict(zip(tasks, in_order(_check, tasks, repeat(self._user)), strict=True))
+
+    def _open_pool(self, tasks: int) -> Executor | None:
+        workers = min(len(os.sched_getaffinity(0)), tasks // PER_WORKER, MOST_WORKERS)
+        if workers < 2:
+            return None
+        from runner.system.spawned import process_pool
+
+        try:
+            return self.enter_context(process_pool(workers))
+        except OSError:  # no shared memory for its queue, as in some containers
+            return None
 
 
-def _check_run(run: ValidationTask, user: Path | None) -> RunResult:
+def _check(task: ValidationTask, user: Path | None) -> Result:
     notes: dict[str, None] = {}
-    return _check_composed(run, user, _registry_check(notes)), notes
-
-
-def _check_composed(task: ValidationTask, user: Path | None, check: PlanCheck | None) -> list[Problem]:
+    runs: list[ExperimentRun] = []
     try:
-        composed = _composed(task.words, user)
-        config = Configuration(composed, user, runnable=False, bags=True, check=check)
+        composed = compose(task.words, user)
+        config = Configuration(composed, user, runnable=False, bags=True, check=_registry_check(notes))
         problems = _problems(config, task.readers)
+        runs = [] if problems else list(_runs(task, composed.document, user))
     except ConfigError as error:
         problems = error.problems
-    return [task.run.attributed(problem) for problem in problems] if task.run else problems
+    return Result([task.run.attributed(problem) for problem in problems] if task.run else problems, notes, runs)
+
+
+def _runs(task: ValidationTask, document: Mapping[str, Any], user: Path | None) -> Iterator[ExperimentRun]:
+    """The runs of the experiment that a task chooses."""
+    experiment = dict(task.choices).get("experiment")
+    if experiment and not task.run:
+        file = label(find_file(conf_directories(user), "experiment", experiment))
+        for name, words in (document.get("experiment", {}).get("runs") or {}).items():
+            yield ExperimentRun(file, f"experiment.runs.{name}", tuple(words))
 
 
 def _problems(config: Configuration, readers: Iterable[ConfigReader]) -> list[Problem]:

@@ -43,12 +43,7 @@ FAULTS = [
     Fault("core/follow_link.py", "state.t - link.t < START_S", "True", "test_rules"),
     Fault("core/learned.py", "- self.bias", "", "test_belief"),
     Fault("configuration/overrides.py", "if str(override.value) not in known:", "if False:", "test_config"),
-    Fault(
-        "configuration/interpolation.py",
-        "all(0 < len(dots) <= len(path)",
-        "all(0 <= len(dots) <= len(path)",
-        "test_validate",
-    ),
+    Fault("configuration/interpolation.py", "len(value) // CHARACTERS", "0", "test_hostile_files"),
     Fault(
         "vehicle/operators.py", "t - o.last_message > SILENT_S", "t - o.last_message > 9 * SILENT_S", "test_operators"
     ),
