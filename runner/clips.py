@@ -42,7 +42,7 @@ class View:
             raise ModelError("size", f"{self.width}x{self.height}", "both sides must be even and at least 16 px")
         if not 0 < self.fov_deg <= (360 if self.lens == "fisheye" else 170):
             rule = "must lie in ]0, 170] for a pinhole, ]0, 360] for a fisheye"
-            raise ModelError("fov_deg", f"{self.fov_deg:g}", rule)
+            raise ModelError("fov_deg", f"{self.fov_deg:g}", rule, "lens")
         if self.pose.z_m <= 0 or self.fps <= 0:
             raise ModelError("pose.z_m", f"z_m {self.pose.z_m:g}, fps {self.fps}", "must be above 0")
 

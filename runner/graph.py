@@ -223,9 +223,9 @@ def check_video(graph: Graph) -> None:
     for side, elements in (("vehicle", graph.vehicle), ("operator", graph.operator)):
         if _COUNTERS[side] not in (element.name for element in elements):
             rule = f"log.video needs an identity named {_COUNTERS[side]} where the stream is encoded"
-            raise ModelError(f"graph.{side}", None, rule)
+            raise ModelError(f"graph.{side}", None, rule, "log.video")
     if not video_codec(graph):
-        raise ModelError("graph.vehicle", None, f"log.video needs one of {', '.join(CODECS)}")
+        raise ModelError("graph.vehicle", None, f"log.video needs one of {', '.join(CODECS)}", "log.video")
 
 
 def assignments(camera: Camera, knob: str, value: KnobValue, pace: float = 1.0) -> list[Assignment]:
@@ -348,26 +348,37 @@ def _per_frame_rate(camera: Camera) -> dict[str, int]:
 
 def _check_names(graph: Graph, source: Source, recorder: Iterable[Element]) -> None:
     """Source and graph become one pipeline, source and recording another; elements are found by name."""
-    for key, elements in (("elements", source.elements), ("stand_in", source.stand_in)):
-        taken = {element.name for element in (*graph.vehicle, *graph.wire_vehicle)}
-        for index, element in enumerate(elements):
-            if element.name in taken:
-                rule = "is already the name of another element"
-                raise ModelError(f"source.{key}[{index}].name", repr(element.name), rule)
-            taken.add(element.name)
-    taken = {element.name for element in (*source.elements, *source.stand_in, *_RECORDED, _WRITER)}
-    for index, element in enumerate(recorder):
-        if element.name in taken:
-            rule = "is already the name of another element"
-            raise ModelError(f"recording.elements[{index}].name", repr(element.name), rule)
+    sent = _names("graph.wire.vehicle", graph.wire_vehicle) | _names("graph.vehicle", graph.vehicle)
+    played = _names("source.stand_in", source.stand_in) | _names("source.elements", source.elements)
+    _check_free("source.elements", source.elements, sent)
+    _check_free("source.stand_in", source.stand_in, sent)
+    _check_free("recording.elements", recorder, played | _names("recording.elements", (*_RECORDED, _WRITER)))
+
+
+def _names(where: str, elements: Iterable[Element]) -> dict[str, str]:
+    """By name of an element, its key."""
+    return {element.name: f"{where}[{index}].name" for index, element in enumerate(elements)}
+
+
+def _check_free(where: str, elements: Iterable[Element], taken: Mapping[str, str]) -> None:
+    """Check that elements have names of their own.
+
+    taken  names of others, with the key of each
+    """
+    known = dict(taken)
+    for name, key in ((element.name, f"{where}[{index}].name") for index, element in enumerate(elements)):
+        if name in known:
+            raise ModelError(key, repr(name), "is already the name of another element", known[name])
+        known[name] = key
 
 
 def _check_packets(graph: Graph) -> None:
     size = graph.settings.mtu_bytes
-    uris = (str(e.properties.get("uri")) for e in graph.vehicle if e.factory == "srtsink")
-    if size > SRT_MOST_BYTES and any("payloadsize=" not in uri for uri in uris):
+    uris = {n: str(e.properties.get("uri")) for n, e in enumerate(graph.vehicle) if e.factory == "srtsink"}
+    sinks = [place for place, uri in uris.items() if "payloadsize=" not in uri]
+    if size > SRT_MOST_BYTES and sinks:
         rule = f"must be at most {SRT_MOST_BYTES} with srtsink, which cuts longer packets"
-        raise ModelError("graph.mtu_bytes", str(size), rule)
+        raise ModelError("graph.mtu_bytes", str(size), rule, f"graph.vehicle[{sinks[0]}].properties.uri")
 
 
 def _values(camera: Camera, media: Media, index: int, clip: str | None) -> dict[str, Value | None]:

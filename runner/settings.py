@@ -79,7 +79,8 @@ class Inputs:
             taken: dict[str | int, str] = {}
             for action, value in given.items():
                 if value is not None and value in taken:
-                    raise ModelError(f"{kind}.{action}", repr(value), f"is already assigned to {taken[value]}")
+                    rule = f"is already assigned to {taken[value]}"
+                    raise ModelError(f"{kind}.{action}", repr(value), rule, f"{kind}.{taken[value]}")
                 if value is not None:
                     taken[value] = action
 
@@ -180,7 +181,7 @@ class RosSettings:
             unset = RosSettings()
             for key, rule in OF_ROS_2.items():
                 if getattr(self, key) != getattr(unset, key):
-                    yield ModelError(key, None, f"has no effect with ros.version=1: {rule}")
+                    yield ModelError(key, None, f"has no effect with ros.version=1: {rule}", "version")
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,9 +219,11 @@ class Dimensions:
 
     def __post_init__(self) -> None:
         if self.front_m < self.wheelbase_m:
-            raise ModelError("front_m", f"{self.front_m:g}", f"must reach the front axle, {self.wheelbase_m:g} m ahead")
+            rule = f"must reach the front axle, {self.wheelbase_m:g} m ahead"
+            raise ModelError("front_m", f"{self.front_m:g}", rule, "wheelbase_m")
         if self.track_m > self.width_m:
-            raise ModelError("track_m", f"{self.track_m:g}", f"must be at most width_m, {self.width_m:g}")
+            rule = f"must be at most width_m, {self.width_m:g}"
+            raise ModelError("track_m", f"{self.track_m:g}", rule, "width_m")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

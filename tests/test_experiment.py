@@ -176,7 +176,8 @@ def test_a_relay_supports_rtsp_only(tod: Command) -> None:
     result = tod("demo", "link=relay", "graph=h264_srt", "log=/nowhere")
     assert result.status == 2
     rule = "supports RTSP only; the graph of front_left has its own transport; choose link=netns"
-    assert result.problems == [f"conf/link/relay.yaml: kind: relay: {rule}"]
+    other = "see conf/graph/h264_srt.yaml: transport: 'pipeline'"
+    assert result.problems == [f"conf/link/relay.yaml: kind: relay: {rule}; {other}"]
 
 
 def test_the_reverse_direction_has_one_rate(tmp_path: Path) -> None:

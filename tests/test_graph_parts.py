@@ -121,7 +121,7 @@ def test_the_composed_graph_is_whole_lists() -> None:
         ),
         (
             "defaults: [h264_rtsp, _self_]\nsender:\n  - {name: sent, element: identity}\n",
-            "vehicle: 'sent': the last element must be named pay0, as the RTSP server requires",
+            "sender[0].name: 'sent'",  # as the other value of a rule about the list that includes it
         ),
     ],
 )

@@ -147,11 +147,6 @@ def test_a_parameter_missing_in_a_list_of_ones_own(conf: UserConf, tod: Command)
             "modes.automatic.hold_upscaling={}",
             "modes.automatic.hold_upscaling.for_s: missing: required by this rule",
         ),
-        (
-            "cameras.front_left.rate_quality.scaling=[0.5]",
-            "cameras.front_left.rate_quality.b_min_kbps: [0, 300, 950]: must have 1 entries, one per scaling factor",
-        ),
-        ("media.port=8090", "page.port: 8090: is already the port of media.port"),
         ("~modes", "modes: missing: must be given"),
         ("~cameras.front_left.fps", "cameras.front_left.fps: missing: must be given"),
     ],
@@ -160,7 +155,30 @@ def test_a_mistake_on_the_command_line_is_attributed_to_it(tod: Command, word: s
     assert tod("print", "source=test", word).problems == [f"command line: {expected}"]
 
 
-def test_a_file_that_breaks_its_base_is_blamed(conf: UserConf, tod: Command) -> None:
+@pytest.mark.parametrize(
+    "words, expected",
+    [
+        (
+            ["cameras.front_left.rate_quality.scaling=[0.5]"],
+            "conf/cameras/front_side.yaml: rate_quality.b_min_kbps: [0, 300, 950]: must have 1 entries, one per "
+            "scaling factor; see command line: cameras.front_left.rate_quality.scaling=[0.5]",
+        ),
+        (
+            ["media.port=8090"],
+            "conf/config.yaml: page.port: 8090: is already the port of media.port; see command line: media.port=8090",
+        ),
+        (
+            ["control.port=8554"],
+            "command line: control.port: 8554: is already the port of media.port; "
+            "see conf/config.yaml: media.port: 8554",
+        ),
+    ],
+)
+def test_a_rule_about_two_values_names_both_and_their_files(tod: Command, words: list[str], expected: str) -> None:
+    assert tod("print", "source=test", *words).problems == [expected]
+
+
+def test_a_file_that_breaks_its_base_is_named(conf: UserConf, tod: Command) -> None:
     conf.write("graph/mine.yaml", "defaults: [h264_rtsp, _self_]\nvehicle: [{name: pay0, element: rtph264pay}]\n")
     conf.write(
         "vehicle/mine.yaml",
@@ -168,9 +186,11 @@ def test_a_file_that_breaks_its_base_is_blamed(conf: UserConf, tod: Command) -> 
         "cameras: {a: {rate_quality: {scaling: [0.5]}}}\n",
     )
     (problem,) = tod("print", "source=test", "graph=mine", conf.word).problems
-    assert problem.startswith(f"{conf.path}/graph/mine.yaml: knobs.sending[0].element: 'gate': no such element")
+    assert problem.startswith("conf/graph/h264_rtsp.yaml: knobs.sending[0].element: 'gate': no such element")
+    assert problem.endswith(f"; see {conf.path}/graph/mine.yaml: vehicle[0].name: 'pay0'")
     (problem,) = tod("print", "source=test", "vehicle=mine", conf.word).problems
-    assert problem.startswith(f"{conf.path}/vehicle/mine.yaml: cameras.a.rate_quality.b_min_kbps: [0, 150, 400]: ")
+    assert problem.startswith("conf/cameras/top_view.yaml: rate_quality.b_min_kbps: [0, 150, 400]: must have 1 entries")
+    assert problem.endswith(f"; see {conf.path}/vehicle/mine.yaml: cameras.a.rate_quality.scaling: [0.5]")
 
 
 @pytest.mark.slow

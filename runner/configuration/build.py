@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from fractions import Fraction
-from functools import cached_property
 from ipaddress import IPv4Network, IPv6Network, ip_network
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from runner import schema
 from runner.clips import view
-from runner.configuration.origin import GRAPH_PARTS, Composed, Part
-from runner.configuration.resolve import is_determined, without
+from runner.configuration.origin import GRAPH_PARTS, Composed
 from runner.configuration.rule_lists import call_entry, check_order
 from runner.core.commands import KnobValue
 from runner.core.model import (
@@ -86,13 +84,9 @@ class Builder:
     files: bool
     bags: bool
     check: PlanCheck | None
-    fits: Collection[str] = ()  # sections already known to satisfy the schemas
     problems: list[Problem] = field(default_factory=list)
     bad: set[schema.Path] = field(default_factory=set)
-    broken: dict[schema.Path, Problem] = field(default_factory=dict)  # broken rules of the model, by path
-    built: set[str] = field(default_factory=set)  # names of the cameras
     setup: Setup | None = None
-    others: dict[int, Builder | None] = field(default_factory=dict)  # builders without one part, by its id
 
     @classmethod
     def of(
@@ -102,19 +96,15 @@ class Builder:
         files: bool,
         bags: bool,
         check: PlanCheck | None,
-        fits: Collection[str],
     ) -> Builder:
         """The builder of a configuration, with its vehicle and settings built."""
-        builder = cls(composed, runnable, files, bags, check, fits)
+        builder = cls(composed, runnable, files, bags, check)
         builder.setup = builder._setup()
-        builder._attribute_problems()
         return builder
 
     def _setup(self) -> Setup | None:
         document = self.composed.document
-        unknown = {key: value for key, value in document.items() if key not in self.fits}
-        found = schema.findings(unknown, "composed")
-        wrong = list(self._without_repeats([f for f in found if not set(f.path[:1]).intersection(self.fits)]))
+        wrong = list(self._without_repeats(schema.findings(document, "composed")))
         self.problems += [self.composed.problem(f.path, f.found, f.rule) for f in wrong]
         self.bad = {f.path for f in wrong} | {f.meant for f in wrong}
         modes = {mode: self._rules(mode) for mode in Mode if self.is_valid("modes", mode)}
@@ -131,7 +121,6 @@ class Builder:
         media = replace(media, secure=keys is not None)
         control = Endpoint(document["control"]["host"], document["control"]["port"])
         built = {name: camera for name, camera in cameras.items() if camera}
-        self.built = set(built)
         recording = self.part(("recording",), _recording)
         page = PageSettings(**document["page"])
         inputs = self.part(("inputs",), lambda data: Inputs(**data)) if "inputs" in document else None
@@ -205,40 +194,18 @@ class Builder:
             return None
 
     def _report(self, path: schema.Path, error: ModelError) -> None:
-        where = (*path, *_split(error.key))
+        where, *others = (self._place(path, key) for key in (error.key, *error.others))
         found = error.found if error.found is None or isinstance(error.found, str) else schema.shown(error.found)
-        self.broken[where] = self.composed.problem(where, found, error.rule)
-        self.problems.append(self.broken[where])
+        self.problems.append(self.composed.problem(where, found, error.rule, others))
 
-    def _attribute_problems(self) -> None:
-        """Attribute a broken rule that involves several values to the file or override that broke it.
-
-        The value that the rule names may be in a file that is correct by itself: omit the later parts one by one, to
-        find the one without which the rule holds.
-        """
-        for where, problem in list(self.broken.items()):
-            for part in self.composed.later_parts(where):
-                other = self._without(part)
-                if other and where not in other.broken and other.is_valid(*where[:-1]) and other.built >= self.built:
-                    path = self.composed.written(where)
-                    path = path[len(part.package) :] if path[: len(part.package)] == part.package else path
-                    attributed = replace(problem, file=part.file, path=schema.dotted(path))
-                    self.problems = [attributed if one == problem else one for one in self.problems]
-                    break
-
-    @cached_property
-    def _is_determined(self) -> bool:
-        return is_determined(self.composed)
-
-    def _without(self, part: Part) -> Builder | None:
-        """The builder of the configuration without a part."""
-        if id(part) not in self.others:
-            composed = without(self.composed, part) if self._is_determined else None
-            other = Builder(composed, self.runnable, self.files, self.bags, self.check) if composed else None
-            if other:
-                other._setup()
-            self.others[id(part)] = other
-        return self.others[id(part)]
+    def _place(self, path: schema.Path, key: str) -> schema.Path:
+        """Path of a key of an object. A camera's own, otherwise, as of its graph, the common one."""
+        inside = _split(key)
+        if path[:1] != ("cameras",) or len(path) != 2 or not inside:
+            return (*path, *inside)
+        camera = self.composed.document["cameras"][path[1]]
+        own = inside[0] not in self.composed.document or (isinstance(camera, dict) and inside[0] in camera)
+        return (*path, *inside) if own else inside
 
     # --- parts --------------------------------------------------------------------------------------------------------
 
@@ -257,8 +224,8 @@ class Builder:
         document = self.composed.document
         data, path = document["cameras"][name], ("cameras", name)
         # Parts that the schema accepts are checked further, whatever the problems elsewhere.
-        graph = self.part(self._of(name, "graph"), _graph)
-        source = self.part(self._of(name, "source"), _source)
+        graph = self.part(self._place(path, "graph"), _graph)
+        source = self.part(self._place(path, "source"), _source)
         model = self.part((*path, "rate_quality"), _rate_quality)
         if graph is None or source is None or model is None or not (self.is_valid(*path) and self.is_valid("fps_max")):
             return None
@@ -303,15 +270,15 @@ class Builder:
         dialling = [camera.name for camera in cameras if camera.graph.transport != "rtsp"]
         if dialling and link.kind == "relay":
             rule = f"supports RTSP only; the graph of {dialling[0]} has its own transport; choose link=netns"
-            self._refuse_link("kind", link.kind, rule)
+            self._refuse_link("kind", link.kind, rule, self._place(("cameras", dialling[0]), "graph.transport"))
         elif dialling and len(dialling) < len(cameras):
             rule = f"needs all cameras on RTSP or none: the graph of {dialling[0]} has its own transport"
-            self._refuse_link("kind", link.kind, rule)
+            self._refuse_link("kind", link.kind, rule, self._place(("cameras", dialling[0]), "graph.transport"))
         if link.limit.tcp and link.kind == "relay":
-            self._refuse_link("tcp", None, "is not supported by link=relay; choose link=netns")
+            self._refuse_link("tcp", None, "is not supported by link=relay; choose link=netns", ("link", "kind"))
 
-    def _refuse_link(self, key: str, found: str | None, rule: str) -> None:
-        self.problems.append(self.composed.problem(("link", key), found, rule))
+    def _refuse_link(self, key: str, found: str | None, rule: str, other: schema.Path) -> None:
+        self.problems.append(self.composed.problem(("link", key), found, rule, [other]))
 
     def check_requests(self, requests: Sequence[TimedRequest]) -> None:
         """Check that the cameras that requests name are mounted."""
@@ -328,15 +295,15 @@ class Builder:
         needs = {"bag"} if source.plays_bags else source.needs.intersection(MOUNT_KEYS)
         needs |= {"topic"} if source.subscribes else set()
         for key in () if source.render else sorted(needs):
-            where = ("cameras", camera.name) if key in camera.mount else self._of(camera.name, "source")
             given = camera.mount.get(key, source.settings.get(key))
             if given is None:
-                self._report(where, ModelError(key, "null", f"must be given, here or for each mounted camera as {key}"))
+                rule = f"must be given, here or for each mounted camera as {key}"
+                self._report_input(camera, ModelError(key, "null", rule))
             elif key == "address" and has_password(str(given)):
                 rule = "must not contain user or password: write user:password to a file, and name that as credentials"
-                self._report(where, ModelError(key, repr(redacted(given)), rule))
+                self._report_input(camera, ModelError(key, repr(redacted(given)), rule))
             elif key == "topic" and not TOPIC.fullmatch(str(given)):
-                self._report(where, ModelError(key, repr(given), TOPIC_RULE))
+                self._report_input(camera, ModelError(key, repr(given), TOPIC_RULE))
 
     def _check_files(self, camera: Camera) -> None:
         """Check that the clip or bag that a camera's source plays can be read."""
@@ -344,8 +311,12 @@ class Builder:
 
         error = (clip_problem(camera) if self.files else None) or (bag_problem(camera) if self.bags else None)
         if error:
-            where = ("cameras", camera.name) if error.key in camera.mount else self._of(camera.name, "source")
-            self._report(where, error)
+            self._report_input(camera, error)
+
+    def _report_input(self, camera: Camera, error: ModelError) -> None:
+        """Report a problem of what a camera's source plays or connects to: its own, or that of the source."""
+        key = error.key if error.key in camera.mount else f"source.{error.key}"
+        self._report(("cameras", camera.name), ModelError(key, error.found, error.rule, "bag", "source.bag"))
 
     def _check_compiles(self, camera: Camera, media: Media, index: int, recording: Recording | None) -> None:
         """Check that everything that source, graph and recording refer to exists."""
@@ -361,35 +332,31 @@ class Builder:
         except ModelError as broken:
             errors = [broken]
         for error in errors:
-            section, _, key = error.key.partition(".")
-            self._report(self._of(camera.name, section), ModelError(key, error.found, error.rule))
-
-    def _of(self, camera: str, section: str) -> schema.Path:
-        """Path of a camera's graph or source: its own, otherwise the common one."""
-        data = self.composed.document["cameras"][camera]
-        return ("cameras", camera, section) if isinstance(data, dict) and section in data else (section,)
+            self._report(("cameras", camera.name), error)
 
     def _check_places(self, cameras: Mapping[str, Camera]) -> None:
         """Check that no tile of the page overlaps another one."""
         places = {name: camera.place for name, camera in cameras.items() if camera.place}
-        for name, rule in overlapping(places):
+        for name, rule, other in overlapping(places):
             found = self.composed.document["cameras"][name]["place"]
-            self._report(("cameras", name), ModelError("place", found, rule))
+            self._report((), ModelError(f"cameras.{name}.place", found, rule, f"cameras.{other}.place"))
 
     def _check_ports(self, cameras: Mapping[str, Camera], servers: Mapping[str, int]) -> None:
         """Check that no two servers use the same port. Cameras count up from the first port of their graph."""
-        taken: dict[int, str] = {}
-        for path, port in servers.items():
+        taken: dict[int, tuple[str, str]] = {}  # whose a port is, and the key that states it
+        for key, port in servers.items():
             if port in taken:
-                self._report((), ModelError(path, str(port), f"is already the port of {taken[port]}"))
-            taken[port] = path
+                owner, other = taken[port]
+                self._report((), ModelError(key, str(port), f"is already the port of {owner}", other))
+            taken[port] = key, key
         for index, (name, camera) in enumerate(cameras.items()):
+            key = schema.dotted(self._place(("cameras", name), "graph.first_port"))
             port = camera.graph.settings.first_port + index
             if port in taken:
-                own = ("cameras", name) if "graph" in self.composed.document["cameras"][name] else ()
-                rule = f"camera {name} would get port {port}, already the port of {taken[port]}"
-                self._report(own, ModelError("graph.first_port", str(port - index), rule))
-            taken[port] = f"camera {name}"
+                owner, other = taken[port]
+                rule = f"camera {name} would get port {port}, already the port of {owner}"
+                self._report((), ModelError(key, str(port - index), rule, other))
+            taken[port] = f"camera {name}", key
 
     def _check_rtp_ports(self, cameras: Mapping[str, Camera], media: Media) -> None:
         """Check that each camera behind the RTSP server finds its ports: an even one for RTP, the next for RTCP."""
@@ -431,7 +398,8 @@ def _capture(source: Source, data: Mapping[str, Any]) -> Capture:
     controls = {**source.capture.get("controls", {}), **own.get("controls", {})}
     for key in ("width", "height", "fps"):
         if key in requested and "format" not in requested:
-            raise ModelError("capture.format", "null", f"must be given where {key} is")
+            stated = (f"capture.{key}", f"source.capture.{key}")
+            raise ModelError("capture.format", "null", f"must be given where {key} is", *stated)
     fps = requested.get("fps")
     size = _given(requested, ("format", "width", "height"))
     return Capture(**size, fps=None if fps is None else _rate(fps), controls=controls)
@@ -468,7 +436,8 @@ def _effort(data: Mapping[str, Any]) -> dict[str, Any]:
     effort = data.get("effort", ONLY_EFFORT)
     if effort not in known:
         expected = f"one of {', '.join(known)}" if known[1:] else known[0]
-        raise ModelError("effort", effort, f"must be {expected}, which this graph's encoder supports")
+        stated = ["efforts"] if is_used else []
+        raise ModelError("effort", effort, f"must be {expected}, which this graph's encoder supports", *stated)
     return dict(efforts.get(effort, {}))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,7 +34,6 @@ class Configuration:
     files     with that, also check that clips exist; None: if runnable
     bags      also check that configured bags have pictures of each camera; None: as files
     check     further check of a compiled plan, against the GStreamer registry
-    fits      sections already known to satisfy the schemas
 
     `setup()`, `pqos()`, `study()` and `experiment()` raise ConfigError with all problems of the vehicle, its settings
     and the parts requested so far.
@@ -49,9 +48,8 @@ class Configuration:
         files: bool | None = None,
         bags: bool | None = None,
         check: PlanCheck | None = None,
-        fits: Collection[str] = (),
     ) -> None:
-        self._composed, self._user, self._runnable, self._check, self._fits = composed, user, runnable, check, fits
+        self._composed, self._user, self._runnable, self._check = composed, user, runnable, check
         self._files = runnable if files is None else files
         self._bags = self._files if bags is None else bags
         self._bases = [*conf_directories(user), Path.cwd()]  # directories of relative paths
@@ -124,7 +122,7 @@ class Configuration:
 
     @cached_property
     def _builder(self) -> Builder:
-        return Builder.of(self._composed, self._runnable, self._files, self._bags, self._check, self._fits)
+        return Builder.of(self._composed, self._runnable, self._files, self._bags, self._check)
 
 
 def _directory(overrides: Sequence[str], user: Path | str | None) -> tuple[Sequence[str], Path | None]:

@@ -45,7 +45,7 @@ def layout_problems(path: Path) -> Iterator[Problem]:
     wrong = {f.path[:2] for f in found}
     for vehicle, cameras in _sections(document, "vehicles"):
         if ("vehicles", vehicle) not in wrong:
-            for name, rule in overlapping(_places(cameras)):
+            for name, rule, _ in overlapping(_places(cameras)):
                 yield Problem(label(path), f"vehicles.{vehicle}.{name}", schema.shown(cameras[name]), rule)
     for vehicle, places in _sections(document, "drive"):
         if ("drive", vehicle) not in wrong and (twice := _twice(places)):
@@ -155,7 +155,7 @@ def places_problem(vehicle: Vehicle, document: Any) -> str | None:
     """The problems of places for a vehicle's cameras, in one line; None if they are valid."""
     if problem := schema.places_problem(document) or _unknown(vehicle, document):
         return problem
-    return "; ".join(f"{name}: {rule}" for name, rule in overlapping(_places(document))) or None
+    return "; ".join(f"{name}: {rule}" for name, rule, _ in overlapping(_places(document))) or None
 
 
 def drive_places_problem(vehicle: Vehicle, document: Any) -> str | None:

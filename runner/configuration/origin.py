@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from runner import schema
 from runner.configuration.interpolation import value_at
 from runner.errors import Problem
 
-PICKED = "picked"  # package, or prefix of its name, in which a group's file is composed alone
+PICKED = "picked"  # package in which a group's file is composed alone
 GRAPH_PARTS = {"encoder": "vehicle", "sender": "vehicle", "receiver": "operator"}  # and the list that includes each
 
 
@@ -45,15 +45,25 @@ class Composed:
     parts: list[Part] = field(default_factory=list)
     moved: Mapping[schema.Path, schema.Path] = field(default_factory=dict)
 
-    def problem(self, path: schema.Path, found: str | None, rule: str) -> Problem:
-        """A problem, attributed to its file or override, with the path inside that."""
+    def problem(self, path: schema.Path, found: str | None, rule: str, others: Iterable[schema.Path] = ()) -> Problem:
+        """A problem, attributed to its file or override, with the path inside that.
+
+        others  paths of further values that the rule is about, of which the first from each other file is named
+        """
+        part, inside = self._stated(path)
+        named = {part.file: ""}
+        for other in others:
+            if (value := value_at(self.document, other)) is not None:
+                its, where = self._stated(other)
+                place = its.name if its.word else f"{its.file}: {schema.dotted(where)}: {schema.shown(value)}"
+                named.setdefault(its.file, f"; see {place}")
+        return Problem(part.file, schema.dotted(inside), found, rule + "".join(named.values()))
+
+    def _stated(self, path: schema.Path) -> tuple[Part, schema.Path]:
+        """The part that a value of the document comes from, and its path in there."""
         path = self.written(path)
         part = self._origin(path)
-        return Problem(part.file, schema.dotted(path[len(part.package) :]), found, rule)
-
-    def later_parts(self, path: schema.Path) -> list[Part]:
-        """The parts that take precedence over the one that the value comes from, the last one first."""
-        return self.parts[: self._age(self.written(path))]
+        return part, path[len(part.package) :]
 
     def stated_by(self, path: schema.Path) -> Part | None:
         """The part that states a value of the document, itself or by an interpolation; None: none does."""
@@ -74,8 +84,7 @@ class Composed:
         used = {(path[:-2], origin[-2]) for path, origin in self.moved.items()}
         mounts = self.document.get("cameras")
         names = mounts if isinstance(mounts, dict) else ()
-        picked = ((key,) for key in self.document if str(key).startswith(PICKED))
-        for place in (("graph",), *picked, *(("cameras", name, "graph") for name in names)):
+        for place in (("graph",), (PICKED,), *(("cameras", name, "graph") for name in names)):
             graph = value_at(self.document, place)
             given = [key for key in GRAPH_PARTS if key in graph] if isinstance(graph, dict) else []
             for key in given:
@@ -110,25 +119,6 @@ class Composed:
             if any(isinstance(_value_in(part, place), list) for place in lists):
                 return self.parts[: index + 1]
         return self.parts
-
-
-def merged(parts: Sequence[Part]) -> dict[str, Any]:
-    """All parts in one document, as OmegaConf merges them: mappings key by key, anything else as a whole."""
-    document: dict[str, Any] = {}
-    for part in reversed(parts):
-        content = {key: value for key, value in (part.content or {}).items() if key != "defaults" or part.path is None}
-        _merge(document, nested(".".join(map(str, part.package)), content) if part.package else content)
-    return document
-
-
-def _merge(document: dict[str, Any], added: Mapping[str, Any]) -> None:
-    for key, value in added.items():
-        if isinstance(value, dict):
-            inner = document[key] if isinstance(document.get(key), dict) else {}
-            document[key] = dict(inner)
-            _merge(document[key], value)
-        else:
-            document[key] = value
 
 
 def _states(part: Part, path: schema.Path, value: Any) -> bool:

@@ -105,9 +105,10 @@ def check_order(mode: Mode, calls: Sequence[RuleCall]) -> list[ModelError]:
     for call in calls:
         where, rule = f"{mode}.{call.name}", call.rule
         for part in sorted(rule.needs - given):
-            problems.append(ModelError(where, None, f"needs {part}, which no earlier rule gives"))
+            problems.append(ModelError(where, None, f"needs {part}, which no earlier rule gives", f"{mode}"))
         for part in sorted(rule.gives & used.keys()):
-            problems.append(ModelError(where, None, f"gives {part}, must come before {used[part]}, which uses it"))
+            broken = f"gives {part}, must come before {used[part]}, which uses it"
+            problems.append(ModelError(where, None, broken, f"{mode}.{used[part]}"))
         # A rule that gives a part again passes it on: those after it use the new one.
         used = {**dict.fromkeys((rule.needs & given | rule.uses) - rule.gives, call.name), **used}
         given |= rule.gives

@@ -50,11 +50,14 @@ Share = Annotated[float, Limits(0, 1)]
 
 
 class ModelError(ValueError):
-    """A broken rule: the value found at `key` (a path below the object being built), and the rule."""
+    """A broken rule: the value found at `key` (a path below the object being built), and the rule.
 
-    def __init__(self, key: str, found: object, rule: str) -> None:
+    others  keys of further values that the rule is about
+    """
+
+    def __init__(self, key: str, found: object, rule: str, *others: str) -> None:
         super().__init__(f"{key}: {found}: {rule}")
-        self.key, self.found, self.rule = key, found, rule
+        self.key, self.found, self.rule, self.others = key, found, rule, others
 
 
 def exact(number: float | str | Fraction) -> Fraction:
@@ -154,7 +157,8 @@ class RateQualityModel:
         if not factors:
             raise ModelError("scaling", factors, "must have at least one factor")
         if len(factors) != len(bounds):
-            raise ModelError("b_min_kbps", bounds, f"must have {len(factors)} entries, one per scaling factor")
+            rule = f"must have {len(factors)} entries, one per scaling factor"
+            raise ModelError("b_min_kbps", bounds, rule, "scaling")
         if any(a >= b for a, b in pairwise(factors)):
             raise ModelError("scaling", factors, "must be strictly increasing")
         if factors[0] <= 0 or factors[-1] > 1:
@@ -162,7 +166,8 @@ class RateQualityModel:
         if bounds[0] != 0 or any(a >= b for a, b in pairwise(bounds)):
             raise ModelError("b_min_kbps", bounds, "must start at 0 and be strictly increasing")
         if self.b_full <= self.b_min[-1]:
-            raise ModelError("b_full_kbps", plain(self.b_full), f"must be above the last b_min, {bounds[-1]}")
+            rule = f"must be above the last b_min, {bounds[-1]}"
+            raise ModelError("b_full_kbps", plain(self.b_full), rule, "b_min_kbps")
         whole = tuple(bound for bound in bounds if isinstance(bound, int))
         object.__setattr__(self, "whole_b_min", whole if len(whole) == len(bounds) else ())
         ends = [*bounds[1:], "..."]
@@ -251,25 +256,30 @@ class Graph:
             check_unique(side, [element.name for element in elements])
         if self.transport == "rtsp" and self.vehicle[-1].name != "pay0":
             rule = "the last element must be named pay0, as the RTSP server requires"
-            raise ModelError("vehicle", repr(self.vehicle[-1].name), rule)
+            last = f"vehicle[{len(self.vehicle) - 1}].name"
+            raise ModelError("vehicle", repr(self.vehicle[-1].name), rule, last, "transport")
         for knob, targets in self.knobs.items():
             for index, target in enumerate(targets):
                 if target.element not in names:
                     rule = f"no such element{suggest(target.element, names)}"
-                    raise ModelError(f"knobs.{knob}[{index}].element", repr(target.element), rule)
+                    known = (f"vehicle[{place}].name" for place in range(len(self.vehicle)))
+                    raise ModelError(f"knobs.{knob}[{index}].element", repr(target.element), rule, *known)
         if self.key_frame == "caps" and [target.property for target in self.knobs["size"]] != ["caps"]:
-            raise ModelError("key_frame", "'caps'", "needs a knob `size` that sets the caps of one element")
+            raise ModelError(
+                "key_frame", "'caps'", "needs a knob `size` that sets the caps of one element", "knobs.size"
+            )
         turned = {(target.element, target.property) for targets in self.knobs.values() for target in targets}
         for index, pair in enumerate(self.mutable):
             if pair not in turned:
-                raise ModelError(f"mutable[{index}]", repr(".".join(pair)), "no knob sets this property")
+                raise ModelError(f"mutable[{index}]", repr(".".join(pair)), "no knob sets this property", "knobs")
 
 
 def check_unique(key: str, names: list[str]) -> None:
     """raises ModelError if two elements of a list have the same name"""
     for index, name in enumerate(names):
         if name in names[:index]:
-            raise ModelError(f"{key}[{index}].name", repr(name), "is already the name of another element")
+            rule = "is already the name of another element"
+            raise ModelError(f"{key}[{index}].name", repr(name), rule, f"{key}[{names.index(name)}].name")
 
 
 @dataclass(frozen=True, slots=True)
@@ -313,7 +323,7 @@ class Source:
         if (self.plays_bags or self.subscribes) and self.elements[0].factory != "appsrc":
             of = "a bag" if self.plays_bags else "a topic"
             rule = f"must be appsrc: the pictures of {of} are pushed into the first element"
-            raise ModelError("elements[0].element", repr(self.elements[0].factory), rule)
+            raise ModelError("elements[0].element", repr(self.elements[0].factory), rule, "bag", "ros")
 
     @property
     def needs(self) -> frozenset[str]:
@@ -384,12 +394,12 @@ class Place:
         return rows and columns
 
 
-def overlapping(places: Mapping[str, Place]) -> Iterator[tuple[str, str]]:
-    """Cameras whose tile overlaps an earlier camera's, each with the rule that it breaks."""
+def overlapping(places: Mapping[str, Place]) -> Iterator[tuple[str, str, str]]:
+    """Cameras whose tile overlaps an earlier camera's, each with the rule that it breaks, and that camera."""
     for count, (name, place) in enumerate(places.items()):
         overlapped = next((other for other, its in islice(places.items(), count) if place.overlaps(its)), None)
         if overlapped is not None:
-            yield name, f"overlaps the place of camera {overlapped}"
+            yield name, f"overlaps the place of camera {overlapped}", overlapped
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -439,11 +449,13 @@ class Camera:
             width, height = self.native
             if self.crop.x + self.crop.width > width or self.crop.y + self.crop.height > height:
                 found = f"{self.crop.width}x{self.crop.height} at {self.crop.x},{self.crop.y}"
-                raise ModelError("native", found, f"must lie inside the native {width}x{height}")
+                rule = f"must lie inside the native {width}x{height}"
+                side = "width_px" if self.crop.x + self.crop.width > width else "height_px"
+                raise ModelError("native", found, rule, side)
         frames = self.graph.settings.vbv_frames or 0.0
         if 1000 * frames > MOST_BUFFER_MS * self.fps:
             rule = f"with vbv_frames {frames:g} of its graph it must be at least {1000 * frames / MOST_BUFFER_MS:g}"
-            raise ModelError("fps", plain(self.fps), rule)
+            raise ModelError("fps", plain(self.fps), rule, "graph.vbv_frames", "fps_max")
 
     @property
     def source_size(self) -> tuple[int, int]:

@@ -112,13 +112,14 @@ def _check_elements(elements: tuple[Element, ...], where: str) -> Iterator[Model
         for key, value in element.properties.items():
             problem = _property_problem(element.factory, key, value)
             if problem:
-                yield ModelError(f"{path}.properties.{key}", _shown(value), problem)
+                yield ModelError(f"{path}.properties.{key}", _shown(value), problem, f"{path}.element")
 
 
 def _check_knobs(plan: Plan) -> Iterator[ModelError]:
     """Each knob's property must exist, be mutable while PLAYING and accept the knob's largest value."""
     camera = plan.camera
     factories = {element.name: element.factory for element in (*plan.source, *plan.vehicle)}
+    stated = {element.name: f"graph.vehicle[{place}].element" for place, element in enumerate(plan.vehicle)}
     largest: dict[str, KnobValue] = {
         "sending": True,
         "roi": camera.full_roi,
@@ -134,10 +135,10 @@ def _check_knobs(plan: Plan) -> Iterator[ModelError]:
             path = f"graph.knobs.{knob}[{index}]"
             rule = _property_problem(factory, key, filled)
             if rule:
-                yield ModelError(f"{path}.property", repr(key), rule)
+                yield ModelError(f"{path}.property", repr(key), rule, stated[name])
             elif not _may_change(element, key) and (name, key) not in camera.graph.mutable:
                 rule = f"{factory} does not declare {key} as mutable while playing; if it is, list it under mutable"
-                yield ModelError(f"{path}.property", repr(key), rule)
+                yield ModelError(f"{path}.property", repr(key), rule, stated[name])
 
 
 def _may_change(element: Gst.Element, key: str) -> bool:
@@ -147,12 +148,13 @@ def _may_change(element: Gst.Element, key: str) -> bool:
 
 def _check_links(plan: Plan, parts: Collection[str]) -> list[ModelError]:
     """Check that neighbouring elements can be linked."""
-    errors: dict[str, str] = {}
+    errors: dict[str, ModelError] = {}
     for where, line in _lines(plan, parts):
         if where not in errors and (message := _unlinkable(line)):
             part = plan.operator if where == "graph.operator" else (*plan.source, *plan.vehicle)
-            errors[where] = message + _misfit(message, [(each.name, each.factory) for each in part])
-    return [ModelError(where, None, message) for where, message in errors.items()]
+            message += _misfit(message, [(each.name, each.factory) for each in part])
+            errors[where] = ModelError(where, None, message, *(f"{where}[{place}].name" for place in range(len(part))))
+    return list(errors.values())
 
 
 def _lines(plan: Plan, parts: Collection[str]) -> Iterator[tuple[str, str]]:

@@ -171,7 +171,7 @@ def build_track(settings: Mapping[str, Any], bases: Sequence[Path]) -> Track | N
     match kind := position.get("kind"):
         case "route":
             if settings.get("kind") != "map":
-                raise ModelError("position.kind", kind, "needs kind: map, whose points it drives through")
+                raise ModelError("position.kind", kind, "needs kind: map, whose points it drives through", "kind")
             with within("position"):
                 speed = number(position, "speed_mps", positive=True)
             from runner.pqos.table import read_map

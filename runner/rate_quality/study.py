@@ -45,7 +45,7 @@ class Study:
         if any(a >= b for a, b in pairwise(self.rates)):
             raise ModelError("bitrates_kbps", list(self.rates), "must be strictly increasing")
         if self.scheduler and self.workers != "dask":
-            raise ModelError("scheduler", repr(self.scheduler), "requires workers=dask")
+            raise ModelError("scheduler", repr(self.scheduler), "requires workers=dask", "workers")
 
 
 def read_study(data: Mapping[str, Any]) -> Study:
