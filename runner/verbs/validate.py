@@ -292,7 +292,6 @@ class _Tasks:
         searched = self._directories if everything else self._directories[:-1]
         fixed = _fixed_groups(overrides)
         self._files = {group: options(group, searched) for group in GROUPS if group not in fixed}
-        self._vehicle_fixed = "vehicle" in fixed
         words = (word.lstrip("+").partition("=") for word in overrides)
         chosen = ((key.lstrip("/").partition("@")[0], name) for key, _, name in words)
         self._given = [each for each in chosen if each[0] in GROUPS and each[1] in options(each[0], self._directories)]
@@ -306,13 +305,10 @@ class _Tasks:
         for group, names in self._files.items():
             for name in names:
                 yield self._of_one_file(group, name)
-        vehicles: Sequence[str | None] = self._files.get("vehicle", [])
-        others: list[Sequence[str | None]] = [self._files.get(group) or [None] for group in CROSSED[1:]]
-        if self._vehicle_fixed or not (vehicles or self._everything):
-            vehicles = [None]
-        for combination in product(vehicles, *others):
+        crossed: list[Sequence[str | None]] = [self._files.get(group) or [None] for group in CROSSED]
+        for combination in product(*crossed):
             chosen = zip(CROSSED, combination, strict=True)
-            yield ValidationTask(self._overrides, tuple((group, one) for group, one in chosen if one))
+            yield ValidationTask(self._overrides, tuple((group, name) for group, name in chosen if name))
         if self._everything:
             yield from self._reached()
 
