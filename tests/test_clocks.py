@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runner.system.clocks import KEPT_S, ClockComparison, ClockDifference, Exchange, latency
+from runner.operator.latency import corrected
+from runner.system.clocks import KEPT_S, ClockComparison, ClockDifference, Exchange
 
 EVERY_S = 0.2
 SLACK_S = 1e-4  # more than the clocks may drift apart during an exchange of 0.1 s
@@ -153,7 +154,7 @@ def test_the_truth_is_within_the_bound_whatever_the_delays(
 
 def test_a_latency_is_known_if_both_clocks_are() -> None:
     clock = ClockDifference(ahead_s=3.7, bound_s=0.001)
-    assert latency(-3652.0, clock) == pytest.approx(48)
-    assert latency(-3652.0, None) is None
-    assert latency(None, clock) is None
-    assert latency(-3701.0, clock) == 0  # within the bound of 0, and never below
+    assert corrected(-3652.0, clock) == pytest.approx(48)
+    assert corrected(-3652.0, None) is None
+    assert corrected(None, clock) is None
+    assert corrected(-3701.0, clock) == 0  # within the bound of 0, and never below

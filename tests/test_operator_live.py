@@ -29,7 +29,7 @@ def operator(hangs: int, notes: list[str], samples: list[Any]) -> LiveOperator:
         state=object(),
         connect=lambda: None,
         close=lambda: None,
-        may_report=lambda: False,
+        link=SimpleNamespace(is_behind=lambda: True),
         sending=dict,
         take=samples.append,
         note=notes.append,

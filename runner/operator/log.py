@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 from runner.drive.log import Log
 from runner.operator.station import Listener, Station
 from runner.records import CameraSample, Note, Offline, Sample, VehicleState
-from runner.system.clocks import latency
-
-LONGEST_MS = 60_000.0  # of a frame that arrives: beyond, a clock was set in between
 
 
 class DriveLog(Listener):
@@ -31,17 +27,10 @@ class DriveLog(Listener):
         self._log.note(note.text)
 
     def _with_arrivals(self, name: str, camera: CameraSample) -> CameraSample:
-        received: Any = self._station.samples[name]
-        arrivals = tuple(self._arrival(name, *arrival) for arrival in received.arrivals)
+        arrivals = tuple(self._arrival(name, *arrival) for arrival in self._station.samples[name].arrivals)
         return replace(camera, arrivals=arrivals)
 
     def _arrival(self, name: str, arrived: float, captured: float | None) -> tuple[float, float | None]:
         """Arrival time of a unit, s since the beginning, and its latency since capture, ms."""
-        clock = self._station.clock
-        ms = None
-        if captured is not None and clock is not None and not self._station.untimed(name):
-            apart_ms = 1000 * (arrived - captured)
-            if latency(apart_ms, clock) is not None and apart_ms + 1000 * clock.ahead_s < LONGEST_MS:
-                # May be negative within the bound, so that a reader can recover the capture time.
-                ms = round(apart_ms + 1000 * clock.ahead_s, 2)
-        return round(arrived - self._log.time, 4), ms
+        ms = self._station.latency.to_arrival_ms(name, arrived, captured)
+        return round(arrived - self._log.time, 4), None if ms is None else round(ms, 2)

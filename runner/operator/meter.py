@@ -6,55 +6,16 @@ from collections import deque
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 from statistics import median
-from typing import Protocol
+from typing import TYPE_CHECKING
+
+from runner.records import CameraState
+
+if TYPE_CHECKING:
+    from runner.apply import Reception
 
 WINDOW_S = 1.0
 MOST_WINDOWS = 10_800  # three hours: a side may run for weeks
 SETTLE_S = 1.5  # a window is compared only if the decision is older: window length plus settling of the rate control
-
-
-class StreamCounters(Protocol):
-    """Running counters of one camera, from the receiver."""
-
-    @property
-    def frames(self) -> int: ...
-    @property
-    def bytes(self) -> int: ...
-    @property
-    def lost(self) -> int: ...
-    @property
-    def damaged(self) -> int: ...
-    @property
-    def buffer_ms(self) -> int | None: ...
-    @property
-    def foreign(self) -> int: ...
-    @property
-    def rebuilt(self) -> int: ...
-    @property
-    def width(self) -> int: ...
-    @property
-    def height(self) -> int: ...
-    @property
-    def latency_ms(self) -> float | None: ...
-    @property
-    def latency_at(self) -> float | None: ...
-    @property
-    def waited_ms(self) -> float | None: ...
-    @property
-    def decode_ms(self) -> float | None: ...
-
-
-class DecidedSetting(Protocol):
-    """What the vehicle has decided for a camera."""
-
-    @property
-    def sending(self) -> bool: ...
-    @property
-    def kbps(self) -> int: ...
-    @property
-    def width(self) -> int: ...
-    @property
-    def height(self) -> int: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,12 +40,12 @@ class ReceptionMeter:
     sizes: dict[tuple[int, int], int] = field(default_factory=dict)  # decided sizes that were received, with counts
     short: int = 0  # settled windows with too few frames for the camera's rate
     windows: int = 0
-    _past: deque[tuple[float, StreamCounters]] = field(default_factory=deque)
+    _past: deque[tuple[float, Reception]] = field(default_factory=deque)
     _decided: tuple[object, ...] | None = None
     _since: float = 0.0
     _counted: float = 0.0
 
-    def add(self, t: float, counters: StreamCounters, decided: DecidedSetting | None) -> MeasuredRates:
+    def add(self, t: float, counters: Reception, decided: CameraState | None) -> MeasuredRates:
         """Add a sample of the counters at time t, s; a few times a second."""
         target = (decided.sending, decided.kbps, decided.width, decided.height) if decided else None
         if target != self._decided:
@@ -107,7 +68,7 @@ class ReceptionMeter:
             (last.frames - first.frames) / (t1 - t0), (last.bytes - first.bytes) * 8 / 1000 / (t1 - t0)
         )
 
-    def _compare(self, rates: MeasuredRates, counters: StreamCounters, decided: DecidedSetting) -> None:
+    def _compare(self, rates: MeasuredRates, counters: Reception, decided: CameraState) -> None:
         self.windows += 1
         self.followed.append(rates.kbps / decided.kbps)
         self.short += rates.fps < 0.9 * self.fps

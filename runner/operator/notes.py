@@ -1,6 +1,8 @@
-"""A decision of the vehicle as one phrase for the operator. Pure."""
+"""What changes on the vehicle, as phrases for the operator. Pure."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
 
 from runner.core.events import EVENTS
 from runner.records import CameraState, VehicleState
@@ -20,6 +22,14 @@ CAUSES = {
     "source_reported": "{camera}'s source",
     "clock_advanced": "Time elapsed",
 }
+
+
+def change_notes(before: VehicleState, state: VehicleState) -> Iterator[str]:
+    """That the rules fail or decide again, and a decision."""
+    if state.fault != before.fault:
+        yield f"{state.fault}; the previous decision stays in force" if state.fault else "the rules decide again"
+    if text := decision_note(before, state):
+        yield text
 
 
 def decision_note(before: VehicleState, state: VehicleState) -> str | None:

@@ -36,17 +36,6 @@ class ClockDifference(NamedTuple):
     bound_s: float
 
 
-def latency(apart_ms: float | None, clock: ClockDifference | None) -> float | None:
-    """A latency, ms, within the error bound of `clock`; None if either is unknown, or they contradict each other.
-
-    apart_ms  time of the later event by this machine's clock minus that of the earlier by the other's, ms
-    """
-    if apart_ms is None or clock is None:
-        return None
-    found = apart_ms + 1000 * clock.ahead_s
-    return max(0.0, found) if found >= -1000 * (clock.bound_s + STEP_S) else None
-
-
 class _Interval(NamedTuple):
     """Bounds of the difference at a time, s."""
 

@@ -63,7 +63,8 @@ class Station(SimpleNamespace):
                 self.step(event="roi_set", camera=name, **roi)
         self.units = {name: self.encoded(name, picture) for name, picture in pictures.items()}
         told = {"note": print, "user": "anna", "answer_s": 1.0, "attention": None, "link_state": LinkState()}
-        super().__init__(state=self.published(), **told)
+        latency = SimpleNamespace(captured=lambda camera, at: at)  # both clocks are one
+        super().__init__(state=self.published(), latency=latency, **told)
 
     def step(self, **event):
         self.run = step(self.vehicle, self.run, parse({"t": 0, **event}))
@@ -100,9 +101,6 @@ class Station(SimpleNamespace):
         line += ["!", size, "!", "x264enc", "tune=zerolatency", "bitrate=8000", "!", stream, "!", "fdsink", "fd=1"]
         done = subprocess.run(line, input=picture, capture_output=True, check=True, timeout=60)
         return done.stdout
-
-    def captured_here(self, camera, captured):
-        return captured
 
     def ask(self, document, on_reply):
         self.last_request = document

@@ -266,8 +266,8 @@ def test_the_control_link_recovers_after_the_broker_has_hung(tmp_path):
                 resumed = time.monotonic()
                 until(lambda: station.take({}) is None and station.state, every_s=0.2)
                 assert time.monotonic() - resumed < 5
-                retained = station._vehicle_time  # it may be; a request as of a time that old would expire
-                until(lambda: station._vehicle_time != retained)
+                retained = station._requests.vehicle_time  # it may be; a request as of a time that old would expire
+                until(lambda: station._requests.vehicle_time != retained)
                 replies = []
                 station.ask({"event": "mode_selected", "mode": "collective"}, replies.append)
                 assert until(lambda: replies)[0].result == "applied"

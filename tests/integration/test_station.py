@@ -16,8 +16,9 @@ from runner.gst.receiver import Reception
 from runner.mqtt.broker import private_broker
 from runner.mqtt.link import ControlLink
 from runner.mqtt.messages import OFFLINE, topic
+from runner.operator.latency import stages
 from runner.operator.meter import MeasuredRates
-from runner.operator.station import SILENT_S, CameraRow, Listener, Station, _stages
+from runner.operator.station import SILENT_S, CameraRow, Listener, Station
 from runner.records import Arrival, Arrivals, CameraTelemetry
 from runner.settings import Endpoint
 from runner.verbs.table import _table
@@ -194,17 +195,17 @@ def test_latencies_are_right_though_the_vehicles_clock_is_ahead(both):
     station.take(fresh())
     assert {row.received.latency_ms for row in station.rows()} == {None}
     assert station.headline() == "delivery_robot, mode automatic, total 1500 kbit/s, latencies still unknown"
-    assert station.captured_here("front", 1000.0) is None
+    assert station.latency.captured("front", 1000.0) is None
     vehicle.clock_ahead_s = 3.7
-    report_until(station, vehicle, lambda: station.clock)
-    clock = station.clock
+    report_until(station, vehicle, lambda: station.latency.clock)
+    clock = station.latency.clock
     assert abs(clock.ahead_s - 3.7) <= clock.bound_s
     report_until(station, vehicle, lambda: station.samples["front"].latency_ms is not None)
-    clock, sample = station.clock, listener.received[-1][1]
+    clock, sample = station.latency.clock, listener.received[-1][1]
     for camera in sample.cameras.values():
         assert abs(camera.latency_ms - 40) <= sample.clock_bound_ms + 1
-    assert abs(station.captured_here("front", 1003.7) - 1000) <= clock.bound_s
-    expected = f", latencies ± {1000 * station.clock.bound_s:.1f} ms"
+    assert abs(station.latency.captured("front", 1003.7) - 1000) <= clock.bound_s
+    expected = f", latencies ± {1000 * station.latency.clock.bound_s:.1f} ms"
     assert station.headline() == f"delivery_robot, mode automatic, total 1500 kbit/s{expected}"
 
 
@@ -241,12 +242,12 @@ def test_a_steering_angle_is_passed_on_with_its_time_by_this_machines_clock(both
     station.listeners.append(Steered())
     vehicle.clock_ahead_s = 3.7
     vehicle.publish("steering", {"at": time.time() + 3.7, "rad": 0.1})
-    report_until(station, vehicle, lambda: station.clock)
+    report_until(station, vehicle, lambda: station.latency.clock)
     at = time.time()
     vehicle.publish("steering", {"at": at + 3.7 + 60, "rad": 0.2})
     vehicle.publish("steering", {"at": at + 3.7, "rad": 0.3})
     until(lambda: received)
-    assert received == [(pytest.approx(at, abs=station.clock.bound_s + 1e-3), 0.3)]
+    assert received == [(pytest.approx(at, abs=station.latency.clock.bound_s + 1e-3), 0.3)]
 
 
 def test_the_heartbeat_states_the_drivers_attention(both):
@@ -301,38 +302,38 @@ def test_the_latency_of_a_source_without_capture_times_is_unknown(both):
         until(step, every_s=0.05)
 
     vehicle.clock_ahead_s = 3.7
-    reach(lambda: station.clock and station.samples["rear"].latency_ms is not None)
+    reach(lambda: station.latency.clock and station.samples["rear"].latency_ms is not None)
     reach(lambda: "latency_ms" in vehicle.reports[-1])
-    assert station.captured_here("rear", 1003.7) is not None
+    assert station.latency.captured("rear", 1003.7) is not None
     rear = {**STATE["cameras"]["rear"], "untimed": True}
     vehicle.publish("state", {**STATE, "t": 2.0, "cameras": {**STATE["cameras"], "rear": rear}})
-    reach(lambda: station.untimed("rear") and "latency_ms" not in vehicle.reports[-1])
+    reach(lambda: station.latency.untimed("rear") and "latency_ms" not in vehicle.reports[-1])
     shown = listener.received[-1][1].cameras
     assert shown["rear"].latency_ms is None
     assert shown["front"].latency_ms is not None
-    assert station.captured_here("rear", 1003.7) is None
-    assert station.captured_here("front", 1003.7) is not None
+    assert station.latency.captured("rear", 1003.7) is None
+    assert station.latency.captured("front", 1003.7) is not None
 
 
 def test_duplicate_or_unrequested_clock_answers_are_ignored(both):
     station, vehicle, _ = both
-    report_until(station, vehicle, lambda: station.clock)
-    before, answer = station.clock, vehicle.answers[-1]
+    report_until(station, vehicle, lambda: station.latency.clock)
+    before, answer = station.latency.clock, vehicle.answers[-1]
     vehicle.publish("clock", {**answer, "received": answer["received"] + 9, "answered": answer["answered"] + 9})
     vehicle.publish("clock", {"sent": 12.5, "received": 99.0, "answered": 99.0, "set_s": 0.0, "error_s": None})
     dropped = station.link.dropped
     vehicle.publish("clock", {**answer, "sent": "yesterday"})
     until(lambda: station.link.dropped > dropped)  # the last of three, in order
     station.take(fresh())
-    assert abs(station.clock.ahead_s - before.ahead_s) < 1
+    assert abs(station.latency.clock.ahead_s - before.ahead_s) < 1
 
 
 def test_a_vehicle_that_stops_stating_its_clock_is_reported_once(both, monkeypatch):
     monkeypatch.setattr("runner.system.clocks.KEPT_S", 0.3)
     station, vehicle, listener = both
-    report_until(station, vehicle, lambda: station.clock)
+    report_until(station, vehicle, lambda: station.latency.clock)
     vehicle.states_clock = False
-    until(lambda: [vehicle.publish("telemetry", TELEMETRY), station.take(fresh()), not station.clock][-1])
+    until(lambda: [vehicle.publish("telemetry", TELEMETRY), station.take(fresh()), not station.latency.clock][-1])
     station.take(fresh())
     assert listener.received[-1][1].clock_bound_ms is None
     assert {row.received.latency_ms for row in station.rows()} == {None}
@@ -423,5 +424,5 @@ def test_the_table_shows_the_names_of_cameras_on_a_narrow_terminal(width):
 def test_no_part_of_a_latency_is_negative():
     """The parts are those of other pictures than the sum."""
     received = Reception(waited_ms=30.0, decode_ms=20.0, latency_ms=40.0)
-    stages = _stages(received, CameraTelemetry({}, 1, 1, capture_ms=5.0, encode_ms=6.0))
-    assert (stages.link, stages.buffer) == (None, 30.0)
+    parts = stages(received, CameraTelemetry({}, 1, 1, capture_ms=5.0, encode_ms=6.0))
+    assert (parts.link, parts.buffer) == (None, 30.0)
