@@ -37,8 +37,10 @@ from runner.security.keyring import Person
 from runner.system.reports import MOST_OF_PEER
 from runner.vehicle.access import Access
 from runner.vehicle.inbox import QueuedReport, Request
-from runner.vehicle.loop import REFUSALS, UNSEEN_REASONS_S, ControlLoop
+from runner.vehicle.loop import ControlLoop
 from runner.vehicle.operators import SILENT_S
+from runner.vehicle.publishing import UNSEEN_REASONS_S
+from runner.vehicle.refusals import REFUSALS
 from stand_in import RecordingVehicle
 
 pytestmark = pytest.mark.slow  # seconds of real time
@@ -385,8 +387,8 @@ def test_a_repeated_request_is_not_answered_before_what_it_asks_for_is_applied(m
 
 def test_a_speed_is_published_for_a_shorter_time_than_its_position(monkeypatch: pytest.MonkeyPatch) -> None:
     """The vehicle may have braked since."""
-    monkeypatch.setattr("runner.vehicle.loop.SPEED_S", 1.0)
-    monkeypatch.setattr("runner.vehicle.loop.POSITION_S", 3.0)
+    monkeypatch.setattr("runner.vehicle.publishing.SPEED_S", 1.0)
+    monkeypatch.setattr("runner.vehicle.publishing.POSITION_S", 3.0)
     watched = Watched()
 
     def positions() -> list[Any]:
@@ -409,7 +411,7 @@ def test_a_sender_whose_requests_are_refused_is_answered_a_few_times_between_two
     for _ in range(50):
         watched.loop.take(Request("flood", {"event": "total_set", "kbps": -1}, outcomes.append))
     with watched.running():
-        until(lambda: watched.loop.refused >= 50)
+        until(lambda: watched.loop.refusals.count >= 50)
         time.sleep(0.3)
     assert REFUSALS <= len(outcomes) < 4 * REFUSALS
     assert {outcome.reason for outcome in outcomes} == {"kbps: -1: must be at least 0"}
@@ -424,12 +426,12 @@ def test_reports_of_a_revoked_operator_keep_nobody_present(tmp_path: Path, monke
         requests.ask("driver", {"event": "operator_connected"})
         until(lambda: "operator driver is present" in watched.reports)
         (tmp_path / keyring.PEOPLE).write_bytes(b"{}")
-        refused = watched.loop.refused
+        refused = watched.loop.refusals.count
         for _ in range(round(2 * SILENT_S / 0.05)):
             watched.loop.take(QueuedReport("driver", report))
             time.sleep(0.05)
         assert any(line.startswith("operator driver has been silent") for line in watched.reports)
-        assert watched.loop.refused > refused
+        assert watched.loop.refusals.count > refused
 
 
 def test_the_frames_that_an_operator_without_control_reports_are_not_logged(monkeypatch: pytest.MonkeyPatch) -> None:

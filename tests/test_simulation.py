@@ -22,7 +22,7 @@ from runner.drive.series import series
 from runner.drive.statistics import statistics
 from runner.link.bucket import Bucket
 from runner.link.policer import Policer
-from runner.simulation import control, drive, operator, vehicle
+from runner.simulation import drive, operator
 from runner.simulation.encoder import Encoder, EncoderModel
 from runner.simulation.families import FAMILIES, LEFT_OUT, generate
 from runner.simulation.figures import cuts, percentile
@@ -137,7 +137,6 @@ def test_what_is_modelled_has_the_numbers_of_the_real_sides() -> None:
 
     assert (drive.TICK_S, drive.TELEMETRY_S) == (loop.TICK_S, loop.TELEMETRY_TICKS * loop.TICK_S)
     assert drive.REPORT_S == live.REPORT_S
-    assert (control.STATE_S, control.REASONS_S, vehicle.KEY_FRAME_S) == (loop.STATE_S, loop.REASONS_S, loop.KEY_FRAME_S)
     assert (operator.TAIL_S, 1000 * operator.REORDER_S) == (arriving.TAIL_S, repair.REORDER_MS)
     assert (*(repair.ATTEMPTS, repair.CONGESTED, repair.CLEAR, repair.DECAY),) == (
         operator.ATTEMPTS,

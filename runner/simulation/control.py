@@ -5,13 +5,10 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 
-from msgspec import UNSET
-
 from runner.core.decision import Decision
-from runner.core.model import plain
 from runner.core.step import Run
 from runner.records import (
-    CameraState,
+    CameraReading,
     CameraTelemetry,
     Record,
     SpeedAdvice,
@@ -21,9 +18,9 @@ from runner.records import (
     to_json,
 )
 from runner.settings import Setup
+from runner.vehicle import publishing
+from runner.vehicle.publishing import REASONS_S, STATE_S
 
-# As in runner.vehicle.loop.
-STATE_S, REASONS_S = 0.2, 1.0
 SEGMENT, SEGMENT_HEADER = 1448, 52  # of TCP with time stamps over IPv4, bytes
 MESSAGE = 30  # of MQTT's own header with a topic, about
 
@@ -53,14 +50,8 @@ class ControlMessages:
 
 def vehicle_state(run: Run, t: float, cause: str) -> VehicleState:
     """The state as the vehicle publishes it, everything commanded being applied."""
-    decision, weights = run.decision, run.state.weights
-    cameras = {
-        name: CameraState.at(setting, plain(weights[name]), applied_to_json(name, run.commanded.get(name, {})), None)
-        for name, setting in decision.settings.items()
-    }
-    total, asked = plain(decision.total), plain(decision.asked)
-    believed = decision.believed or UNSET
-    return VehicleState(t, cause, decision.mode, total, asked, cameras, believed=believed)
+    cameras = {name: CameraReading(run.commanded.get(name, {})) for name in run.decision.settings}
+    return publishing.vehicle_state(run, cameras, t, cause)
 
 
 def segments(size: int) -> Iterator[int]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from msgspec import UNSET
@@ -16,12 +16,12 @@ from runner.records import ReceptionReport, ReceptionReported, SentFrame
 from runner.settings import Setup
 from runner.simulation.encoder import Encoder
 from runner.vehicle.operators import Operators
+from runner.vehicle.repair import KeyFrames
 from runner.vehicle.sending import SendingTimes
 from runner.vehicle.uplink import MeasuredUplink
 
 OPERATOR = "operator"  # id of the only one
 LOOK_S = 0.02  # between two looks at what the payloaders have sent
-KEY_FRAME_S = 0.5  # between two key frames that repair a camera's pictures, as in runner.vehicle.loop
 OnStep = Callable[[Run, Event, Run], None]
 
 
@@ -35,7 +35,7 @@ class SimulatedVehicle:
     on_step: OnStep
     on_report: Callable[[ReceptionReported], None]
     _sent: deque[tuple[str, SentFrame]] = field(default_factory=deque)  # that were not looked at yet
-    _key_frames: dict[str, float] = field(default_factory=dict)  # by camera, time of the last request for one
+    _key_frames: KeyFrames = field(default_factory=KeyFrames)
     _in_control: str = ""
 
     def __post_init__(self) -> None:
@@ -82,8 +82,10 @@ class SimulatedVehicle:
         if measured := self._uplink.take(reported):
             self.take(measured)
         if report.damaged is not UNSET:
-            for name in self._due(report.damaged, t):
-                self.encoders[name].key = True
+            encoders = {name: self.encoders[name] for name in report.damaged}
+            affected = (name for name, encoder in encoders.items() if encoder.sends and encoder.restarts)
+            for name in self._key_frames.due(affected, t):
+                encoders[name].key = True
 
     def _step(self, event: Event) -> None:
         before = self.run
@@ -101,11 +103,3 @@ class SimulatedVehicle:
             self.take(ControlPassed(t=t, operator=in_control))
         if bool(self._operators.present) != (self.run.state.operator_since is not None):
             self.take(OperatorConnected(t=t) if self._operators.present else OperatorDisconnected(t=t))
-
-    def _due(self, damaged: tuple[str, ...], t: float) -> Iterator[str]:
-        """Cameras that need a key frame now."""
-        for name in damaged:
-            encoder = self.encoders[name]
-            if encoder.sends and encoder.restarts and t - self._key_frames.get(name, -KEY_FRAME_S) >= KEY_FRAME_S:
-                self._key_frames[name] = t
-                yield name

@@ -7,10 +7,26 @@ import time
 from collections import Counter
 from collections.abc import Callable
 
+REPEAT_S = 10.0
 PERIOD_S = 3600.0
 MOST = 100  # texts in a period; further ones, and repeated ones, are only counted
 MOST_OF_PEER = 10  # of these
 LONGEST = 1000  # characters of a text
+
+
+class RepeatedReports:
+    """Passes on a text that is repeated, such as an ongoing fault, at most every REPEAT_S. To be used in one thread."""
+
+    def __init__(self, on_report: Callable[[str], None]) -> None:
+        self._on_report = on_report
+        self._reported: dict[str, float] = {}  # by text, when it was last passed on
+
+    def __call__(self, text: str) -> None:
+        now = time.monotonic()
+        self._reported = {known: at for known, at in self._reported.items() if now - at < REPEAT_S}
+        if text not in self._reported:
+            self._reported[text] = now
+            self._on_report(text)
 
 
 class LimitedReports:

@@ -36,6 +36,10 @@ class Request(NamedTuple):
     will: bool = False
     run: int | None = None
 
+    def reply(self, outcome: Outcome) -> None:
+        if self.answer:
+            self.answer(outcome)
+
     @property
     def queue(self) -> str:
         return self.sender

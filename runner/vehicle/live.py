@@ -268,7 +268,7 @@ class _VehicleControl:
         self._live.loop.publish_again()  # the broker may have published the last will, or lost everything
 
     def _on_request(self, message: MqttMessage) -> None:
-        if self._live.loop.overrun(message.sender):
+        if self._live.loop.refusals.overrun(message.sender):
             return
         parsed = read_request(message)
         reply = self._topic("reply", message.sender)
@@ -279,18 +279,18 @@ class _VehicleControl:
         will, run = is_will(parsed.identity), run_of(parsed.identity)
         request = Request(message.sender, parsed.document, answer, parsed.as_of, will, run)
         if parsed.problem:
-            self._live.loop.refuse(request, parsed.problem)
+            self._live.loop.refusals.refuse(request, parsed.problem)
         else:
             self._live.loop.take(request)
 
     def _on_reception(self, message: MqttMessage) -> None:
         received = time.time()
-        if self._live.loop.overrun(message.sender, reports=True):
+        if self._live.loop.refusals.overrun(message.sender, reports=True):
             return
         try:
             report = read_reception(message)
         except ValueError:
-            self._live.loop.reject(message.sender)
+            self._live.loop.refusals.reject(message.sender)
             raise
         clock_topic = self._topic("clock", message.sender)
 

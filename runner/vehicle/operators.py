@@ -10,12 +10,15 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
+from math import inf
 
 from runner.mqtt.messages import MAX_ROUND_TRIP_S
 
 SILENT_S = 1.0  # an operator that sends nothing for this long is offline; it normally sends four messages a second
 AHEAD_S = 0.1  # by how much `as_of` may exceed the vehicle's time: two monotonic clocks drift apart
 DELAYS = 64  # delays remembered of each operator; their minimum is the round trip
+CLOCK_S = 0.1  # between two answers about the clock to an operator, which asks five times a second
+PRESENT_S = 1.0  # a process of an operator that has reported within this time still runs
 MAX_OPERATORS = 64  # remembered; a new one replaces the one that has been silent longest
 
 
@@ -26,6 +29,8 @@ class _Operator:
     present: bool = False
     announced: bool = False
     signed_off: bool = False
+    clock_asked: float = -inf
+    runs: dict[int, float] = field(default_factory=dict)  # by process, when it last sent a reception report
     delays: deque[float] = field(default_factory=lambda: deque(maxlen=DELAYS))
 
 
@@ -123,6 +128,26 @@ class Operators:
     def overdue_s(self, name: str, t: float, as_of: float) -> float:
         """How much longer a message took than its sender's shortest round trip; see `expired`."""
         return max(0.0, t - as_of - min(self._operator(name, t).delays, default=0.0))
+
+    def reported(self, name: str, t: float, run: int) -> None:
+        """A process of an operator sent a reception report."""
+        operator = self._operator(name, t)
+        operator.runs = {each: at for each, at in operator.runs.items() if t - at < PRESENT_S} | {run: t}
+
+    def goes_on(self, name: str, t: float, ended: int | None) -> bool:
+        """Whether another process of an operator than the one that ends still sends reports; None: not stated which."""
+        operator = self._known.get(name)
+        if ended is None or operator is None:
+            return False
+        return any(t - at < PRESENT_S for run, at in operator.runs.items() if run != ended)
+
+    def may_ask_clock(self, name: str, t: float) -> bool:
+        """Whether to answer an operator that compares clocks: answers to a flood would fill the uplink."""
+        operator = self._operator(name, t)
+        if t - operator.clock_asked < CLOCK_S:
+            return False
+        operator.clock_asked = t
+        return True
 
     def _operator(self, name: str, t: float) -> _Operator:
         if name not in self._known:

@@ -14,10 +14,10 @@ from runner.core.events import LinkMeasured
 from runner.core.evidence import EvidenceMemory, LinkReport, ReceivedUnit, observe, rounded, summarise
 from runner.core.model import Graph, Vehicle, exact
 from runner.records import ReceptionReported, UnitReceived
+from runner.vehicle.operators import PRESENT_S
 
 ROUND_TRIPS = 64  # remembered; the smallest is the round trip
 LONGEST_S = 60.0  # upper limit of a reported round trip
-PRESENT_S = 1.0  # an operator's side that has reported within this time still runs
 
 
 @dataclass

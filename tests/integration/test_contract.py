@@ -15,7 +15,7 @@ from runner.mqtt.messages import topic
 from runner.operator.frames import live_frames
 from runner.operator.live import live_operator
 from runner.vehicle.live import live_vehicle
-from runner.vehicle.loop import KEY_FRAME_S
+from runner.vehicle.repair import KEY_FRAME_S
 from stand_in import RecordingOperator, RecordingVehicle
 
 # Without the measured link: a busy machine delays packets, which would lower the total.

@@ -1,0 +1,164 @@
+"""What the vehicle publishes of itself, and when: its state, telemetry, advised speed and steering angle."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+from msgspec import UNSET
+
+from runner.core.events import Attention, PositionReported, SteeringReported
+from runner.core.model import plain
+from runner.core.step import Run
+from runner.records import (
+    CameraReading,
+    CameraState,
+    CameraTelemetry,
+    Position,
+    SpeedAdvice,
+    SteeringAngle,
+    Telemetry,
+    VehicleState,
+    applied_to_json,
+)
+from runner.settings import LatencyLimit
+
+STATE_S = 0.2  # between two states, unless a request waits for its answer: each takes some kB of a limited link
+REASONS_S, UNSEEN_REASONS_S = 1.0, 10.0  # between two that differ in reasons only; the second without an operator
+STEERING_S = 0.05  # between two published steering angles: each costs the video 0.2 kB of the link
+UNSEEN = (Attention.HIDDEN, Attention.ABSENT)  # the driver sees no picture
+ADVICE_S = 0.2  # how long a reported latency, and the advice based on it, is valid
+POSITION_S = 5.0  # an older position is stale
+SPEED_S = 2.0  # an older speed is stale; receivers of GNSS report once a second or more often
+
+Publish = Callable[[VehicleState | Telemetry | SpeedAdvice | SteeringAngle], bool]
+
+
+@dataclass
+class Publisher:
+    """Used in one thread, except that any may set `again`: the broker may have lost the state.
+
+    publish   as in `runner.vehicle.loop.ControlLoop`
+    cause     the event that the decision in force came from
+    operator  the one in control, "" for none
+    latency   when a latency was last reported, s, and its value, ms
+    position  as last reported
+    """
+
+    limit: LatencyLimit
+    publish: Publish
+    cause: str = ""
+    operator: str = ""
+    latency: tuple[float, float | None] = (-ADVICE_S, None)
+    again: bool = False
+    position: PositionReported | None = None
+    _published: VehicleState | None = None  # the state as last published
+    _steering_published: float = -STEERING_S
+
+    def is_state_due(self, now: float) -> bool:
+        """Whether to publish the state if it has changed."""
+        return self._published is None or self.again or now - self._published.t >= STATE_S
+
+    def state(self, run: Run, cameras: Mapping[str, CameraReading], now: float, *, has_viewer: bool) -> None:
+        """Publish the decided and the applied values if either has changed.
+
+        has_viewer  whether an operator is present
+        """
+        state = vehicle_state(run, cameras, now, self.cause, self.operator)
+        if self._is_news(state, REASONS_S if has_viewer else UNSEEN_REASONS_S) and self.publish(state):
+            self.again, self._published = False, state
+
+    def _is_news(self, state: VehicleState, interval_s: float) -> bool:
+        """Whether to publish a state. Changed reasons or beliefs alone, which change all the time, are not urgent."""
+        last = self._published
+        if last is None or self.again:
+            return True
+        if state == last:
+            return False
+        return state.t - last.t >= interval_s or _without_reasons(state) != _without_reasons(last)
+
+    def telemetry(
+        self,
+        run: Run,
+        t: float,
+        cameras: Mapping[str, CameraReading],
+        stages: Mapping[str, tuple[float, float]],
+        refused: int,
+        errors: int,
+    ) -> Telemetry:
+        """What was read back from the elements, and what the encoders have output so far."""
+        measured = {
+            name: CameraTelemetry(
+                applied_to_json(name, camera.applied),
+                camera.frames,
+                camera.bytes,
+                *(round(ms, 2) for ms in stages.get(name, ())),
+            )
+            for name, camera in cameras.items()
+        }
+        prediction = run.state.prediction
+        predicted = plain(prediction.kbps) if prediction else None
+        position, factor = self._current_position(t), self._speed_factor(run, t)
+        return Telemetry(t, predicted, position, measured, refused, errors, factor)
+
+    def _current_position(self, t: float) -> Position | None:
+        """The position, while it is not stale; its speed becomes stale earlier."""
+        if self.position is None or (age_s := t - self.position.t) > POSITION_S:
+            return None
+        return Position.of(self.position if age_s <= SPEED_S else replace(self.position, speed_mps=None))
+
+    def steering(self, event: SteeringReported, now: float) -> None:
+        if event.t - self._steering_published >= STEERING_S:
+            self._steering_published = event.t
+            self.publish(SteeringAngle(round(time.time() - (now - event.t), 4), event.rad))
+
+    def advise(self, run: Run, t: float) -> None:
+        """Publish the speed that the latency of the operator's pictures allows; 0 without a recent report or driver."""
+        if (factor := self._speed_factor(run, t)) is not None:
+            _, measured_ms = self.latency
+            total_ms = (
+                None if not factor or measured_ms is None else round(measured_ms + (self.limit.fixed_ms or 0.0), 1)
+            )
+            self.publish(SpeedAdvice(t, factor, total_ms, ADVICE_S))
+
+    def _speed_factor(self, run: Run, t: float) -> float | None:
+        at, measured_ms = self.latency
+        is_seen = t - at <= ADVICE_S and run.state.attention not in UNSEEN
+        factor = self.limit.speed_factor(measured_ms if is_seen else None)
+        return None if factor is None else round(factor, 3)
+
+
+def vehicle_state(
+    run: Run, cameras: Mapping[str, CameraReading], t: float, cause: str, operator: str = ""
+) -> VehicleState:
+    """The state as the vehicle publishes it. operator: in control, "" for none."""
+    decision = run.decision
+    states = {
+        name: CameraState.at(
+            decision.settings[name],
+            plain(run.state.weights[name]),
+            applied_to_json(name, camera.applied),
+            camera.fault or camera.lost,
+            camera.untimed,
+            camera.slow_fps,
+        )
+        for name, camera in cameras.items()
+    }
+    return VehicleState(
+        t,
+        cause,
+        decision.mode,
+        plain(decision.total),
+        plain(decision.asked),
+        states,
+        run.fault,
+        attention=run.state.attention or UNSET,
+        operator=operator or UNSET,
+        believed=decision.believed or UNSET,
+    )
+
+
+def _without_reasons(state: VehicleState) -> VehicleState:
+    cameras = {name: replace(camera, reason="") for name, camera in state.cameras.items()}
+    return replace(state, cameras=cameras, believed=UNSET)
