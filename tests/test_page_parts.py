@@ -31,10 +31,11 @@ from runner.configuration.layout import NOWHERE, Layouts
 from runner.core.events import Attention
 from runner.core.roles import Role
 from runner.operator.station import LinkState
+from runner.page.access import LOGIN_POLICY, POLICY, hosts
 from runner.page.control import GRACE_S, Control, combined_attention, page_of
 from runner.page.history import MAX_SAMPLES, History
 from runner.page.login import COOKIE, PageLogin
-from runner.page.server import LOGIN_POLICY, POLICY, PageServer, hosts
+from runner.page.server import PageServer
 from runner.page.viewer import CATCH_UP, HEADER, KEY, MAX_UNITS, RESTART, PageViewer
 from runner.records import CameraSample, LatencyStages, Outcome, Position, Sample
 from runner.security import keyring
@@ -73,7 +74,7 @@ def served(*overrides, layouts=None, login=None, keyring=None, note=print):
     port = free_port()
     station = SimpleNamespace(state=None, note=note, user="anna", answer_s=1.0, attention=None, link_state=LinkState())
     page = PageServer(setup(f"page.port={port}", *overrides), station, layouts=layouts, keyring=keyring)
-    page._login = login or page._login
+    page._access.login = login or page._access.login
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("runner.page.server.UNRESPONSIVE_S", 60)
         page.start()
@@ -85,7 +86,7 @@ def served(*overrides, layouts=None, login=None, keyring=None, note=print):
 
 @pytest.mark.parametrize("begun", [b"", b"GET / HT", b"GET / HTTP/1.1\r\nHost: localhost\r\n", FULL + b"GET / H"])
 def test_a_request_that_is_never_finished_is_closed(monkeypatch, begun):
-    monkeypatch.setattr("runner.page.server.REQUEST_S", 0.3)
+    monkeypatch.setattr("runner.page.connections.REQUEST_S", 0.3)
     with served() as (port, _), socket.create_connection(("127.0.0.1", port), timeout=60) as line:
         line.sendall(begun.replace(b"PORT", str(port).encode()))
         with suppress(ConnectionResetError):
@@ -95,7 +96,7 @@ def test_a_request_that_is_never_finished_is_closed(monkeypatch, begun):
 
 def test_a_login_whose_body_never_comes_is_closed(monkeypatch):
     """The body is read before anybody has logged in."""
-    monkeypatch.setattr("runner.page.server.REQUEST_S", 0.3)
+    monkeypatch.setattr("runner.page.connections.REQUEST_S", 0.3)
     login = PageLogin(lambda: b"token")
     with served(login=login) as (port, _), socket.create_connection(("127.0.0.1", port), timeout=60) as line:
         own = f"Host: localhost:{port}\r\nOrigin: https://localhost:{port}\r\n"
@@ -167,7 +168,7 @@ def test_messages_are_ignored_once_the_token_is_replaced(monkeypatch):
 
 def test_connections_without_access_replace_each_other_and_close_none_with_access(monkeypatch):
     """Otherwise a stranger could take all descriptors of the process that shows the pictures."""
-    monkeypatch.setattr("runner.page.server.MAX_STRANGERS", 5)
+    monkeypatch.setattr("runner.page.connections.MAX_STRANGERS", 5)
     one = OneSession()
     with served(login=one.login) as (port, _), ExitStack() as stack:
 
@@ -241,7 +242,7 @@ def test_the_page_accepts_nothing_older_than_tls_1_3(keys, version):
 
 
 def test_a_handshake_that_never_ends_is_closed(keys, monkeypatch):
-    monkeypatch.setattr("runner.page.server.REQUEST_S", 0.3)
+    monkeypatch.setattr("runner.page.connections.REQUEST_S", 0.3)
     with (
         served(keyring=Keyring.of(keys.directory / "alice")) as (port, _),
         socket.create_connection(("127.0.0.1", port), timeout=60) as line,

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from typing import Protocol
 
 from runner.core.events import Attention
+from runner.page.viewer import PageViewer
 
 GRACE_S = 5.0  # a page that is reloaded within this time keeps control
 # The driver needs the pictures of every window but the focus in only one: the first of these that any reports counts.
@@ -55,23 +55,7 @@ class Control:
         return "another" if self._holder and self._closed_at is None else "nobody"
 
 
-class Window(Protocol):
-    """A browser's window.
-
-    token    of the page in it, or of the monitor
-    browser  random name that all windows of a browser share; "": none given
-    monitor  whether it shows some cameras for a page in another window of the same browser
-    """
-
-    @property
-    def token(self) -> str: ...
-    @property
-    def browser(self) -> str: ...
-    @property
-    def monitor(self) -> bool: ...
-
-
-def page_of(window: Window, windows: Sequence[Window], control: Control) -> str:
+def page_of(window: PageViewer, windows: Sequence[PageViewer], control: Control) -> str:
     """The token of the page that a window belongs to: its own, or for a monitor that of a page in the same browser.
 
     Of several pages it is the one in control, otherwise the newest. A monitor without a page has no control.

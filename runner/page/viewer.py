@@ -29,8 +29,8 @@ class PageViewer:
     token      its identity: a random name that the browser keeps across a reload
     cameras    indexes of the cameras that it shows
     burst      returns the units that bring a late decoder up to date; called only when the viewer is ready for them
-    browser    see `runner.page.control.Window`
-    monitor    see there
+    browser    random name that all windows of a browser share; "": none given
+    monitor    whether it shows some cameras for a page in another window of the same browser
     attention  whether its user can see the pictures; None: not reported yet
     focused    whether its browser's keys reach it
     selected   name of the selected camera; "": none yet

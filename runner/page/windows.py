@@ -1,0 +1,93 @@
+"""The open windows of all browsers: which of them are one page, and which page holds control."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+from runner.core.events import Attention
+from runner.page.control import Control, combined_attention, page_of
+from runner.page.viewer import PageViewer
+
+
+class Windows:
+    """In the page's thread.
+
+    on_attention  called with whether the driver can see the pictures, from the windows of the page in control
+    """
+
+    def __init__(self, on_attention: Callable[[Attention | None], None]) -> None:
+        self._viewers: list[PageViewer] = []  # the newest last
+        self._control = Control()
+        self._on_attention = on_attention
+
+    def __iter__(self) -> Iterator[PageViewer]:
+        return iter(self._viewers)
+
+    def add(self, viewer: PageViewer) -> None:
+        """A window connects; it does not know its page's selection yet."""
+        self._viewers.append(viewer)
+        viewer.selected = next((other.selected for other in self._others(viewer) if other.selected), "")
+
+    def opened(self, viewer: PageViewer, before: str | None) -> None:
+        """It has been told everything. before: as in `Control.on_opened`."""
+        if not viewer.monitor:
+            self._control.on_opened(viewer.token, time.monotonic(), before)
+        self.state_control()
+
+    def closed(self, viewer: PageViewer) -> None:
+        self._viewers.remove(viewer)
+        if viewer.token not in {other.token for other in self._viewers if not other.monitor}:
+            self._control.on_closed(viewer.token, time.monotonic())
+        self.state_control()
+
+    def broadcast(self, kind: str, message: Mapping[str, Any]) -> None:
+        for viewer in self._viewers:
+            viewer.post(kind, message)
+
+    def holder_for(self, viewer: PageViewer) -> str:
+        """The holder of control from a window's point of view: see `Control`."""
+        return self._control.holder_for(page_of(viewer, self._viewers, self._control))
+
+    def take_control(self, viewer: PageViewer) -> None:
+        self._control.take(viewer.token)
+        self.state_control()
+
+    def release_control(self, viewer: PageViewer) -> None:
+        self._control.release(viewer.token)
+        self.state_control()
+
+    def select(self, viewer: PageViewer, camera: str) -> None:
+        """Select a camera in all windows of a page."""
+        viewer.selected = camera
+        for other in self._others(viewer):
+            other.selected = camera
+            other.post("selection", {"camera": camera})
+
+    def state_control(self) -> None:
+        """Send each window the holder of control, and whether another window of its page has the focus or is hidden.
+
+        abandoned  nobody is in control because the page that was has closed
+        """
+        for viewer in self._viewers:
+            others = self._others(viewer)
+            elsewhere = any(other.focused for other in others)
+            covered = any(other.attention is Attention.HIDDEN for other in others)
+            holder = self.holder_for(viewer)
+            abandoned = holder == "nobody" and self._control.is_held
+            message = {"holder": holder, "abandoned": abandoned, "elsewhere": elsewhere, "covered": covered}
+            viewer.post("control", message)
+        self._on_attention(self._attention())
+
+    def _attention(self) -> Attention | None:
+        driving = [viewer for viewer in self._viewers if self.holder_for(viewer) == "you"]
+        if driving:
+            return combined_attention([viewer.attention for viewer in driving])
+        return Attention.ABSENT if self._control.is_held else None
+
+    def _others(self, viewer: PageViewer) -> list[PageViewer]:
+        """The other windows of a viewer's page."""
+        page = page_of(viewer, self._viewers, self._control)
+        others = (other for other in self._viewers if other is not viewer)
+        return [other for other in others if page_of(other, self._viewers, self._control) == page]
