@@ -29,6 +29,7 @@ from runner.gst.credentials import Login, log_in
 from runner.gst.decoders import DecoderWatch
 from runner.gst.ip_camera import follow_cameras
 from runner.gst.lost import LostCameras
+from runner.gst.opening import OnReport
 from runner.gst.outage import ReportMerger
 from runner.gst.pipeline import CameraPipeline
 from runner.gst.probes import PassingBuffer
@@ -43,7 +44,7 @@ from runner.gst.registry import (
     versions,
 )
 from runner.gst.rtspsrc import limit_teardown
-from runner.gst.server import CameraServer, OnReport
+from runner.gst.server import CameraServer
 from runner.gst.supervised import CameraCaller
 from runner.gst.timers import Guarded, every
 from runner.gst.video_files import VideoFile, VideoFiles
@@ -319,7 +320,7 @@ class VehicleSide:
     def give_control(self, operator: str) -> None:
         """Set which operator is in control, "" for none: its viewers are always admitted, see `runner.gst.viewers`."""
         if self._server:
-            self._server.controller = operator
+            self._server.admission.controller = operator
 
     def push(self, camera: str, frame: Any, form: str | None = None, captured: float | None = None) -> bool:
         """Push a frame of a camera whose frames come from Python; see `runner.live.LiveVehicle`."""

@@ -59,7 +59,7 @@ def patient_server() -> Iterator[None]:
     How long it really takes is tested where cameras are opened in any state, see test_server.py.
     """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("runner.gst.server.OPEN_S", 5.0)
+        patch.setattr("runner.gst.opening.OPEN_S", 5.0)
         yield
 
 

@@ -146,7 +146,7 @@ def test_a_camera_without_the_wanted_video_is_reported(media, words, why):
 )
 def test_a_camera_that_answers_slowly_is_awaited(monkeypatch, method, delay_s):
     """By one attempt, however long; its viewers are refused at once meanwhile."""
-    monkeypatch.setattr("runner.gst.server.OPEN_S", 0.3)  # as long as a viewer waits
+    monkeypatch.setattr("runner.gst.opening.OPEN_S", 0.3)  # as long as a viewer waits
     with mini_camera(delays_s={method: delay_s}) as camera, robot(camera.address) as (side, plan, reported):
         refused(plan)
         waiting = until(lambda: side.read()["rear"].fault)

@@ -20,8 +20,9 @@ from rtsp_client import RtspClient
 from runner.core.commands import Command
 from runner.graph import FEEDBACK
 from runner.gst import GLib, Gst
+from runner.gst.opening import ServedCameras
 from runner.gst.requests import AT_ONCE, KEY_UNIT_S, REPEATED
-from runner.gst.server import LAG_S, CameraServer
+from runner.gst.server import LAG_S
 from runner.gst.viewers import user_agent
 
 CAMERA, OTHER = "front_left", "front_right"
@@ -186,7 +187,7 @@ def test_opening_a_camera_in_any_state_is_answered_immediately(state, udp):
 
 @pytest.mark.alone
 def test_a_camera_that_delivers_nothing_is_answered_503_and_opens_when_it_delivers(monkeypatch):
-    monkeypatch.setattr("runner.gst.server.OPEN_S", 0.9)
+    monkeypatch.setattr("runner.gst.opening.OPEN_S", 0.9)
     with serving("source=appsrc") as vehicle, asking_options(vehicle, CAMERA) as took:
         with RtspClient(vehicle.url()) as client:
             began = time.monotonic()
@@ -202,18 +203,18 @@ def test_a_camera_that_delivers_nothing_is_answered_503_and_opens_when_it_delive
 
 def test_a_viewer_whose_time_is_up_does_not_count_a_camera_as_lost_that_has_just_opened(monkeypatch):
     """It opens between the end of a viewer's wait and the note about it."""
-    monkeypatch.setattr("runner.gst.server.SLOW_S", 0.1)
+    monkeypatch.setattr("runner.gst.opening.SLOW_S", 0.1)
     with serving("source=appsrc") as vehicle:
         with RtspClient(vehicle.url()) as client:
             assert client.open() == [503]
         assert vehicle.side.read()[CAMERA].lost
-        server = vehicle.side._server
-        camera = server._cameras[CAMERA]
+        cameras = vehicle.side._server._cameras
+        camera = cameras.named[CAMERA]
         until(lambda: vehicle.side.push(CAMERA, bytes(480 * 260 * 3 // 2)))
         until(lambda: camera.is_open)
         until(lambda: not vehicle.side.read()[CAMERA].lost)
         assert camera.opening  # until a viewer holds it
-        server._note_slow(camera)
+        cameras._note_slow(camera)
         assert not vehicle.side.read()[CAMERA].lost
 
 
@@ -228,7 +229,7 @@ def test_a_session_gets_one_copy_of_a_camera_by_whichever_of_its_paths(paths, ud
             viewer.ask("SETUP", f"{url}/stream=0", Transport=transport)
         played = [url for url in urls if viewer.ask("PLAY", url) == 200]
         assert len(played) == 1
-        stream = vehicle.side._server._cameras[SMALL_CAMERA].media.get_stream(0)
+        stream = vehicle.side._server._cameras.named[SMALL_CAMERA].media.get_stream(0)
         assert len(stream.transport_filter(None)) == 1
 
 
@@ -678,7 +679,7 @@ def test_a_pipeline_that_fails_with_viewers_is_torn_down_and_rebuilt(capfd):
 
 def test_an_element_that_fails_while_its_pipeline_stops_is_not_reported(monkeypatch):
     """Caps that change meanwhile are refused by elements that have already stopped."""
-    inform = CameraServer._on_target_state
+    inform = ServedCameras._on_target_state
 
     def fail(server, media, state, camera):
         inform(server, media, state, camera)
@@ -686,7 +687,7 @@ def test_an_element_that_fails_while_its_pipeline_stops_is_not_reported(monkeypa
             error = GLib.Error.new_literal(Gst.StreamError.quark(), "made to fail", Gst.StreamError.FAILED)
             camera.bus.post(Gst.Message.new_error(media.get_element(), error, "in a test"))
 
-    monkeypatch.setattr(CameraServer, "_on_target_state", fail)
+    monkeypatch.setattr(ServedCameras, "_on_target_state", fail)
     with serving(*SMALL, cameras=(SMALL_CAMERA,)) as vehicle:
         with watched(vehicle, SMALL_CAMERA):
             pass
@@ -783,7 +784,7 @@ def test_requests_for_key_frames_reach_the_encoder_once_a_second():
 )
 def test_a_camera_that_never_delivers_leaves_nothing(dead, monkeypatch):
     """Viewers try again for as long as it is dead."""
-    monkeypatch.setattr("runner.gst.server.OPEN_S", 0.9)
+    monkeypatch.setattr("runner.gst.opening.OPEN_S", 0.9)
     with serving(*SMALL, *dead, cameras=(SMALL_CAMERA,)) as vehicle:
         for _ in range(3):
             with RtspClient(vehicle.url(SMALL_CAMERA)) as viewer:
@@ -821,7 +822,7 @@ def test_the_reason_of_a_source_that_fails_is_reported_and_it_leaves_nothing():
 
 def test_idle_connections_take_no_descriptors_from_others(monkeypatch):
     """Without descriptors the library aborts the process."""
-    monkeypatch.setattr("runner.gst.server.MOST", 16)
+    monkeypatch.setattr("runner.gst.clients.MOST", 16)
     with serving(*SMALL, cameras=(SMALL_CAMERA,)) as vehicle, watched(vehicle, SMALL_CAMERA), ExitStack() as stack:
         address = ("127.0.0.1", vehicle.port)
         idle = [stack.enter_context(socket.create_connection(address, 5)) for _ in range(60)]
@@ -833,7 +834,7 @@ def test_idle_connections_take_no_descriptors_from_others(monkeypatch):
 
 def test_connections_that_only_send_requests_do_not_keep_a_viewer_out(monkeypatch):
     """They are not silent, but watch nothing: a request every few seconds would hold their places for good."""
-    monkeypatch.setattr("runner.gst.server.MOST", 16)
+    monkeypatch.setattr("runner.gst.clients.MOST", 16)
     with serving(*SMALL, cameras=(SMALL_CAMERA,)) as vehicle, ExitStack() as stack, watched(vehicle, SMALL_CAMERA):
         idle = [stack.enter_context(RtspClient(vehicle.url(SMALL_CAMERA))) for _ in range(15)]
         assert {client.ask("OPTIONS") for client in idle} == {200}

@@ -1,0 +1,101 @@
+"""Admits viewers to the cameras of the RTSP server, or refuses them, when they set a stream up."""
+
+from __future__ import annotations
+
+import threading
+from typing import TYPE_CHECKING
+
+from gi.repository import GstRtsp, GstRtspServer
+
+from runner.gst.clients import Clients
+from runner.gst.opening import ServedCameras
+from runner.gst.rtsp_requests import user_agent, wants_udp
+from runner.gst.sessions import end, set_up, transports
+from runner.gst.viewers import admit, operator_of
+
+if TYPE_CHECKING:
+    from runner.gst.secure import ViewerCheck
+
+OK, FORBIDDEN, REFUSED, UNAVAILABLE, NOT_NOW = (
+    GstRtsp.RTSPStatusCode.OK,
+    GstRtsp.RTSPStatusCode.FORBIDDEN,
+    GstRtsp.RTSPStatusCode.NOT_ENOUGH_BANDWIDTH,
+    GstRtsp.RTSPStatusCode.SERVICE_UNAVAILABLE,
+    GstRtsp.RTSPStatusCode.METHOD_NOT_VALID_IN_THIS_STATE,
+)
+
+
+class Admission:
+    """Decides in the thread of each client.
+
+    keys         None: anyone may watch
+    max_viewers  of a camera over the uplink
+    changed      guards what the clients watch
+
+    `controller` is the operator in control, "" for none: see `runner.gst.viewers`.
+    """
+
+    def __init__(
+        self,
+        cameras: ServedCameras,
+        clients: Clients,
+        keys: ViewerCheck | None,
+        max_viewers: int,
+        changed: threading.Condition,
+    ) -> None:
+        self._cameras, self._clients, self._keys = cameras, clients, keys
+        self._max_viewers, self._changed = max_viewers, changed
+        self.controller = ""
+
+    def on_setup(self, client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext) -> GstRtsp.RTSPStatusCode:
+        """Admit a viewer, or refuse it for its keys, or because its copy of the stream would overload the uplink."""
+        camera, connection = self._cameras.of(context.media), self._clients.of(client)
+        if self._keys and connection:
+            connection.read_certificate(client)
+            if refusal := self._keys.refusal(connection.certificate, context.token):
+                connection.refusal = refusal
+                return FORBIDDEN
+        if not _end_other(client, context):
+            return NOT_NOW
+        # The library ends a media whose UDP it refuses, but its client then asks for TCP.
+        if camera and camera.is_open and wants_udp(context):
+            self._cameras.keep(client, context.media)
+        with self._changed:
+            new_viewer = self._clients.of(client)
+            if camera is None or new_viewer is None or not camera.is_open:
+                return UNAVAILABLE
+            operator = self._keys.viewer(new_viewer.certificate) if self._keys else operator_of(user_agent(context))
+            new_viewer.identify(operator)
+            current = self._clients.watching(camera.name)
+            viewers = [c.viewer for c in current]
+            is_admitted = new_viewer in current
+            leaving = [] if is_admitted else admit(viewers, new_viewer.viewer, self._max_viewers, self.controller)
+            if leaving is None:
+                return REFUSED
+            new_viewer.cameras.setdefault(camera.name, None)
+            if wants_udp(context):
+                new_viewer.refused_udp.add(camera.name)  # until it is set up
+        for connection in current:
+            if connection.viewer in leaving:
+                why = f"the operator in control watches from {new_viewer.viewer.address}"
+                self._clients.disconnect(connection, why)
+        return OK
+
+
+def _end_other(client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext) -> bool:
+    """End what a connection has set up of the requested camera elsewhere; False if it is being sent a copy.
+
+    Elsewhere is in another session, or in the same one by the camera's other path.
+
+    The library would not end that copy: it would go on after the viewer has left, and nobody would count it. A camera
+    that is not being sent may be set up again: ffmpeg does so in a new session when it pauses UDP to try TCP.
+    """
+    held = [(session, media) for session, media in set_up(client) if media.get_media() is context.media]
+    own = context.session and context.session.get_media(context.uri.abspath)[0]
+    sent = context.stream.transport_filter(None)
+    if any(transport in sent for _, media in held for transport in transports(media)):
+        return False
+    for session, media in held:
+        if session is not context.session or media is not own:
+            end(session, media)
+    return True
