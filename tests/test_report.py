@@ -21,9 +21,10 @@ from helpers import CONF, Command, Result
 from runner.configuration.compose import compose
 from runner.core.events import CameraSwitched
 from runner.drive import quality_file
+from runner.drive.charts import Figure
 from runner.drive.checks import ClaimCheck
 from runner.drive.colours import DAY, NIGHT
-from runner.drive.figures import Figure, bitrates, figures
+from runner.drive.figures import bitrates, figures
 from runner.drive.quality_file import DeliveredQuality
 from runner.drive.read import read_drive
 from runner.drive.series import series

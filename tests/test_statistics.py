@@ -11,19 +11,15 @@ import numpy as np
 import pytest
 from drives import write_drive, write_model
 
+from runner.drive.latency import Freeze, Latency, freezes, latency, per_second
 from runner.drive.read import read_drive
 from runner.drive.series import CameraSeries, DecidedSeries, ReceivedSeries, Sent, series
 from runner.drive.statistics import (
     CameraStatistics,
-    Freeze,
-    Latency,
     Model,
     RateCurve,
     camera_statistics,
     estimate,
-    freezes,
-    latency,
-    per_second,
     rate_curves,
     slow_time,
     statistics,

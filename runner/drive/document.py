@@ -12,9 +12,10 @@ import numpy as np
 
 from runner.core.model import Count, Limits, NonNegative, Share
 from runner.drive.checks import ClaimCheck
+from runner.drive.latency import Latency
 from runner.drive.predictions import Worth
 from runner.drive.series import LinkSeries, Series
-from runner.drive.statistics import CameraStatistics, DriveStatistics, Latency
+from runner.drive.statistics import CameraStatistics, DriveStatistics
 
 FORMAT_VERSION: Literal[1] = 1
 

@@ -1,20 +1,22 @@
 """The figures of the paper's driving test (section V-B), each defined once for print and page. Pure.
 
-A figure is rows of charts: a row for each drive, on the same axes, so that drives can be compared by eye.
+Drives can be compared by eye: each has its row of charts, on the same axes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
+from runner.drive.charts import Axis, Bars, Chart, Curve, Figure, MapTrack, Strip
+from runner.drive.latency import SECOND_S, latencies, per_second, to_arrival
 from runner.drive.predictions import EVERY_S, Compared, compared
 from runner.drive.series import CameraSeries, FloatSeries, Panel, Positions, Series, TimeSeries, held
-from runner.drive.statistics import SECOND_S, DriveStatistics, latencies, per_second, to_arrival
+from runner.drive.statistics import DriveStatistics
 
 MINUTES_FROM_S = 900.0
 STEP_OFFSET = 0.014  # of the largest factor, between steps that would overlap
@@ -27,101 +29,6 @@ SMALLEST_TRACK_M = 20.0  # around a stationary vehicle
 METRICS = {"psnr": "PSNR in dB", "mssim": "MSSIM", "vmaf": "VMAF", "brisque": "BRISQUE (lower is better)"}
 
 Drives = Sequence[DriveStatistics]
-
-
-class Axis(NamedTuple):
-    """marks: the labelled values; none leaves the choice to the renderer."""
-
-    title: str
-    low: float
-    high: float
-    marks: tuple[float, ...] = ()
-    log: bool = False
-    percent: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Curve:
-    """A quantity, in the units of the axes.
-
-    colour     index of a camera in the palette, or the name of a colour of the style sheet
-    dash       index of the dash pattern, which distinguishes curves without colour
-    around     lowest and highest of the cameras whose mean is the curve
-    steps      each value is in force until the next
-    filled     down to 0, without a line
-    points     without a line
-    reasons    for each value, shown on hover
-    """
-
-    label: str
-    x: FloatSeries
-    y: FloatSeries
-    colour: int | str
-    dash: int = 0
-    width: float = 1.0
-    around: tuple[FloatSeries, FloatSeries] | None = None
-    steps: bool = False
-    filled: bool = False
-    points: bool = False
-    reasons: tuple[str, ...] = ()
-
-
-class Bars(NamedTuple):
-    """Spans of time of one camera: (start, duration), s."""
-
-    label: str
-    colour: int
-    spans: tuple[tuple[float, float], ...]
-
-
-class Strip(NamedTuple):
-    """Rows of bars below a chart, on its time axis; and the text shown if there are none."""
-
-    bars: tuple[Bars, ...]
-    none: str
-
-
-class MapTrack(NamedTuple):
-    """Positions, m, a quantity at some of them, and arrows (m, m, degrees from east to north) along the track."""
-
-    way: tuple[FloatSeries, FloatSeries]
-    t: FloatSeries
-    east: FloatSeries
-    north: FloatSeries
-    values: FloatSeries
-    low: float
-    high: float
-    title: str
-    arrows: tuple[tuple[float, float, float], ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Chart:
-    """One pair of axes.
-
-    drive   its index among the drives, None for a chart of all of them, or one that is not over time
-    unit_s  unit of a time axis, s
-    hover   plotly's format of a value
-    """
-
-    title: str
-    x: Axis
-    y: Axis
-    curves: tuple[Curve, ...] = ()
-    drive: int | None = 0
-    part: int = 0
-    unit_s: float = 1.0
-    strip: Strip | None = None
-    track: MapTrack | None = None
-    hover: str = ""
-
-
-class Figure(NamedTuple):
-    """rows: charts side by side."""
-
-    name: str
-    heading: str
-    rows: tuple[tuple[Chart, ...], ...]
 
 
 def figures(drives: Drives) -> tuple[list[Figure], list[str]]:

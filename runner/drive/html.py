@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from runner.drive.charts import Chart, Curve, Figure, MapTrack
 from runner.drive.checks import ClaimCheck
 from runner.drive.colours import DAY, NIGHT
 from runner.drive.document import number, rules, when
-from runner.drive.figures import Chart, Curve, Figure, MapTrack
 from runner.drive.series import FloatSeries, Series
 from runner.drive.statistics import DriveStatistics
 from runner.drive.tables import LEGEND, VERDICTS, camera_rows, drive_rows, shown

@@ -24,8 +24,8 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
 from matplotlib.transforms import ScaledTranslation
 
+from runner.drive.charts import Axis, Chart, Curve, Figure, MapTrack, Strip
 from runner.drive.colours import DAY, NAMED
-from runner.drive.figures import Axis, Chart, Curve, Figure, MapTrack, Strip
 from runner.system.files import write_whole
 
 if TYPE_CHECKING:

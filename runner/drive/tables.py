@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from runner.drive.statistics import CameraStatistics, DriveStatistics, Latency
+from runner.drive.latency import Latency
+from runner.drive.statistics import CameraStatistics, DriveStatistics
 
 TableRow = tuple[str, ...]
 VERDICTS: Mapping[bool | None, str] = {True: "yes", False: "no", None: "-"}

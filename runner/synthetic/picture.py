@@ -18,20 +18,8 @@ import numpy as np
 from runner.clips import View
 from runner.core.intrinsics import focal_px
 from runner.core.model import Pose
-from runner.synthetic.world import (
-    GROUND,
-    LEVELS,
-    RAILING,
-    SKY,
-    TREE,
-    VISIBLE_M,
-    WALL,
-    Array,
-    compiled,
-    open_atlas,
-    plan_course,
-    stand_faces,
-)
+from runner.synthetic.faces import VISIBLE_M, stand_faces
+from runner.synthetic.world import GROUND, LEVELS, RAILING, SKY, TREE, WALL, Array, compiled, open_atlas, plan_course
 
 AZIMUTHS = 8192  # about a pixel of the sharpest usual view, 1920 over 90 degrees
 LAYERS = 20  # faces kept per azimuth; farther ones are not visible

@@ -78,7 +78,7 @@ FAULTS = [
     Fault("pqos/table.py", 'if "" in names:', "if False:", "test_table"),
     Fault("link/bucket.py", "self._tokens -= size", "self._tokens -= size / 2", "test_link_parts"),
     Fault("link/relay.py", "up.put(len(data) + UDP_HEADERS,", "up.put(len(data) // 2,", "integration/test_link"),
-    Fault("drive/statistics.py", "FREEZE_FACTOR * means, means + FREEZE_MORE_S", "means, means", "test_statistics"),
+    Fault("drive/latency.py", "FREEZE_FACTOR * means, means + FREEZE_MORE_S", "means, means", "test_statistics"),
     Fault(
         "drive/series.py",
         'np.searchsorted(line.t, at, "right") - 1',
