@@ -5,7 +5,6 @@ import { test } from "node:test";
 
 import { Clock, now } from "../../runner/page/static/clock.js";
 import { GroundView } from "../../runner/page/static/ground_view.js";
-import { judge } from "../../runner/page/static/status.js";
 import { Stream } from "../../runner/page/static/stream.js";
 import { WHOLE } from "../../runner/page/static/framing.js";
 
@@ -18,14 +17,18 @@ const HIDDEN = { ...BOX, width: 0, height: 0 };
 const straight = () => /** @type {any} */ ({ dispose() {}, warp: { fps: SLOW, isDue: false } });
 
 /** A stream whose picture was last drawn, by the bird's-eye view or straightened, 230 ms ago. */
-function slowStream(more = {}, decoded_ms = 20) {
+function slowStream({ display, ...more }, decoded_ms = 20) {
   const stream = new Stream(CAMERA, { clock: new Clock(), limits: LIMITS, connected: true, online: true, bound: NaN, video: true, dimensions: null, onMark() {}, wake() {} });
-  const composed_at = now() - 250;
-  Object.assign(stream, { on: true, sending: true, drawn: true, composed_at, composed_fps: SLOW, ...more });
-  Object.assign(stream, { arrived: now() - decoded_ms, decoded: now() - 230, ready_at: now() - decoded_ms });
+  Object.assign(stream, { composed_at: now() - 250, composed_fps: SLOW, ...more });
+  Object.assign(stream.canvas, { display });
+  const newest = now() - decoded_ms;
+  Object.assign(stream.live, { on: true, sending: true, drawn: true, arrived: newest, decoded: now() - 230, ready_at: newest });
   return stream;
 }
-const statusOf = (stream) => judge(stream.times(), LIMITS, now());
+function statusOf(stream) {
+  stream.live.judge(stream.drawing(), now());
+  return stream.status;
+}
 
 test("a picture that moves is live before and after its camera leaves the bird's-eye view", () => {
   const stream = slowStream({ isInBirdseye: true, display: HIDDEN });
@@ -91,10 +94,10 @@ test("a picture is late as soon as it arrives too late, before it is drawn: the 
   const stream = slowStream({ display: BOX }, 0);
   Object.assign(stream.station, { clock, bound: 10 });
   const unit = (age_ms) => ({ flags: 0, sequence: 1, captured: now() - age_ms, arrived: now(), data: null });
-  stream.decoded = now();
-  stream.decode(unit(180), now());
+  stream.live.decoded = now();
+  stream.decoding.decode(unit(180), now());
   assert.equal(statusOf(stream), "live");
-  stream.decode(unit(190), now());
+  stream.decoding.decode(unit(190), now());
   assert.equal(statusOf(stream), "late");
 });
 
@@ -106,6 +109,6 @@ test("a browser that plays no H.265 says so although the stream states no parame
   const stream = new Stream({ ...CAMERA, codec: "h265" }, station);
   stream.receive({ flags: 1, sequence: 0, captured: 0, arrived: 0, data: Uint8Array.of(0, 0, 0, 1, CRA, 1, 0x55) });
   await new Promise((done) => setTimeout(done));
-  assert.equal(stream.refused, "This browser has no decoder for H.265 (hev1.1.6.L93.B0). Use an H.264 graph or another browser.");
+  assert.equal(stream.decoding.refused, "This browser has no decoder for H.265 (hev1.1.6.L93.B0). Use an H.264 graph or another browser.");
   assert.equal(decoders.configured, 0);
 });

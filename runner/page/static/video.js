@@ -7,6 +7,7 @@
 import { ageOf, skewOf } from "./ages.js";
 import { isTopView } from "./arrange.js";
 import { Clock, now } from "./clock.js";
+import { described } from "./drawn_pictures.js";
 import { GroundView } from "./ground_view.js";
 import { hasGpu } from "./picture.js";
 import { startWarps } from "./remote_warp.js";
@@ -18,15 +19,19 @@ import { drawInTurn } from "./turns.js";
 // Used only by other modules, but imported here so that all modules are fetched in parallel.
 import "./codec.js";
 import "./counter.js";
+import "./decoding.js";
 import "./framing.js";
 import "./ground.js";
 import "./guide_lines.js";
 import "./guides.js";
+import "./liveness.js";
 import "./pace.js";
 import "./projection.js";
 import "./overlay.js";
+import "./shown_region.js";
 import "./status.js";
 import "./straight_view.js";
+import "./stream_canvas.js";
 import "./warp.js";
 import "./yuv.js";
 
@@ -110,7 +115,8 @@ function dropConnection() {
  * even after the station is back.
  */
 async function reconnect() {
-  const response = await fetch("/static/video.js", { method: "HEAD", cache: "no-store", signal: AbortSignal.timeout(CONNECT_MS) }).catch(() => null);
+  const request = { method: "HEAD", cache: "no-store", signal: AbortSignal.timeout(CONNECT_MS) };
+  const response = await fetch("/static/video.js", /** @type {RequestInit} */ (request)).catch(() => null);
   attempts++;
   if (response?.status === 401) return toPage({ kind: "login" }); // the session has ended
   if (response?.ok) connect();
@@ -224,7 +230,7 @@ function tick() {
 function judgeAll() {
   for (const stream of streams) {
     if (!stream.updateStatus()) continue;
-    toPage({ kind: "status", camera: stream.name, status: stream.status, why: stream.refused });
+    toPage({ kind: "status", camera: stream.name, status: stream.status, why: stream.decoding.refused });
   }
   if (isAsleep) ground.draw(); // it shows the status of pictures
   if (streams.some(({ isWaiting }) => isWaiting)) wake(); // a picture that could not be straightened yet
@@ -233,7 +239,7 @@ function judgeAll() {
 /** Report the ages that the page shows, and the skew between the pictures of the cameras. */
 function reportAges() {
   const bound_ms = station.bound + station.clock.bound;
-  const ages = Object.fromEntries(streams.map(({ name, stages, status }) => [name, { ...ageOf(stages, bound_ms), bound_ms, status }]));
+  const ages = Object.fromEntries(streams.map(({ name, drawn, status }) => [name, { ...ageOf(drawn.stages, bound_ms), bound_ms, status }]));
   const skew_ms = skewOf(streams.map(({ status, shown }) => ({ status, captured: shown?.meta.captured ?? NaN })));
   const slow = streams.filter((stream) => stream.isSlow()).length > 0; // not some(): every stream counts its pictures
   toPage({ kind: "ages", ages, skew_ms, slow });
@@ -271,7 +277,10 @@ const orders = {
     setInterval(reportAges, REPORT_MS);
     setInterval(() => send({ clock: now() }), 1000);
   },
-  canvas: ({ name, canvas }) => find(name)?.attach(canvas),
+  canvas({ name, canvas }) {
+    find(name)?.canvas.attach(canvas);
+    wake();
+  },
   guided({ names }) {
     guided = names;
     applyGuides();
@@ -295,14 +304,21 @@ const orders = {
   size: ({ name, ...display }) => find(name)?.setDisplay(display),
   send: ({ message }) => toPage({ kind: "sent", id: message.id, sent: send(message) }),
   async ask({ id, what, name }) {
-    const questions = { measure, guides: () => find(name)?.guideLines(), ground: () => ground.measure(), stages: allStages, picture: () => find(name)?.picture(), first: () => find(name)?.first };
+    const questions = {
+      measure,
+      guides: () => find(name)?.canvas.guideLines(),
+      ground: () => ground.measure(),
+      stages: allStages,
+      picture: () => described(find(name)?.shown),
+      first: () => find(name)?.first,
+    };
     toPage({ kind: "answer", id, value: await questions[what]() });
   },
 };
 
 /** Times of each drawn picture: captured, arrived at the station, received here, decoded, drawn; ms on the station's clock. */
 function allStages() {
-  return Object.fromEntries(streams.map(({ name, stages }) => [name, stages]));
+  return Object.fromEntries(streams.map(({ name, drawn }) => [name, drawn.stages]));
 }
 
 function measure() {

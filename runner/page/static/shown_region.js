@@ -1,0 +1,58 @@
+/** Which part of the full image a camera's pictures show: the region of interest, once it has been read back. */
+
+import { now } from "./clock.js";
+
+const UNTIMED_MS = 1000; // longest transit of a picture without a capture time
+
+/** @typedef {{picture: import("./picture.js").Picture, meta: any}} Shown */
+
+export class ShownRegion {
+  /** @type {import("./framing.js").Rectangle|null} */
+  region = null; // that pictures show; null: unknown, or about to change
+  /** @type {import("./framing.js").Size|null} */
+  expected = null; // size of these pictures; null: likewise
+  region_since = Infinity; // page time: pictures captured from this time on show the region
+  size_since = Infinity;
+
+  /** @param {any} station see `Stream` */
+  constructor(station) {
+    this.station = station;
+  }
+
+  /** The vehicle's decision. */
+  update({ roi, width, height, applied }) {
+    const { x, y, width: wide, height: high } = applied.roi ?? roi;
+    const size = applied.size ?? { width, height };
+    const isApplied = x === roi.x && y === roi.y && wide === roi.width && high === roi.height;
+    const region = isApplied ? { x, y, width: wide, height: high } : null;
+    const expected = isApplied && size.width === width && size.height === height ? size : null;
+    const since = now(); // the station's clock may be unknown yet, or be set
+    if (JSON.stringify(region) !== JSON.stringify(this.region)) Object.assign(this, { region, region_since: since });
+    if (JSON.stringify(expected) !== JSON.stringify(this.expected)) Object.assign(this, { expected, size_since: since });
+  }
+
+  /** The region that a picture is known to show. @param {Shown|null} one */
+  of(one) {
+    const { region } = this;
+    const isKnown = one && region && this.capturedAt(one.meta) >= this.region_since && hasAspectOf(one.picture, region);
+    return isKnown ? region : null;
+  }
+
+  /** The same, if the picture has the size that was decided. @param {Shown|null} one */
+  ofSized(one) {
+    const { expected } = this;
+    const { width, height } = one?.picture ?? {};
+    const fits = one && expected && width === expected.width && height === expected.height;
+    return fits && this.capturedAt(one.meta) >= this.size_since ? this.of(one) : null;
+  }
+
+  /** Page time at which a picture was captured; if unknown, the earliest possible time. */
+  capturedAt({ captured = NaN, arrived = NaN }) {
+    return (Number.isFinite(captured) ? captured : arrived - UNTIMED_MS) - this.station.clock.offset;
+  }
+}
+
+/** Whether a picture has a region's aspect ratio, to within rounding to even numbers of px. */
+function hasAspectOf(picture, { width, height }) {
+  return Math.abs(picture.width * height - picture.height * width) <= width + height;
+}

@@ -1,0 +1,149 @@
+/** The canvas of one camera in the worker: its picture, what is written over it, and the lines on the ground. */
+
+import { imageToBox, placement, visible, WHOLE } from "./framing.js";
+import { ESTIMATED, GuideLines, labelPicture } from "./guide_lines.js";
+import { drawNote, drawOverlay, readably } from "./overlay.js";
+import { hasGpu, paintImage } from "./picture.js";
+import { resize } from "./resizing.js";
+import { STALLED } from "./status.js";
+import { straightOptics } from "./straight.js";
+
+/**
+ * @typedef {object} Seen
+ * @property {import("./stream.js").Shown|null} shown
+ * @property {boolean} isStraight whether the picture is to be straightened
+ * @property {string} status
+ * @property {string} text of the alarm, "" for none
+ * @property {string} note
+ * @property {{region: import("./framing.js").Rectangle, rad: number|null}|null} steered of the guides
+ */
+
+export class StreamCanvas {
+  /** @type {OffscreenCanvas|null} */
+  canvas = null;
+  /** @type {OffscreenCanvasRenderingContext2D|null} */
+  context = null;
+  isFresh = true; // whether nothing was painted into the canvas yet
+  isResizeDue = false; // whether the canvas keeps an old size for now
+  display = { width: 0, height: 0, ratio: 1, view: WHOLE };
+  /** @type {string|null} */
+  painted_text = ""; // text in the canvas, "" for the plain picture; null: to be painted again
+
+  /** @param {any} camera as in hello  @param {any} dimensions of the vehicle */
+  constructor(camera, dimensions) {
+    this.camera = camera;
+    this.guides = camera.pose && dimensions ? new GuideLines(camera, dimensions) : null;
+  }
+
+  attach(canvas) {
+    this.canvas = canvas;
+    this.isFresh = true;
+    this.context = canvas.getContext("2d", { alpha: false, desynchronized: true });
+    this.painted_text = null;
+  }
+
+  /** Whether it is shown. */
+  get isShown() {
+    return this.display.width > 0;
+  }
+
+  setStraight(on) {
+    this.guides?.setOptics(on ? straightOptics(this.camera) : this.camera);
+  }
+
+  /** @param {Seen} seen  @returns {boolean} whether there is a canvas */
+  paint({ shown, isStraight, status, text, note, steered }) {
+    const { canvas, context } = this;
+    if (!canvas || !context) return false;
+    this.resize(canvas, shown, isStraight, STALLED.includes(status));
+    if (shown && status !== "off" && status !== "unsupported") paintPicture(context, shown, isStraight);
+    else blank(context);
+    this.drawGuides(context, canvas, steered);
+    if (isStraight && shown?.image && !this.camera.calibrated && !this.guides?.shown) this.labelEstimate(context, canvas);
+    const { mirrored } = this.display.view;
+    if (note) drawNote(context, this.visibleArea(canvas), mirrored, note);
+    if (text) drawOverlay(context, this.visibleArea(canvas), mirrored, status, text);
+    this.painted_text = textOf(text, note);
+    return true;
+  }
+
+  /** Whether it shows other texts than these. */
+  isOutdated(text, note) {
+    return this.context !== null && this.painted_text !== textOf(text, note);
+  }
+
+  /** Draw the guides over the picture in the canvas; none over a stalled one, since nobody may steer by it. */
+  drawGuides(context, canvas, steered) {
+    const area = this.visibleArea(canvas);
+    const css = (canvas.width * this.display.ratio) / (this.widthOnScreen(canvas) || canvas.width);
+    this.guides?.draw(context, steered && { ...steered, area, css, mirrored: this.display.view.mirrored });
+  }
+
+  /** For tests: the guides that are drawn, in CSS px of the picture's box. */
+  guideLines() {
+    const { canvas, guides, display } = this;
+    if (!canvas || !guides) return undefined;
+    const toBox = imageToBox(display, canvas, display.view, { x: 0, y: 0, width: canvas.width, height: canvas.height });
+    return guides.drawn.map((line) => ({ ...line, pieces: line.pieces.map((piece) => piece.map(toBox)) }));
+  }
+
+  /** A picture straightened by optics that nobody has measured says so, as lines on the ground do. */
+  labelEstimate(context, canvas) {
+    const area = this.visibleArea(canvas);
+    const box = { left: 0, top: 0, bottom: area.height };
+    readably(context, area, this.display.view.mirrored, () => labelPicture(context, ESTIMATED, box));
+  }
+
+  /**
+   * The canvas has the picture's size. For a lasting alarm it is an integer multiple of it, close to the size on the
+   * screen, so that words are sharp while the aspect ratio, and with it the page's layout, stays the same; for guides,
+   * too, if the browser scales pictures with a GPU.
+   */
+  resize(canvas, shown, isStraight, sharp) {
+    const { width: wide, height: high, ratio } = this.display;
+    const box = { width: Math.round(wide * ratio) || 480, height: Math.round(high * ratio) || 270 };
+    const own = isStraight ? (shown?.image ?? this.straightSize()) : (shown?.picture.painted ?? box);
+    const scale = this.widthOnScreen(own) / own.width;
+    const wanted = sharp ? Math.ceil(scale) : this.guides?.shown && hasGpu ? Math.round(scale) : 1;
+    const times = Math.min(6, Math.max(1, wanted));
+    const size = { width: own.width * times, height: own.height * times };
+    if (this.isFresh) Object.assign(canvas, size); // nothing is shown yet
+    this.isResizeDue = !resize(canvas, size);
+    this.isFresh = false;
+  }
+
+  /** A straightened image has the resolution of the screen, but at most the camera's. */
+  straightSize() {
+    const { width, height } = this.camera;
+    const wide = Math.round(Math.min(width, this.widthOnScreen(this.camera) || width));
+    return { width: wide, height: Math.round((wide * height) / width) };
+  }
+
+  /** Width of a picture on the screen, including cropped parts, in px of the screen; 0: not known yet. */
+  widthOnScreen(picture) {
+    const { ratio, view } = this.display;
+    return placement(this.display, picture, view).width * ratio;
+  }
+
+  /** The part of the canvas that is on the screen. */
+  visibleArea({ width, height }) {
+    const { display } = this;
+    const isPlaced = display.width && display.height;
+    return isPlaced ? visible(display, { width, height }, display.view) : { x: 0, y: 0, width, height };
+  }
+}
+
+const textOf = (...texts) => texts.filter(Boolean).join("\n");
+
+/** @param {OffscreenCanvasRenderingContext2D} context  @param {import("./stream.js").Shown} shown  @param {boolean} isStraight */
+function paintPicture(context, { picture, image = null }, isStraight) {
+  const { width, height } = context.canvas;
+  if (!isStraight) picture.paint(context, width, height);
+  else if (image) paintImage(context, image, width, height);
+  else blank(context);
+}
+
+function blank(context) {
+  context.fillStyle = "#0b0e11";
+  context.fillRect(0, 0, context.canvas.width, context.canvas.height);
+}
