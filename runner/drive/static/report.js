@@ -25,7 +25,8 @@ const root = document.documentElement;
 const isDay = () => root.dataset.theme === "day";
 const themed = (name) => getComputedStyle(root).getPropertyValue(`--${name}`).trim();
 // Escapes texts of the drive for plotly's labels, which interpret some HTML.
-const plain = (text) => String(text).replace(/[&<>]/g, (c) => ({ "&": "&amp;", "<": "&lt;", ">": "&gt;" })[c] ?? c).replaceAll("\n", "<br>");
+const ENTITIES = { "&": "&amp;", "<": "&lt;", ">": "&gt;" };
+const plain = (text) => String(text).replace(/[&<>]/g, (c) => ENTITIES[c] ?? c).replaceAll("\n", "<br>");
 
 /** Colour of a camera's index in the palette, or of a name in the style sheet. */
 function colourOf(colour) {
@@ -50,7 +51,9 @@ function traces(curve, hover) {
   const shape = steps ? "hv" : "linear";
   const base = { type: "scatter", mode: "lines", x, legendgroup: name };
   const trace = {
-    ...base, ...(points ? { mode: "markers", marker: { color: colour, size: 6, opacity: 0.6 } } : {}), y, name, hovertemplate: why ? "%{text}<extra></extra>" : `${hover} ${name}<extra></extra>`, text: why?.map(plain),
+    ...base,
+    ...(points ? { mode: "markers", marker: { color: colour, size: 6, opacity: 0.6 } } : {}),
+    y, name, hovertemplate: why ? "%{text}<extra></extra>" : `${hover} ${name}<extra></extra>`, text: why?.map(plain),
     line: { color: colour, width: filled ? 0 : 1.6 * curve.width, dash: DASHES[curve.dash % DASHES.length], shape },
     ...(filled ? { fill: "tozeroy", fillcolor: `${colour}99` } : {}),
   };
@@ -64,7 +67,8 @@ function freezes({ label, colour, spans }, x, unit_s) {
   const least = MIN_VISIBLE * (x.high - x.low);
   const name = plain(label);
   return {
-    type: "bar", orientation: "h", yaxis: "y2", name, showlegend: false, base: spans.map(([t]) => t), x: spans.map(([, s]) => Math.max(s, least)),
+    type: "bar", orientation: "h", yaxis: "y2", name, showlegend: false,
+    base: spans.map(([t]) => t), x: spans.map(([, s]) => Math.max(s, least)),
     y: spans.map(() => name), marker: { color: colourOf(colour), line: { width: 0 } }, hoverinfo: "text", textposition: "none",
     hovertext: spans.map(([t, s]) => `${name} froze at ${(t * unit_s).toFixed(1)} s for ${(s * unit_s).toFixed(2)} s`),
   };
@@ -76,7 +80,8 @@ function freezes({ label, colour, spans }, x, unit_s) {
  * @param {string} hover of a value
  */
 function mapTraces({ way: [x, y], t, east, north, values, low, high, title, arrows }, hover) {
-  const bar = { title: { text: title, side: "right", font: { size: 13 } }, thickness: 12, outlinewidth: 0, tickfont: { size: 12 }, nticks: 6 };
+  const small = { outlinewidth: 0, tickfont: { size: 12 }, nticks: 6 };
+  const bar = { title: { text: title, side: "right", font: { size: 13 } }, thickness: 12, ...small };
   const markers = { type: "scatter", mode: "markers", hoverinfo: "skip" };
   const outlined = { color: themed("panel"), line: { width: 2.5, color: themed("text") } };
   const end = (at, symbol, name) => ({ ...markers, x: [x.at(at)], y: [y.at(at)], name, marker: { ...outlined, symbol, size: 13 } });
@@ -89,7 +94,10 @@ function mapTraces({ way: [x, y], t, east, north, values, low, high, title, arro
     { ...markers, x: arrows.map(([each]) => each), y: arrows.map(([, each]) => each), name: "direction", showlegend: false,
       marker: { ...outlined, symbol: "triangle-up", size: 11, angle, line: { ...outlined.line, width: 1.5 } } },
     end(0, "circle", "start"), end(-1, "square", "end"),
-    { ...markers, x: [], y: [], name: "position at the pointer", showlegend: false, marker: { symbol: "circle-open", size: 22, color: themed("text"), line: { width: 4 } } },
+    {
+      ...markers, x: [], y: [], name: "position at the pointer", showlegend: false,
+      marker: { symbol: "circle-open", size: 22, color: themed("text"), line: { width: 4 } },
+    },
   ];
 }
 
@@ -109,7 +117,10 @@ function stripOf({ strip, x, y }) {
   if (!strip) return {};
   const rows = strip.bars.length;
   const height = Math.min(0.4, 0.06 + 0.055 * rows);
-  const none = { text: plain(strip.none), showarrow: false, xref: "paper", yref: "paper", x: 0.5, y: 0.03, font: { size: 12, color: themed("muted") } };
+  const none = {
+    text: plain(strip.none), showarrow: false, xref: "paper", yref: "paper", x: 0.5, y: 0.03,
+    font: { size: 12, color: themed("muted") },
+  };
   return {
     xaxis: { ...axisOf(x), anchor: "free", position: 0 },
     yaxis: { ...axisOf(y), domain: [height + 0.08, 1] },

@@ -22,7 +22,8 @@ import { isEditing } from "./edit.js";
  * @property {boolean} [onCameras] a key triggers it only while no control has the focus: Enter on a button presses the button
  */
 /** @type {[string, Action][]} */
-const BY_NUMBER = Array.from({ length: 9 }, (_, i) => [`camera_${i + 1}`, { description: `select camera ${i + 1}`, run: () => selectNumber(i + 1) }]);
+const BY_NUMBER = Array.from({ length: 9 }, (_, i) => i + 1).map((number) =>
+  [`camera_${number}`, { description: `select camera ${number}`, run: () => selectNumber(number) }]);
 
 /** @type {Record<string, Action>} */
 export const ACTIONS = {
@@ -32,7 +33,11 @@ export const ACTIONS = {
   camera_rear: { description: "select the rear camera", run: () => selectRole("rear"), onCameras: true },
   ...Object.fromEntries(BY_NUMBER),
   reverse: { description: "Drive view: swap the rear and front cameras; press again to undo", run: reverse },
-  enlarge: { description: "enlarge the selected camera (double click); in the Drive view it changes places with the front camera", run: enlargeSelected, onCameras: true },
+  enlarge: {
+    description: "enlarge the selected camera (double click); in the Drive view it changes places with the front camera",
+    run: enlargeSelected,
+    onCameras: true,
+  },
   back: { description: "back from the enlarged picture", run: () => store.enlarged && enlarge(null) },
   mode_single: { description: "mode Single", run: () => selectMode("single") },
   mode_automatic: { description: "mode Automatic", run: () => selectMode("automatic") },
@@ -40,8 +45,14 @@ export const ACTIONS = {
   total_lower: { description: "mode Collective: lower the total by a tenth", run: () => scaleTotal(0.9) },
   total_raise: { description: "mode Collective: raise the total by a tenth", run: () => scaleTotal(1.1) },
   view: { description: "Drive or Configure view", run: toggleView },
-  guides: { description: "Drive view: lines on the ground of calibrated cameras, of all, or none", run: () => store.view !== "configure" && toggleGuides() },
-  birdseye: { description: "Drive view: bird's-eye view in place of the top views, large in place of the front camera, or none", run: cycleBirdseye },
+  guides: {
+    description: "Drive view: lines on the ground of calibrated cameras, of all, or none",
+    run: () => store.view !== "configure" && toggleGuides(),
+  },
+  birdseye: {
+    description: "Drive view: bird's-eye view in place of the top views, large in place of the front camera, or none",
+    run: cycleBirdseye,
+  },
   straighten: { description: "straighten the picture of the selected fisheye, or show the original", run: () => toggleStraight() },
   drawer: { description: "Drive view: open or close the drawer", run: toggleDrawer },
   map: { description: "the map; in the Drive view opens or closes the drawer with it", run: () => toggleTab("map") },
@@ -56,7 +67,8 @@ export const ACTIONS = {
 };
 
 // Only the page shows what these change, so a monitor passes them on to it.
-const OF_PAGE = ["camera_left", "camera_front", "camera_right", "camera_rear", "reverse", "view", "birdseye", "drawer", "map", "monitors", "sound", "full_image", "total_lower", "total_raise"];
+const OF_PAGE = ["camera_left", "camera_front", "camera_right", "camera_rear", "reverse", "view", "birdseye", "drawer",
+  "map", "monitors", "sound", "full_image", "total_lower", "total_raise"];
 const channel = new BroadcastChannel("tod-actions");
 
 export function startActions() {
@@ -64,10 +76,14 @@ export function startActions() {
   passOn("back", () => store.enlarged !== null || !inControl());
   passOn("enlarge", () => camera(store.selected) !== undefined);
   passOn("straighten", () => camera(store.selected) !== undefined);
-  channel.onmessage = ({ data }) => store.view !== "monitor" && inControl() && (typeof data === "number" ? selectNumber(data) : ACTIONS[data]?.run());
+  channel.onmessage = ({ data }) =>
+    store.view !== "monitor" && inControl() && (typeof data === "number" ? selectNumber(data) : ACTIONS[data]?.run());
 }
 
-/** Have a monitor pass an action on to its page, unless it concerns the monitor itself. @param {string} name  @param {() => boolean} isOwn */
+/**
+ * Have a monitor pass an action on to its page, unless it concerns the monitor itself.
+ * @param {string} name  @param {() => boolean} isOwn
+ */
 function passOn(name, isOwn) {
   const { run } = ACTIONS[name];
   ACTIONS[name].run = () => (store.view !== "monitor" || isOwn() ? run() : tellPage(name));
@@ -76,7 +92,10 @@ function passOn(name, isOwn) {
 /** @param {string|number} message name of an action, or the number of a camera */
 const tellPage = (message) => (inControl() ? channel.postMessage(message) : showProblem(whyNoControl()));
 
-/** Select a camera by its number among the vehicle's, from 1 on; a monitor has its page select one that it does not show. @param {number} number */
+/**
+ * Select a camera by its number among the vehicle's, from 1 on; a monitor has its page select one that it does not show.
+ * @param {number} number
+ */
 export function selectNumber(number) {
   const found = store.hello?.cameras.find(({ index }) => index === number - 1);
   if (found || store.view !== "monitor") selectCamera(found?.name);

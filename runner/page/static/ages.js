@@ -37,7 +37,9 @@ export function ageOf(pictures, bound_ms = Infinity) {
 export function worstOf(pictures, late_ms) {
   const moving = pictures.filter(({ status }) => MOVING.includes(status));
   const unknown = moving.find(({ age_ms, bound_ms }) => !Number.isFinite(age_ms) || !Number.isFinite(bound_ms));
-  if (unknown || !moving.length) return { camera: unknown?.camera ?? null, age_ms: null, bound_ms: null, level: unknown ? "unknown" : "none" };
+  const none = { age_ms: null, bound_ms: null };
+  if (unknown) return { camera: unknown.camera, ...none, level: "unknown" };
+  if (!moving.length) return { camera: null, ...none, level: "none" };
   const upperBound = ({ age_ms, bound_ms }) => (age_ms ?? 0) + bound_ms;
   const late = moving.filter(({ status }) => status === "late"); // its median may be below the limit
   const worst = (late.length ? late : moving).reduce((a, b) => (upperBound(b) > upperBound(a) ? b : a));

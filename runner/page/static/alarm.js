@@ -54,9 +54,14 @@ export class Alarm {
     return this.#sound(own, kind, now);
   }
 
-  /** The tone of a picture that failed or was paused too soon to sound, and has not recovered since; to be called a few times a second. @param {number} now */
+  /**
+   * The tone of a picture that failed or was paused too soon to sound, and has not recovered since; to be called a few
+   * times a second.
+   * @param {number} now
+   */
   overdue(now) {
-    const due = Object.values(this.#ofCamera).filter((own) => own.waiting && now >= own.earliest && now - latest(own, own.waiting) >= REPEAT_MS);
+    const waiting = Object.values(this.#ofCamera).filter((own) => own.waiting && now >= own.earliest);
+    const due = waiting.filter((own) => now - latest(own, own.waiting) >= REPEAT_MS);
     const tones = due.map((own) => this.#sound(own, own.waiting ?? "late", now));
     return tones.includes("lost") ? "lost" : tones.includes("late") ? "late" : null;
   }

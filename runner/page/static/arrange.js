@@ -46,7 +46,8 @@ export function rolesOf(cameras, places = null) {
   if (!front) return rolesByPose(cameras);
   const [left, right, rear] = [places.left, places.right, places.rear].map(named);
   const row = (places.row ?? []).map(named).filter((camera) => camera !== null);
-  return { front, left, right, rear, others: [...row, ...cameras.filter((camera) => ![front, left, right, rear, ...row].includes(camera))] };
+  const others = cameras.filter((camera) => ![front, left, right, rear, ...row].includes(camera));
+  return { front, left, right, rear, others: [...row, ...others] };
 }
 
 /**
@@ -89,7 +90,8 @@ export function arrange(cameras, width, height, main = null, birdseye = null, pl
   const kept = cameras.filter((each) => !birdseye || !isTopView(each) || large.includes(each.name));
   const roles = rolesOf(birdseye ? [...kept, asCamera(birdseye)] : kept, places);
   const area = (found) => (roles.front ? found.pictures.get(roles.front.name).width : 0);
-  const found = [withStrip(roles, width, height), ...(roles.left || roles.right || !roles.others.length ? [] : [withColumn(roles, width, height)])];
+  const hasSides = roles.left || roles.right || !roles.others.length;
+  const found = [withStrip(roles, width, height), ...(hasSides ? [] : [withColumn(roles, width, height)])];
   const best = found.sort((a, b) => area(b) - area(a))[0];
   swap(best.pictures, roles.front?.name, main);
   return best;
@@ -123,7 +125,8 @@ function withStrip(roles, width, height) {
   const at = left ? side + GAP : sides ? 0 : Math.floor((width - wide) / 2);
   const pictures = band.pictures;
   if (left) pictures.set(left.name, { x: 0, ...middle, width: side, view: viewOf(left, "fill", 1) });
-  if (front) pictures.set(front.name, { x: at, y: middle.y + Math.floor((middle.height - high) / 2), width: wide, height: high, view: viewOf(front) });
+  const y = middle.y + Math.floor((middle.height - high) / 2);
+  if (front) pictures.set(front.name, { x: at, y, width: wide, height: high, view: viewOf(front) });
   if (right) pictures.set(right.name, { x: at + wide + GAP, ...middle, width: side, view: viewOf(right, "fill", 0) });
   const total = Math.ceil(sum(others.map((camera) => row * aspectOf(camera) + GAP)) - GAP);
   let x = Math.max(0, Math.floor((width - total) / 2));

@@ -22,7 +22,8 @@ export function believedWords(believed) {
 }
 
 /** Why the total is limited, without what these words say. @param {string[]} reasons  @param {string} words */
-export const furtherReasons = (reasons, words) => reasons.filter((reason) => !words.startsWith("Link: ") || !SAID.some((each) => reason.includes(each)));
+export const furtherReasons = (reasons, words) =>
+  reasons.filter((reason) => !words.startsWith("Link: ") || !SAID.some((each) => reason.includes(each)));
 
 function linkWords({ kbps, deviation, margin, policer_kbps }) {
   if (policer_kbps !== null) return `Link: drops what exceeds ${about(policer_kbps)} kbit/s.`;
@@ -34,7 +35,8 @@ function predictionWords({ bias, error, gain }) {
   const off = rounded(Math.exp(-bias) - 1);
   const scatter = rounded(error);
   const give = scatter >= SCATTER ? ` ± ${scatter} %` : "";
-  const level = off >= 100 ? `${Math.round(Math.exp(-bias))} times too high` : off ? `${Math.abs(off)} % too ${off > 0 ? "high" : "low"}` : "right";
+  const times = `${Math.round(Math.exp(-bias))} times too high`;
+  const level = off >= 100 ? times : off ? `${Math.abs(off)} % too ${off > 0 ? "high" : "low"}` : "right";
   return `Predictions here are ${level}${give}${gain === null ? "" : `, changes ${changeWords(rounded(gain))}`}.`;
 }
 

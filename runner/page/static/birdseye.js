@@ -44,7 +44,8 @@ export function cycleBirdseye() {
 export function placeBirdseye(box) {
   const element = byId("birdseye");
   element.hidden = !box;
-  if (box) Object.assign(element.style, Object.fromEntries([["left", box.x], ["top", box.y], ["width", box.width], ["height", box.height]].map(([key, px]) => [key, `${px}px`])));
+  const sides = box && { left: box.x, top: box.y, width: box.width, height: box.height };
+  for (const [side, px] of Object.entries(sides ?? {})) element.style[side] = `${px}px`;
   showGround(Boolean(box), element);
   setAttribute(byId("to-birdseye"), "aria-pressed", Boolean(box));
 }

@@ -24,7 +24,10 @@ const relativeTimes = () => {
 };
 
 const line = (x, y, name, colour, more = {}) =>
-  ({ type: "scatter", mode: "lines", x, y, name, line: { color: colour, width: 2, ...more }, hovertemplate: `%{y:.6~g} ${name}<extra></extra>` });
+  ({
+    type: "scatter", mode: "lines", x, y, name, line: { color: colour, width: 2, ...more },
+    hovertemplate: `%{y:.6~g} ${name}<extra></extra>`,
+  });
 
 function totals() {
   const { predicted_kbps, allocated_kbps, actual_kbps } = store.series;
@@ -149,7 +152,8 @@ function loadPlotly() {
     drawAll();
     setInterval(drawAll, 1000);
   });
-  script.addEventListener("error", () => charts.forEach(({ id }) => byId(id).replaceChildren("charts are not available: /plotly.js failed to load")));
+  const failed = "charts are not available: /plotly.js failed to load";
+  script.addEventListener("error", () => charts.forEach(({ id }) => byId(id).replaceChildren(failed)));
   document.head.append(script);
 }
 

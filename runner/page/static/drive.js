@@ -24,7 +24,10 @@ const SETTLED_MS = 2500; // by then, pictures skipped while hidden no longer cou
 
 const FITS = [1, 0.9, 0.8, 0.7, 0.6]; // of the usual size of text
 
-/** Parts of the band whose text is made smaller where it would be cut off, each with its text when its size was chosen. @type {Map<HTMLElement, string>} */
+/**
+ * Parts of the band whose text is made smaller where it would be cut off, each with its text when its size was chosen.
+ * @type {Map<HTMLElement, string>}
+ */
 const fitted = new Map([...byId("drive").querySelectorAll(".figures, .words")].map((part) => [/** @type {HTMLElement} */ (part), ""]));
 const attention = new Attention();
 let isFocused = document.hasFocus();
@@ -100,7 +103,8 @@ function refreshAlarms() {
 
 /** Show pictures by status, FROZEN front left, rear (monitor), and further words. Returns whether there are any pictures. */
 function showAlarms(element, cameras, further = []) {
-  const found = Object.keys(ALARMS).map((status) => ({ status, pictures: picturesOf(status, cameras) })).filter(({ pictures }) => pictures.length);
+  const all = Object.keys(ALARMS).map((status) => ({ status, pictures: picturesOf(status, cameras) }));
+  const found = all.filter(({ pictures }) => pictures.length);
   const texts = found.map(({ status, pictures }) => `${SHAPES[status]} ${WORDS[status] ?? status.toUpperCase()} ${pictures.join(", ")}`);
   setText(element, [...texts, ...further].join("  "));
   setAttribute(element, "data-level", found.some(({ status }) => NOT_LIVE.includes(status)) ? "late" : "near");

@@ -117,7 +117,8 @@ function change(next, name) {
 // --- keys and pointer -------------------------------------------------------------------------------------------------
 
 function addMover(name) {
-  const mover = make("button", { class: "mover", "data-mover": name, "aria-describedby": "layout-help" }, make("span", { class: "where" }), make("span", { class: "grip", "aria-hidden": "true" }));
+  const parts = [make("span", { class: "where" }), make("span", { class: "grip", "aria-hidden": "true" })];
+  const mover = make("button", { class: "mover", "data-mover": name, "aria-describedby": "layout-help" }, ...parts);
   mover.addEventListener("keydown", (event) => onKeyDown(event, name));
   mover.addEventListener("pointerdown", (event) => drag(event, name, mover));
   document.querySelector(`.tile[data-camera="${name}"]`)?.append(mover);

@@ -14,7 +14,8 @@ const target = make("div", { class: "target", hidden: true }); // where the drag
 /** @type {import("./edit.js").Editor} */
 export const DRIVE = {
   kind: "drive",
-  help: "Drag a picture to another place; the one there takes its own. Keys: arrows for left, right, mirror and row, Enter for the middle, Shift with ← → along the row.",
+  help: "Drag a picture to another place; the one there takes its own. Keys: arrows for left, right, mirror and row, " +
+    "Enter for the middle, Shift with ← → along the row.",
   initial: () => placesOf(driveRoles()),
   own: () => placesOf(rolesOf(store.hello?.cameras ?? [])),
   stated,
@@ -33,7 +34,8 @@ export const DRIVE = {
       over(at) {
         target.hidden = !at;
         if (!at) return;
-        for (const [side, length] of Object.entries(destination(draft, name, at).box)) target.style[{ x: "left", y: "top" }[side] ?? side] = `${length}px`;
+        const { box } = destination(draft, name, at);
+        for (const [side, length] of Object.entries(box)) target.style[{ x: "left", y: "top" }[side] ?? side] = `${length}px`;
       },
       drop(at) {
         const { place, other } = destination(draft, name, at);

@@ -42,7 +42,10 @@ export const GRID = {
     const { rows, columns } = sizeOf(draft);
     const placeAt = (at) => {
       const [x, y] = [(at.clientX - press.clientX) / across, (at.clientY - press.clientY) / down];
-      if (isGrip) return { ...own, row_span: clamped(own.row_span + y, 1, rows + 1 - own.row), column_span: clamped(own.column_span + x, 1, columns + 1 - own.column) };
+      if (isGrip) {
+        const row_span = clamped(own.row_span + y, 1, rows + 1 - own.row);
+        return { ...own, row_span, column_span: clamped(own.column_span + x, 1, columns + 1 - own.column) };
+      }
       return { ...own, row: clamped(own.row + y, 0, rows), column: clamped(own.column + x, 0, columns) };
     };
     return {

@@ -35,8 +35,10 @@ export function moved(draft, name, row, column) {
   const own = { ...draft[name], row: clamped(row, 0, MAX_INDEX), column: clamped(column, 0, MAX_INDEX) };
   const under = Object.keys(draft).filter((other) => other !== name && overlap(own, draft[other]));
   const { row: up, column: left } = draft[name];
-  const swapped = { ...draft, [name]: own, ...Object.fromEntries(under.map((other) => [other, { ...draft[other], row: up, column: left }])) };
-  return under.length === 1 && isFree(swapped, under[0]) && isFree(swapped, name) ? swapped : withoutOverlaps({ ...draft, [name]: own }, name);
+  const given = Object.fromEntries(under.map((other) => [other, { ...draft[other], row: up, column: left }]));
+  const swapped = { ...draft, [name]: own, ...given };
+  const fits = under.length === 1 && isFree(swapped, under[0]) && isFree(swapped, name);
+  return fits ? swapped : withoutOverlaps({ ...draft, [name]: own }, name);
 }
 
 /**

@@ -17,7 +17,8 @@ export const boxSize = ({ clientWidth: width, clientHeight: height }) => ({ widt
 export const size = (width, height) => (width && height ? `${width}×${height}` : "–");
 
 /** A latency in ms and its error bound: 48 ± 6 ms. */
-export const latency = (ms, bound) => (Number.isFinite(ms) && Number.isFinite(bound) ? `${whole(ms)} ± ${whole(Math.ceil(bound))} ms` : "– ms");
+export const latency = (ms, bound) =>
+  Number.isFinite(ms) && Number.isFinite(bound) ? `${whole(ms)} ± ${whole(Math.ceil(bound))} ms` : "– ms";
 
 export const region = (roi) => (roi ? `${size(roi.width, roi.height)} at ${roi.x}, ${roi.y}` : "–");
 

@@ -63,7 +63,9 @@ export function imageToBox(box, picture, view, region) {
  */
 export function framingText(box, picture, view) {
   const { width, height } = visible(box, picture, view);
-  const across = width < 0.995 * picture.width ? `${{ 0: "left", 1: "right" }[view.align] ?? "middle"} ${Math.round((100 * width) / picture.width)} % shown` : "";
+  const where = { 0: "left", 1: "right" }[view.align] ?? "middle";
+  const percent = Math.round((100 * width) / picture.width);
+  const across = width < 0.995 * picture.width ? `${where} ${percent} % shown` : "";
   const down = height < 0.995 * picture.height ? `middle ${Math.round((100 * height) / picture.height)} % of the height shown` : "";
   return [across, down, view.mirrored ? "mirrored" : ""].filter(Boolean).join(", ");
 }

@@ -36,7 +36,8 @@ function poll() {
 
 function onConnected({ gamepad }) {
   const isStandard = gamepad.mapping === "standard";
-  const text = isStandard ? "connected" : withKey("connected: it numbers its buttons in its own order; check inputs.buttons; the list of keys shows what is pressed", "help");
+  const own = "connected: it numbers its buttons in its own order; check inputs.buttons; the list of keys shows what is pressed";
+  const text = isStandard ? "connected" : withKey(own, "help");
   publish("toast", { text: `${nameOf(gamepad)} ${text}`, level: isStandard ? "hint" : "problem" });
   remind(keyOf(gamepad), null);
   pollTimer ??= setInterval(poll, POLL_MS);
@@ -54,7 +55,9 @@ function onDisconnected({ gamepad }) {
 
 /** Vibrate for a picture that is lost or late. */
 function vibrate(kind) {
-  for (const { vibrationActuator } of pads()) Promise.resolve(vibrationActuator?.playEffect("dual-rumble", EFFECTS[kind])).catch(() => {}); // not every device can
+  for (const { vibrationActuator } of pads()) {
+    Promise.resolve(vibrationActuator?.playEffect("dual-rumble", EFFECTS[kind])).catch(() => {}); // not every device can
+  }
 }
 
 export function startGamepads() {

@@ -14,7 +14,10 @@ const FALLOFF = 10; // power of the distance by which a camera's weight falls: a
 /** @typedef {import("./framing.js").Rectangle} Rectangle */
 /** @typedef {{rear: number, front: number, right: number, left: number}} Extent along x from rear to front, along y from right to left */
 /** @typedef {{places: Place[], columns: number, rows: number}} Lattice rows from the rear to the front, each from right to left */
-/** @typedef {{points: (Point|null)[], near: number[]}} Sight of a camera, for each vertex: its point in the full image, and its weight there */
+/**
+ * @typedef {{points: (Point|null)[], near: number[]}} Sight of a camera, for each vertex: its point in the full image,
+ * and its weight there
+ */
 
 /**
  * The vehicle's outline on the ground, with a margin.
@@ -61,7 +64,8 @@ export function sightOf(optics, dimensions, places) {
   const { x_m, y_m, z_m } = optics.pose;
   const [body, eye] = [outline(dimensions), { x: x_m, y: y_m }];
   const outside = !crosses(eye, eye, body);
-  const near = places.map((place) => (outside && crosses(eye, place, body) ? 0 : Math.hypot(place.x - x_m, place.y - y_m, z_m) ** -FALLOFF));
+  const nearness = (place) => Math.hypot(place.x - x_m, place.y - y_m, z_m) ** -FALLOFF;
+  const near = places.map((place) => (outside && crosses(eye, place, body) ? 0 : nearness(place)));
   return { points: places.map(toImage), near };
 }
 
@@ -135,5 +139,6 @@ export function trianglesOf(columns, rows, points, shares) {
 export function groundPlacement(box, dimensions) {
   const { extent, width, height } = groundOf(dimensions);
   const px_per_m = Math.min(box.width / width, box.height / height);
-  return { px_per_m, x: box.width / 2 + ((extent.left + extent.right) / 2) * px_per_m, y: box.height / 2 + ((extent.front + extent.rear) / 2) * px_per_m };
+  const [across, along] = [(extent.left + extent.right) / 2, (extent.front + extent.rear) / 2];
+  return { px_per_m, x: box.width / 2 + across * px_per_m, y: box.height / 2 + along * px_per_m };
 }

@@ -66,7 +66,8 @@ export class GroundView {
   setCameras(streams, dimensions) {
     this.session++;
     for (const layer of this.layers) layer.dispose();
-    Object.assign(this, { streams: dimensions ? streams : [], dimensions, layers: [], sights: [], shared_regions: "", drawn_labels: [], drawn: { picture: "", frames: "", lines: "" } });
+    const nothing = { layers: [], sights: [], shared_regions: "", drawn_labels: [], drawn: { picture: "", frames: "", lines: "" } };
+    Object.assign(this, { streams: dimensions ? streams : [], dimensions, ...nothing });
     this.updateStreams();
   }
 
@@ -120,7 +121,8 @@ export class GroundView {
     if (warp.lost) return this.fail(`${warp.lost}; reload the page`);
     const size = warp.sizeFor({ width: display.width * display.ratio, height: display.height * display.ratio });
     const picture = JSON.stringify([size, seen.map(({ fill, region }) => [fill, region])]);
-    const frames = JSON.stringify(seen.map(({ newest }) => newest?.meta.timestamp ?? null)); // of stalled ones, too: drawing shows that they move again
+    // Of stalled ones, too: drawing shows that they move again.
+    const frames = JSON.stringify(seen.map(({ newest }) => newest?.meta.timestamp ?? null));
     if (warp.isBusy || (picture === drawn.picture && (frames === drawn.frames || !warp.isDue))) return;
     Object.assign(drawn, { picture, frames });
     this.share(seen.map(({ region }) => region));
@@ -159,7 +161,9 @@ export class GroundView {
     const { lattice, sights, layers } = this;
     if (!lattice || JSON.stringify(regions) === this.shared_regions) return;
     this.shared_regions = JSON.stringify(regions);
-    for (const [i, shares] of sharesOf(sights, regions).entries()) layers[i].share(shares, trianglesOf(lattice.columns, lattice.rows, sights[i].points, shares));
+    for (const [i, shares] of sharesOf(sights, regions).entries()) {
+      layers[i].share(shares, trianglesOf(lattice.columns, lattice.rows, sights[i].points, shares));
+    }
   }
 
   // --- what does not change with every picture ------------------------------------------------------------------------
@@ -176,7 +180,8 @@ export class GroundView {
     this.drawn.lines = described;
     context.scale(display.ratio, display.ratio);
     const side = Math.min(display.width, display.height);
-    const size = Math.round(Math.max(10, Math.min(0.045 * side, Math.max(22, 0.026 * side)))); // on large screens the page's text grows, too
+    // On large screens the page's text grows, too.
+    const size = Math.round(Math.max(10, Math.min(0.045 * side, Math.max(22, 0.026 * side))));
     const laid = groundPlacement(display, dimensions);
     drawDistances(context, dimensions, laid, size);
     if (rad !== null) drawPaths(context, pathGuides(dimensions, rad), laid);
@@ -207,13 +212,16 @@ export class GroundView {
     }
     const thick = 0.4 * size;
     if (seen.some(({ status }) => STALLED.includes(status))) frame(context, width, height, thick, RED, []);
-    else if (seen.some(({ label, status }) => label && MOVING.includes(status))) frame(context, width, height, thick, AMBER, [2 * size, size]);
+    else if (seen.some(({ label, status }) => label && MOVING.includes(status))) {
+      frame(context, width, height, thick, AMBER, [2 * size, size]);
+    }
   }
 
   /** For tests: its placement in its box, CSS px; the cameras' labels now, and when the picture was drawn. */
   measure() {
     const laid = this.dimensions && groundPlacement(this.display, this.dimensions);
-    return { ...laid, on: this.isOn(), count: this.count, why: this.why, states: this.streams.map((stream) => stream.fromAbove().label), drawn: this.drawn_labels };
+    const states = this.streams.map((stream) => stream.fromAbove().label);
+    return { ...laid, on: this.isOn(), count: this.count, why: this.why, states, drawn: this.drawn_labels };
   }
 }
 

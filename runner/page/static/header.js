@@ -31,7 +31,10 @@ export function selectMode(selected) {
   request("mode", { event: "mode_selected", mode: selected }, `mode ${selected}`);
 }
 
-/** This page has lost control without releasing it: the driver must know, and other pages may drive. A monitor shares its page's control. */
+/**
+ * This page has lost control without releasing it: the driver must know, and other pages may drive. A monitor shares its
+ * page's control.
+ */
 function onControl() {
   if (store.view === "monitor" && store.holder === "nobody" && !store.abandoned) holding.onRelease(); // its page has released it
   const isLost = holding.update(store.holder);
@@ -103,7 +106,8 @@ function refreshControl() {
   const button = byId("take-control", HTMLButtonElement);
   const other = otherOperator();
   const isUnheard = store.holder === "you" && hearing.isLost;
-  setText(byId("holder"), !store.connected ? "" : other ? `Operator ${other} is in control` : isUnheard ? "Vehicle does not receive you" : HOLDERS[store.holder]);
+  const own = isUnheard ? "Vehicle does not receive you" : HOLDERS[store.holder];
+  setText(byId("holder"), !store.connected ? "" : other ? `Operator ${other} is in control` : own);
   setAttribute(byId("holder"), "data-holder", other || isUnheard ? "another" : store.holder);
   setText(button, store.holder === "you" ? "Release" : "Take control");
   button.classList.toggle("strong", store.connected && store.holder !== "you");

@@ -49,7 +49,8 @@ function onKeyDown(event) {
  * these keys belong to the dialog.
  */
 function leaveField({ key, target }) {
-  if (!(target instanceof HTMLInputElement) || target.type !== "number" || target.closest("dialog") || !["Enter", "Escape"].includes(key)) return;
+  if (!(target instanceof HTMLInputElement) || target.type !== "number") return;
+  if (target.closest("dialog") || !["Enter", "Escape"].includes(key)) return;
   if (key === "Escape") target.dispatchEvent(new Event("revert"));
   target.blur();
 }
@@ -72,17 +73,23 @@ function onFixedKey(key) {
 /** Two tables beside each other, so that the list fits on small screens. */
 function keyTables() {
   const buttons = store.hello?.inputs.buttons ?? {};
+  const listed = (names, of) => names.map(of).join(" ").trim();
   /** @type {(names: string[], description: string) => [string, string, string]} */
-  const cells = (names, description) => [names.map((name) => labelOf(keys()[name])).join(" ").trim(), names.map((name) => buttons[name] ?? "").join(" ").trim(), description];
+  const cells = (names, description) =>
+    [listed(names, (name) => labelOf(keys()[name])), listed(names, (name) => buttons[name] ?? ""), description];
   const numbered = Object.keys(ACTIONS).filter((name) => NUMBERED.test(name));
-  const rows = Object.entries(ACTIONS).filter(([name]) => !NUMBERED.test(name)).map(([name, { description }]) => cells([name], description));
-  rows.splice(ROLES, 0, cells(numbered.slice(0, store.view === "monitor" ? undefined : store.hello?.cameras.length), "select a camera by its number"));
+  const single = Object.entries(ACTIONS).filter(([name]) => !NUMBERED.test(name));
+  const rows = single.map(([name, { description }]) => cells([name], description));
+  const count = store.view === "monitor" ? undefined : store.hello?.cameras.length;
+  rows.splice(ROLES, 0, cells(numbered.slice(0, count), "select a camera by its number"));
   /** @param {[string, string, string]} cells */
-  const row = ([key, button, description]) => make("tr", {}, make("th", { scope: "row" }, key), make("td", {}, button), make("td", {}, description));
+  const row = ([key, ...others]) =>
+    make("tr", {}, make("th", { scope: "row" }, key), ...others.map((text) => make("td", {}, text)));
   const heads = () => ["Key", "Button", "Action"].map((head) => make("th", { scope: "col" }, head));
   const used = [...rows, ...FIXED].filter(([key, button]) => key || button).map(row);
   const half = Math.ceil(used.length / 2);
-  const tables = [used.slice(0, half), used.slice(half)].map((part) => make("table", {}, make("thead", {}, make("tr", {}, ...heads())), make("tbody", {}, ...part)));
+  const tables = [used.slice(0, half), used.slice(half)].map((part) =>
+    make("table", {}, make("thead", {}, make("tr", {}, ...heads())), make("tbody", {}, ...part)));
   return make("div", { class: "columns" }, ...tables);
 }
 

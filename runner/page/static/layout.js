@@ -108,12 +108,14 @@ export function boxesOf(band, height, width, chrome) {
   const widest = (width - (band.columns - 1) * GAP) / band.columns;
   const wished = Math.max(...band.tiles.map((tile) => columnFor(tile, height, chrome)));
   const column = Math.floor(Math.min(widest, wished));
-  const boxes = band.tiles.map((tile) => ({ width: column * tile.column_span + GAP * (tile.column_span - 1), height: heightOf(tile, height, chrome) }));
+  const boxes = band.tiles.map((tile) =>
+    ({ width: column * tile.column_span + GAP * (tile.column_span - 1), height: heightOf(tile, height, chrome) }));
   return { column, boxes };
 }
 
 /** Width of the columns at which a tile's picture fills its height. */
-const columnFor = (tile, height, chrome) => (heightOf(tile, height, chrome) * boxAspect(tile.camera) - GAP * (tile.column_span - 1)) / tile.column_span;
+const columnFor = (tile, height, chrome) =>
+  (heightOf(tile, height, chrome) * boxAspect(tile.camera) - GAP * (tile.column_span - 1)) / tile.column_span;
 
 /** Height of a tile's picture, with the gaps and the chrome of the tiles that it spans. */
 const heightOf = ({ row_span }, height, chrome) => height * row_span + (chrome + GAP) * (row_span - 1);

@@ -79,7 +79,10 @@ export function transferCanvas(name, element) {
   worker.postMessage({ order: "canvas", name, canvas }, [canvas]);
 }
 
-/** State whether the operator can see this page, and its keys reach it; the worker reports it. @param {string} state  @param {boolean} focused */
+/**
+ * State whether the operator can see this page, and its keys reach it; the worker reports it.
+ * @param {string} state  @param {boolean} focused
+ */
 export const reportAttention = (state, focused) => worker.postMessage({ order: "attention", state, focused });
 
 /** @param {string[]} names of the cameras whose guides are shown */

@@ -22,7 +22,10 @@ const ownId = String(Math.random());
  * @typedef {{age_ms: number|null, bound_ms: number}} Age of a picture
  */
 
-/** The last report of each open monitor, and when it arrived. @type {Map<string, {status: Record<string, string>, ages: Record<string, Age>, at: number}>} */
+/**
+ * The last report of each open monitor, and when it arrived.
+ * @type {Map<string, {status: Record<string, string>, ages: Record<string, Age>, at: number}>}
+ */
 const reports = new Map();
 
 /** Each picture in a monitor. */

@@ -27,7 +27,8 @@ export function listMonitors() {
   if (!store.hello || store.view === "monitor" || dialog.open) return;
   dialog.replaceChildren(
     make("h2", { id: "monitors-title" }, "Monitors"),
-    make("p", {}, "Open one of these addresses in a window on another screen. In this browser, it shares selection and control with this page."),
+    make("p", {}, "Open one of these addresses in a window on another screen. " +
+      "In this browser, it shares selection and control with this page."),
     make("ul", {}, ...groups(store.hello).map(link)),
     make("form", { method: "dialog" }, make("button", { autofocus: true }, "Close")),
   );

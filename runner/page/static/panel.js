@@ -31,7 +31,10 @@ const title = make("h2");
 const swatch = make("span", { class: "swatch", "aria-hidden": "true" });
 const status = make("span", { class: "status" });
 const on = make("button", { class: "switch", role: "switch", "data-control": "on", onclick: () => switchCamera(name()) });
-const straight = make("button", { "data-control": "straight", "data-key": "straighten", "data-title": "straighten the picture of this fisheye, or show the original", onclick: () => toggleStraight() }, "Straighten");
+const straight = make("button", {
+  "data-control": "straight", "data-key": "straighten", onclick: () => toggleStraight(),
+  "data-title": "straighten the picture of this fisheye, or show the original",
+}, "Straighten");
 const reason = make("p", { class: "why-decided" });
 const byHand = make("p", { class: "why" });
 const bitrate = makeSlider({
@@ -48,7 +51,9 @@ const weightNote = make("span", { class: "muted" });
 const sides = Object.fromEntries(SIDES.map((side) => [side, number(`roi-${side}`, `ROI ${side}, px`, { step: 1, min: 0 })]));
 const apply = make("button", { "data-control": "roi-apply", onclick: sendSides }, "Set ROI");
 const full = make("button", { "data-control": "roi-full", onclick: () => sendFull() }, "Full image");
-const locked = make("button", { "data-control": "roi-aspect", onclick: toggleLocked, title: "dragged regions keep the aspect ratio of the full image" }, "Lock aspect");
+const locked = make("button", {
+  "data-control": "roi-aspect", onclick: toggleLocked, title: "dragged regions keep the aspect ratio of the full image",
+}, "Lock aspect");
 const frame = new RegionFrame();
 const differing = make("p", { class: "differing" });
 const rows = new Map();
@@ -87,7 +92,8 @@ function comparison() {
     body.append(rows.get(key).row);
   }
   const head = make("tr", {}, ...["", "Decided", "Applied"].map((text) => make("th", { scope: "col" }, text)));
-  return make("table", { class: "facts" }, make("caption", { class: "unseen" }, "decided and applied values"), make("thead", {}, head), body);
+  const caption = make("caption", { class: "unseen" }, "decided and applied values");
+  return make("table", { class: "facts" }, caption, make("thead", {}, head), body);
 }
 
 /** Two stages in each row, which leaves space for the charts beside it on a large screen. */

@@ -31,7 +31,11 @@ export const placeOf = (places, name) => SINGLES.find((place) => places[place] =
  */
 export function moved(places, name, to, at = places.row.length) {
   const from = placeOf(places, name);
-  if (to === "row") return from === "front" ? places : { ...without(places, from, name, null), row: inserted(places.row.filter((other) => other !== name), name, at) };
+  if (to === "row" && from === "front") return places;
+  if (to === "row") {
+    const others = places.row.filter((other) => other !== name);
+    return { ...without(places, from, name, null), row: inserted(others, name, at) };
+  }
   const there = places[to];
   if (from === to || (from === "front" && !there)) return places;
   return { ...without(places, from, name, there), [to]: name };

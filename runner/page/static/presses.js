@@ -2,7 +2,8 @@
 
 const END = 0.5; // an axis that is further from its middle counts as pressed,
 const RELEASED = 0.3; // and as released at this distance
-const DIRECTIONS = ["up", null, "right", null, "down", null, "left", null]; // of a cross reported as one axis, from -1 to 1; null: between two
+// Of a cross reported as one axis, from -1 to 1; null: between two.
+const DIRECTIONS = ["up", null, "right", null, "down", null, "left", null];
 const TOLERANCE = 0.1; // of a step between directions
 
 /** @typedef {{index: number, buttons: readonly {pressed: boolean}[], axes?: readonly number[]}} Pad as the Gamepad API reports it */
@@ -20,7 +21,10 @@ function heldOf({ buttons, axes = [] }, before) {
   return [...numbers, ...pressed, ...axes.flatMap((value, i) => directionOf(value).map((direction) => `hat${i}-${direction}`))];
 }
 
-/** The direction if an axis reports that of a cross, which is beyond 1 while nothing is pressed. @param {number} value  @returns {string[]} */
+/**
+ * The direction if an axis reports that of a cross, which is beyond 1 while nothing is pressed.
+ * @param {number} value  @returns {string[]}
+ */
 function directionOf(value) {
   const step = ((value + 1) * (DIRECTIONS.length - 1)) / 2;
   const direction = Math.abs(step - Math.round(step)) <= TOLERANCE ? DIRECTIONS[Math.round(step)] : null;
@@ -40,7 +44,8 @@ export class Presses {
   poll(pads) {
     const before = this.held;
     this.held = new Map(pads.map((pad) => [pad.index, new Set(heldOf(pad, before.get(pad.index)))]));
-    const pressed = [...this.held].flatMap(([index, held]) => [...held].filter((button) => before.has(index) && !before.get(index)?.has(button)));
+    const isNew = (index, button) => before.has(index) && !before.get(index)?.has(button);
+    const pressed = [...this.held].flatMap(([index, held]) => [...held].filter((button) => isNew(index, button)));
     return [...new Set(pressed)];
   }
 

@@ -2,7 +2,10 @@
 
 /** @typedef {{x: number, y: number}} Point */
 /** @typedef {{x: number, y: number, z: number}} Place axes of ROS REP 103: forward, left, up, from the ground below the rear axle */
-/** @typedef {{x_m: number, y_m: number, z_m: number, yaw_deg: number, pitch_deg: number, roll_deg: number}} Pose yaw to the left, pitch down, roll clockwise */
+/**
+ * @typedef {{x_m: number, y_m: number, z_m: number, yaw_deg: number, pitch_deg: number, roll_deg: number}} Pose
+ * yaw to the left, pitch down, roll clockwise
+ */
 /**
  * @typedef {object} Optics
  * @property {Pose} pose

@@ -26,7 +26,8 @@ export function zoomed({ x, y, width, height }, point, factor, full) {
   const times = Math.max(factor, SMALLEST / width, SMALLEST / height);
   const [wide, high] = [Math.min(full.width, width * times), Math.min(full.height, height * times)];
   const share = (at, from, length) => limit((at - from) / length, 0, 1);
-  return inside({ x: x + share(point.x, x, width) * (width - wide), y: y + share(point.y, y, height) * (height - high), width: wide, height: high }, full);
+  const [left, top] = [x + share(point.x, x, width) * (width - wide), y + share(point.y, y, height) * (height - high)];
+  return inside({ x: left, y: top, width: wide, height: high }, full);
 }
 
 /** @param {Rectangle} region  @param {{x: number, y: number}} offset  @param {Size} full */

@@ -103,7 +103,10 @@ export class RemoteWarp {
     post({ order: "forget", target: this.id });
   }
 
-  /** Places on the canvas, y up, and the points of the camera's full image shown there. @param {Point[]} places  @param {(Point|null)[]} points */
+  /**
+   * Places on the canvas, y up, and the points of the camera's full image shown there.
+   * @param {Point[]} places  @param {(Point|null)[]} points
+   */
   layer(places, points) {
     return new RemoteLayer(this.id, places, points);
   }
@@ -131,7 +134,8 @@ export class RemoteWarp {
   /**
    * @param {Size} size of the drawing, px
    * @param {import("./warp.js").Frame} frame
-   * @param {{layer: RemoteLayer, fill: number, picture: Picture|null, region: import("./framing.js").Rectangle}[]} parts picture: null unless filled with one
+   * @param {{layer: RemoteLayer, fill: number, picture: Picture|null, region: import("./framing.js").Rectangle}[]} parts
+   *   picture: null unless filled with one
    * @returns {Promise<Image|null>} null: it is on the screen
    * @throws {Error} with a message for the operator
    */

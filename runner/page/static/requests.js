@@ -28,7 +28,8 @@ let count = 0;
 export function request(control, event, description) {
   if (!inControl()) return void showProblem(whyNoControl());
   const id = `${PREFIX}-${++count}`;
-  const timer = setTimeout(() => onReply({ id, result: "timed out", reason: "no answer from the station" }), 1000 * (store.hello?.answer_s ?? 0) + GIVE_UP_MS);
+  const none = { id, result: "timed out", reason: "no answer from the station" };
+  const timer = setTimeout(() => onReply(none), 1000 * (store.hello?.answer_s ?? 0) + GIVE_UP_MS);
   requests.pending.set(id, { id, control, event, description, timer, sent: Date.now() });
   send({ id, ...event });
   publish("requests");

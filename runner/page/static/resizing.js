@@ -6,7 +6,10 @@
 let isReady = false; // whether the main thread has just answered, so that waiting for it is short
 let isAsked = false; // whether it has not answered yet
 
-/** @param {{width: number, height: number}} canvas  @param {import("./framing.js").Size} size px  @returns {boolean} whether it has this size now */
+/**
+ * @param {{width: number, height: number}} canvas  @param {import("./framing.js").Size} size px
+ * @returns {boolean} whether it has this size now
+ */
 export function resize(canvas, { width, height }) {
   if (canvas.width === width && canvas.height === height) return true; // setting the same size has the same effect as a new one
   if (isReady) Object.assign(canvas, { width, height });

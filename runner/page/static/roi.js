@@ -65,7 +65,8 @@ export function fullRegion(name) {
 /** Why a region cannot be chosen on a camera's picture; null: it can. */
 export function whyNoRegion(name) {
   if (!inControl()) return whyNoControl();
-  if (isStraight(name)) return `no ROI can be chosen on a straightened picture; ${withKey("turn straightening off", "straighten")}, or type the numbers`;
+  const how = `${withKey("turn straightening off", "straighten")}, or type the numbers`;
+  if (isStraight(name)) return `no ROI can be chosen on a straightened picture; ${how}`;
   return mode() === "single" ? null : "the ROI is set in mode S; choose S to set it by hand";
 }
 

@@ -16,8 +16,9 @@ const HAND_MS = 400;
  * @returns {{element, update({value, max, why}), reset()}}
  */
 export function makeSlider({ label, data, id, target, send, control }) {
-  const range = make("input", { type: "range", min: 0, max: STEPS, step: 1, "aria-label": `${label}, slider`, "data-control": `${data}-slider` });
-  const number = make("input", { type: "number", min: 1, step: 1, id: id ?? false, "aria-label": `${label}, kbit/s`, "data-control": data });
+  const named = (what, key) => ({ "aria-label": `${label}, ${what}`, "data-control": key });
+  const range = make("input", { type: "range", min: 0, max: STEPS, step: 1, ...named("slider", `${data}-slider`) });
+  const number = make("input", { type: "number", min: 1, step: 1, id: id ?? false, ...named("kbit/s", data) });
   const tick = make("i", { class: "tick", "aria-hidden": "true" });
   const inForce = make("span", { class: "in-force" });
   const element = make("div", { class: "slider" }, make("div", { class: "track" }, range, tick), number, inForce);

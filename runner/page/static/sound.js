@@ -67,7 +67,10 @@ function sound(kind) {
 
 /** Sound for the worst picture, which may have gone wrong before this page had control. */
 const soundCurrent = () => isDriving && sound(currentKind());
-const currentKind = () => worstKind([...Object.keys(store.status).map((name) => alertStatus(name)), ...monitored().map(({ camera, status }) => alertStatus(camera, status))]);
+function currentKind() {
+  const own = Object.keys(store.status).map((name) => alertStatus(name));
+  return worstKind([...own, ...monitored().map(({ camera, status }) => alertStatus(camera, status))]);
+}
 
 /** @param {string} picture  @param {string} camera  @param {string} status */
 function onStatus(picture, camera, status) {
@@ -111,7 +114,8 @@ function showMuted({ key }) {
 
 export function startSound() {
   if (store.view === "monitor") return addEventListener("storage", showMuted);
-  for (const button of buttons) button.addEventListener("click", () => (!wasBlocked || isMuted()) && toggleSound()); // resumed since the press began
+  const onClick = () => (!wasBlocked || isMuted()) && toggleSound(); // resumed since the press began
+  for (const button of buttons) button.addEventListener("click", onClick);
   for (const kind of ["pointerup", "keydown"]) addEventListener(kind, onPress, true);
   listen("control", onControl);
   listen("hello", refresh);

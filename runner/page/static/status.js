@@ -20,7 +20,8 @@ export const INTERVALS = 1.3; // this many frame intervals without a picture are
  * @property {boolean} drawn whether a picture was drawn since the stream last started
  * @property {number} [waits_since] page time since which units arrive and none was drawn
  * @property {number|null} wave_s length of a refresh wave, or time between key frames; null: unknown
- * @property {number|null} stood_since page time of the last picture before the decoder restarted in the middle of the stream; null: it did not
+ * @property {number|null} stood_since page time of the last picture before the decoder restarted in the middle of the
+ *   stream; null: it did not
  * @property {boolean} faulty whether the source has a fault: it may repeat old pictures
  * @property {boolean} damaged whether the picture shows that packets were lost
  * @property {number} arrived page time of the newest unit, or of the start of the stream

@@ -29,7 +29,10 @@ let sampledAt = -Infinity; // page time of the last sample
  * @property {number} weight
  * @property {number[]} scaling factors, rising
  * @property {number} b_full_kbps
- * @typedef {{vehicle: string, cameras: Camera[], layout: Layout, selected: string|null, dimensions: import("./guides.js").Dimensions|null, inputs: Inputs, operator: string|null, answer_s: number, late_ms: number}} Hello selected: in another window of this page; operator: this station's by its keys; answer_s: the station
+ * @typedef {{vehicle: string, cameras: Camera[], layout: Layout, selected: string|null,
+ *   dimensions: import("./guides.js").Dimensions|null, inputs: Inputs, operator: string|null, answer_s: number,
+ *   late_ms: number}} Hello
+ * selected: in another window of this page; operator: this station's by its keys; answer_s: the station
  *   answers a request within this time; late_ms: a picture older than this is late
  * @typedef {{keys: Record<string, string|null>, buttons: Record<string, number|string|null>}} Inputs by action
  * @typedef {{places: Places, own: Places, drive: import("./placing.js").Places|null, problem: string|null}} Layout of the Configure
@@ -40,7 +43,8 @@ let sampledAt = -Infinity; // page time of the last sample
  * @property {number} [bitrate] kbit/s
  * @property {{width: number, height: number}} [size] px
  * @property {import("./records.js").Roi} [roi]
- * @typedef {{fault: string|null, expiring: string[]}} Link of the station to the broker: why there is none, and which certificates expire soon
+ * @typedef {{fault: string|null, expiring: string[]}} Link
+ * of the station to the broker: why there is none, and which certificates expire soon
  * @typedef {{time: number, text: string, level: string, own: boolean}} Note own: the page's, not the station's
  */
 
@@ -178,11 +182,17 @@ export const decisionOf = (name) => (store.state?.online && name ? store.state.c
  * Why there is no decision about a camera; "": there is one.
  * @param {string} name
  */
-export const whyUndecided = (name) => (!store.state?.online ? (store.link.fault ? "There is no control link." : "The vehicle is offline.") : decisionOf(name) ? "" : `The vehicle has no camera ${name}.`);
+export function whyUndecided(name) {
+  if (!store.state?.online) return store.link.fault ? "There is no control link." : "The vehicle is offline.";
+  return decisionOf(name) ? "" : `The vehicle has no camera ${name}.`;
+}
 export const mode = () => (store.state?.online ? store.state.mode : null);
 export const inControl = () => store.connected && store.holder === "you";
 
-/** The operator in control, if it is not this station's; null: it is, nobody is, or any operator's requests are carried out, as without keys. */
+/**
+ * The operator in control, if it is not this station's; null: it is, nobody is, or any operator's requests are carried
+ * out, as without keys.
+ */
 export function otherOperator() {
   const own = store.hello?.operator;
   const operator = store.connected && store.state?.online ? store.state.operator : undefined;
@@ -237,7 +247,8 @@ function onHistory(message) {
 
 function appendSample(sample) {
   const last = store.series.time.at(-1);
-  if (last !== undefined && sample.time < last - 0.99) store.series = emptySeries(Object.keys(store.series.cameras)); // the clock was set back
+  const wasSetBack = last !== undefined && sample.time < last - 0.99; // the clock
+  if (wasSetBack) store.series = emptySeries(Object.keys(store.series.cameras));
   else if (last !== undefined && sample.time < last + 0.99) return;
   const { series } = store;
   push(series, "time", sample.time);

@@ -25,7 +25,8 @@ export const straightOptics = (camera) => ({
 
 /**
  * Points of the straightened image, and the points of the camera's image shown there.
- * @param {{pose: Optics["pose"]|null, fov_deg: number, lens: Optics["lens"], native: Optics["native"], width: number, height: number}} camera
+ * @param {{pose: Optics["pose"]|null, fov_deg: number, lens: Optics["lens"], native: Optics["native"],
+ *   width: number, height: number}} camera
  */
 export function straightMesh(camera) {
   const optics = straightOptics(camera);

@@ -20,7 +20,8 @@ export function isStraight(name) {
 export function toggleStraight(name = store.selected) {
   const info = camera(name);
   if (!info) return;
-  if (!canStraighten(info)) return publish("toast", { text: `${info.name}: lines are already straight; only a fisheye bends them`, level: "hint" });
+  const text = `${info.name}: lines are already straight; only a fisheye bends them`;
+  if (!canStraighten(info)) return publish("toast", { text, level: "hint" });
   const isOn = chosen.has(info.name); // as shown here; another window may have chosen it meanwhile
   change((choice) => (isOn ? choice.delete(info.name) : choice.add(info.name)));
 }

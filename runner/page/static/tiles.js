@@ -17,7 +17,9 @@ import { ALARMS } from "./alarm.js";
 import { colourOf } from "./colours.js";
 import { announce, boxSize, byId, displayName, factor, latency, make, setAttribute, setText, size, whole } from "./format.js";
 
-export const SHAPES = { live: "●", late: "▲", damaged: "◪", frozen: "■", lost: "✕", off: "○", paused: "❚❚", synchronising: "◌", unsupported: "⊘" };
+export const SHAPES = {
+  live: "●", late: "▲", damaged: "◪", frozen: "■", lost: "✕", off: "○", paused: "❚❚", synchronising: "◌", unsupported: "⊘",
+};
 const SHORT = { synchronising: "SYNC", unsupported: "NO PICTURE" }; // the overlay has the full word
 const SILENT = ["lost", "off", "paused"]; // no frames arrive: the last values are out of date
 export const STALE = [...SILENT, "frozen"]; // the displayed picture is older than when it was drawn
@@ -85,7 +87,8 @@ function groupTiles() {
   const key = JSON.stringify(bands);
   if (key === bandsKey) return layOut();
   bandsKey = key; // only if changed: moving a tile drops the focus
-  const row = ({ grid, tiles: bandTiles }) => make("div", { class: grid ? "row grid" : "row" }, ...bandTiles.map((tile) => tiles.get(tile.camera.name).element));
+  const row = ({ grid, tiles: shown }) =>
+    make("div", { class: grid ? "row grid" : "row" }, ...shown.map((tile) => tiles.get(tile.camera.name).element));
   area.replaceChildren(...bands.map(row));
   layOut();
 }
@@ -171,7 +174,9 @@ function layOutBands() {
   const heights = heightsOf(bands, area.clientWidth, area.clientHeight, rest);
   for (const [i, band] of bands.entries()) {
     const { column, boxes } = boxesOf(band, heights[i], area.clientWidth, rest);
-    const tracks = band.grid ? { gridTemplateColumns: `repeat(${band.columns}, ${column}px)`, gridTemplateRows: `repeat(${band.rows}, ${heights[i] + rest}px)` } : {};
+    const repeated = (count, px) => `repeat(${count}, ${px}px)`;
+    const rows = repeated(band.rows, heights[i] + rest);
+    const tracks = band.grid ? { gridTemplateColumns: repeated(band.columns, column), gridTemplateRows: rows } : {};
     Object.assign(/** @type {HTMLElement} */ (area.children[i]).style, tracks);
     for (const [j, tile] of band.tiles.entries()) {
       const { box, element } = tiles.get(tile.camera.name);
@@ -185,7 +190,9 @@ function layOutBands() {
 /** Place each camera by its direction; the enlarged one swaps places with the front camera. */
 function layOutDrive() {
   const birdseye = driveDraft ? null : birdseyeSize(); // it would hide the top views
-  const { band, mirror, pictures } = arrange(store.hello?.cameras ?? [], area.clientWidth, area.clientHeight, store.enlarged, birdseye, drivePlaces());
+  const cameras = store.hello?.cameras ?? [];
+  const { clientWidth, clientHeight } = area;
+  const { band, mirror, pictures } = arrange(cameras, clientWidth, clientHeight, store.enlarged, birdseye, drivePlaces());
   byId("drive").style.height = `${band.height}px`;
   byId("drive").style.setProperty("--mirror", `${mirror.width}px`);
   placeBirdseye(pictures.get(BIRDSEYE));
@@ -301,7 +308,8 @@ function refreshCaption(name, { rates, form, reason }) {
   caption(rates, bitrate, `${whole(sample?.fps)}${of} fps · ${kbps} kbit/s`, "frames per second · kbit/s: actual / allocated / demand");
   const lost = sample?.lost ? ` · ${sample.lost} lost` : "";
   const wire = `${whole(sample?.lost)} packets lost, receiver rebuilt ${whole(sample?.rebuilt)} times`;
-  caption(form, region, `${shape} · ${latency(age_ms, bound_ms)}${lost}`, `received size · scaling factor · latency from capture to drawing ± error bound; ${wire}${repair}`);
+  const why = `received size · scaling factor · latency from capture to drawing ± error bound; ${wire}${repair}`;
+  caption(form, region, `${shape} · ${latency(age_ms, bound_ms)}${lost}`, why);
   setAttribute(form, "data-uncertain", (bound_ms ?? 0) > UNCERTAIN_MS ? "" : null);
   setText(reason, now?.reason ?? "");
 }
@@ -336,7 +344,8 @@ function onStatus({ camera: name, status }) {
   if (!part) return;
   refreshStatus(name, part);
   refreshCaption(name, part);
-  if (alertStatus(name, status) in ALARMS) speak(name, `${displayName(name)} ${SHORT[status] ?? status} ${store.refused[name] ?? ""}`.trim());
+  const said = `${displayName(name)} ${SHORT[status] ?? status} ${store.refused[name] ?? ""}`.trim();
+  if (alertStatus(name, status) in ALARMS) speak(name, said);
 }
 
 /** Have alarms spoken together: a screen reader would drop all but the last of those that come at once. */

@@ -79,7 +79,8 @@ function commonReasons(beginning) {
 }
 
 export function startTotal() {
-  const predicted = make("div", { class: "prediction" }, make("span", {}, "Prediction "), prediction, make("span", { class: "muted" }, " kbit/s"));
+  const unit = make("span", { class: "muted" }, " kbit/s");
+  const predicted = make("div", { class: "prediction" }, make("span", {}, "Prediction "), prediction, unit);
   const inForce = make("div", {}, make("span", {}, "Total "), figure, requested, make("span", { class: "muted" }, " kbit/s"));
   byId("total-panel").append(make("div", { class: "figures" }, inForce, predicted), slider.element, why, believed);
   listen("hello state sample control requests socket", refresh);

@@ -44,7 +44,10 @@ const STRIPE_PX = 14;
 /** @typedef {import("./projection.js").Point} Point */
 /** @typedef {import("./framing.js").Rectangle} Rectangle */
 /** @typedef {import("./picture.js").Picture} Picture */
-/** @typedef {{x: number, y: number, width: number, height: number}} Frame middle and size of what the canvas shows, in units of the places; y up */
+/**
+ * @typedef {{x: number, y: number, width: number, height: number}} Frame
+ * middle and size of what the canvas shows, in units of the places; y up
+ */
 
 /** One picture and its mesh. */
 export class Layer {
@@ -75,7 +78,8 @@ export class Layer {
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
     const anisotropy = gl.getExtension("EXT_texture_filter_anisotropic"); // without it distant ground is blurred along the line of sight
-    if (anisotropy) gl.texParameterf(gl.TEXTURE_2D, anisotropy.TEXTURE_MAX_ANISOTROPY_EXT, Math.min(ANISOTROPY, gl.getParameter(anisotropy.MAX_TEXTURE_MAX_ANISOTROPY_EXT)));
+    const most = anisotropy && gl.getParameter(anisotropy.MAX_TEXTURE_MAX_ANISOTROPY_EXT);
+    if (anisotropy) gl.texParameterf(gl.TEXTURE_2D, anisotropy.TEXTURE_MAX_ANISOTROPY_EXT, Math.min(ANISOTROPY, most));
   }
 
   /** @param {Float32Array} shares of the picture at each vertex  @param {Uint32Array} triangles that are drawn, as vertices */
@@ -136,7 +140,8 @@ export class Warp {
   /**
    * @param {{width: number, height: number}} size of the canvas, px
    * @param {Frame} frame
-   * @param {{layer: Layer, fill: number, picture: Picture|null, region: Rectangle}[]} drawn picture: null if the layer has it already, or needs none
+   * @param {{layer: Layer, fill: number, picture: Picture|null, region: Rectangle}[]} drawn
+   *   picture: null if the layer has it already, or needs none
    */
   draw({ width, height }, frame, drawn) {
     const { gl, canvas, uniforms } = this;

@@ -58,7 +58,8 @@ const orders = {
     targets.delete(target);
   },
   draw({ target, id, size, frame, drawn }) {
-    const parts = drawn.map(({ layer, picture, ...fill }) => ({ ...fill, layer: layers.get(layer), picture: picture && receivedPicture(picture) }));
+    const parts = drawn.map(({ layer, picture, ...fill }) =>
+      ({ ...fill, layer: layers.get(layer), picture: picture && receivedPicture(picture) }));
     const { warp, why, isShown } = targets.get(target) ?? { warp: null, why: LOST, isShown: true };
     if (!warp || warp.lost) postMessage({ kind: "drawn", id, image: null, why: why || LOST });
     else if (isShown) {

@@ -44,7 +44,8 @@ export function toRgba(bytes, planes, format, space, image, width) {
   const lookUp = tablesOf(space);
   for (let row = 0; row < image.height; row++) {
     const chroma = across === 2 ? row : row >> 1;
-    const from = { y: y.offset + row * across * y.stride, below: y.stride, u: u.offset + chroma * u.stride, v: v.offset + chroma * v.stride };
+    const [light, colour] = [y.offset + row * across * y.stride, chroma * u.stride];
+    const from = { y: light, below: y.stride, u: u.offset + colour, v: v.offset + chroma * v.stride };
     convert(bytes, from, chroma_step, lookUp, out, row * image.width, image.width);
   }
 }
@@ -96,6 +97,7 @@ function halfRow(bytes, from, chroma_step, { y, rv, gv, gu, bu }, out, to, width
     low += 2;
     us += chroma_step;
     vs += chroma_step;
-    out[to] = OPAQUE | (CLAMP[(light + bu[cb]) >> SHIFT] << 16) | (CLAMP[(light + gv[cr] + gu[cb]) >> SHIFT] << 8) | CLAMP[(light + rv[cr]) >> SHIFT];
+    const [red, green] = [CLAMP[(light + rv[cr]) >> SHIFT], CLAMP[(light + gv[cr] + gu[cb]) >> SHIFT]];
+    out[to] = OPAQUE | (CLAMP[(light + bu[cb]) >> SHIFT] << 16) | (green << 8) | red;
   }
 }

@@ -52,7 +52,8 @@ export function zoomRegion(name, box, view) {
 
   function onWheel(event) {
     event.preventDefault();
-    const [region, seen] = [wheelRegion && performance.now() - wheelRegion.at < REST_MS ? wheelRegion.region : current(), shownRegion(name)];
+    const wheeled = wheelRegion && performance.now() - wheelRegion.at < REST_MS ? wheelRegion.region : null;
+    const [region, seen] = [wheeled ?? current(), shownRegion(name)];
     const full = camera(name);
     if (!region || !seen || !full) return;
     const px = event.deltaY * (event.deltaMode === WheelEvent.DOM_DELTA_LINE ? LINE_PX : 1);
@@ -83,7 +84,9 @@ export function zoomRegion(name, box, view) {
     const { region, seen, from } = gesture;
     const [factor, { scale }] = [gesture.distance / Math.max(1, fingerDistance()), placement(size(), seen, view())];
     const larger = zoomed(region, imagePoint(from, seen), factor, full);
-    const offset = { x: ((view().mirrored ? 1 : -1) * (centre().x - from.x) * factor) / scale, y: (-(centre().y - from.y) * factor) / scale };
+    const side = view().mirrored ? 1 : -1;
+    const [x, y] = [(side * (centre().x - from.x) * factor) / scale, (-(centre().y - from.y) * factor) / scale];
+    const offset = { x, y };
     send(moved(larger, offset, full));
   }
 
