@@ -19,10 +19,11 @@ LIMITS = {
 LARGER = {
     "runner/apply.py: lines of a module": 644,
     "runner/configuration/build.py: lines of a module": 519,
+    "runner/core/model.py: lines of a module": 502,
     "runner/drive/series.py: lines of a module": 610,
     "runner/gst/receiver.py Receiver: methods": 30,
     "runner/mqtt/link.py ControlLink: methods": 29,
-    "runner/records.py: lines of a module": 704,
+    "runner/records.py: lines of a module": 797,
     "runner/simulation/drive.py Simulation: methods": 26,
 }
 METHOD = re.compile(r"^  (?:static )?(?:async )?(?:get |set )?#?\w+\(.*\) \{", re.MULTILINE)
