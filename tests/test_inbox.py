@@ -84,7 +84,7 @@ def test_requests_are_never_merged_or_reordered(puts: list[tuple[str, str]]) -> 
 
 
 def test_a_flood_is_throttled_and_others_are_served_in_between(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "ROUND_S", 2.0)
+    monkeypatch.setattr(module, "ROUND_S", 1.0)
     inbox = Inbox()
     for number in range(MAX_QUEUED):
         inbox.put(make_request("flood", "total_set", kbps=number))

@@ -75,7 +75,7 @@ def test_a_clip_with_blanks_in_its_path_plays(tod, tmp_path):
 
 
 @pytest.mark.parametrize("transport", ["tcp", "udp"])
-@pytest.mark.parametrize("retransmission_ms", [0, 200])
+@pytest.mark.parametrize("retransmission_ms", [pytest.param(0, marks=pytest.mark.soak), 200])
 def test_a_third_party_client_plays_the_stream(transport, retransmission_ms):
     words = ("vehicle=delivery_robot", f"graph.retransmission_ms={retransmission_ms}")
     with streaming(*words, cameras=("rear",)) as (_, setup, _, _reported):

@@ -251,7 +251,7 @@ def test_a_camera_can_be_reopened_immediately():
     assert answers == 30 * [[200, 200, 200]]
 
 
-@pytest.mark.parametrize("source", ["source=test", "source=synthetic"])
+@pytest.mark.parametrize("source", [pytest.param("source=test", marks=pytest.mark.soak), "source=synthetic"])
 @pytest.mark.parametrize("header", [{"Range": "npt=5.000-"}, {"Scale": "2.0"}, {"Speed": "4.0"}], ids=str)
 def test_a_viewer_cannot_seek_a_shared_stream(source, header):
     with serving(source) as vehicle, watched(vehicle) as viewer:
