@@ -18,7 +18,6 @@ LIMITS = {
 # What is still larger, which may only shrink.
 LARGER = {
     "runner/apply.py: lines of a module": 644,
-    "runner/configuration/build.py: lines of a module": 519,
     "runner/core/model.py: lines of a module": 502,
     "runner/drive/series.py: lines of a module": 610,
     "runner/gst/receiver.py Receiver: methods": 30,
