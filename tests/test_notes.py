@@ -25,8 +25,8 @@ def camera(scaling: float | None = 0.5, **more: Any) -> dict[str, Any]:
 
 def state(cause: str = "start", mode: str = "automatic", total: int = 3000, **cameras: Any) -> VehicleState:
     known = {name: camera() for name in ("front", "rear", "mast")}
-    document = {"online": True, "t": 1.0, "cause": cause, "mode": mode, "total_kbps": total, "cameras": known | cameras}
-    read = read_state(json.dumps(document).encode())
+    decided = {"cause": cause, "mode": mode, "total_kbps": total, "asked_kbps": total, "cameras": known | cameras}
+    read = read_state(json.dumps({"online": True, "t": 1.0, **decided}).encode())
     assert read
     return read
 
