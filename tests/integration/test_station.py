@@ -32,6 +32,7 @@ STATE = {
     "cause": "start",
     "mode": "automatic",
     "total_kbps": 1500,
+    "asked_kbps": 1500,
     "cameras": {
         name: {
             **CAMERA,
@@ -346,7 +347,8 @@ def test_a_decision_is_one_note_however_many_cameras_it_changes(both):
         name: {**camera, "scaling": 0.25, "reason": f"{kbps} of 4000 kbit/s, range [0, 400) -> 0.25"}
         for kbps, (name, camera) in enumerate(STATE["cameras"].items(), 300)
     }
-    state = {**STATE, "t": 2.0, "cause": "bitrate_predicted kbps 900", "total_kbps": 900, "cameras": cameras}
+    totals = {"total_kbps": 900, "asked_kbps": 900}
+    state = {**STATE, "t": 2.0, "cause": "bitrate_predicted kbps 900", **totals, "cameras": cameras}
     vehicle.publish("state", state)
     vehicle.publish("state", {**state, "t": 3.0, "cause": "bitrate_predicted kbps 880", "total_kbps": 880})
     until(lambda: station.state.total_kbps == 880)
