@@ -764,7 +764,11 @@ def line_to_json(record: Record) -> Json:
 def line_from_json(document: Mapping[str, Any]) -> Record:
     """The record described by a log line that satisfies its schema."""
     kind = _BY_KIND[document["log"]]
-    record: Record = from_json(Offline if kind is VehicleState and not document["online"] else kind, document)
+    kind = Offline if kind is VehicleState and not document["online"] else kind
+    try:
+        record: Record = from_json(kind, document)
+    except msgspec.ValidationError:  # to a schema, 1920.0 is a whole number, too
+        record = msgspec.convert(document, kind, strict=False)
     return record
 
 

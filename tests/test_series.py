@@ -306,3 +306,12 @@ def test_a_truncated_drive_is_read_up_to_there(tmp_path: Path) -> None:
     drive = series(read_drive(path))
     assert drive.ended == {"vehicle": False, "operator": False, "link": False}
     assert json.loads(json.dumps(drive.warnings))
+
+
+def test_a_whole_number_may_be_written_as_a_float(tmp_path: Path) -> None:
+    def rewritten(_side: str, lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        return [line | {"refused": float(line["refused"])} if line.get("log") == "sample" else line for line in lines]
+
+    path = write_drive(tmp_path / "drive", seconds=5)
+    as_floats = write_drive(tmp_path / "floats", seconds=5, change=rewritten)
+    assert read_drive(as_floats).sides["operator"].lines == read_drive(path).sides["operator"].lines
