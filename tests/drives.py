@@ -15,7 +15,7 @@ from runner.configuration.config import configuration
 from runner.core.events import ClockAdvanced, Event, PositionReported, to_json
 from runner.core.model import plain
 from runner.core.step import Run, start, step
-from runner.drive.log import FILES
+from runner.drive.log import FILES, FORMAT
 from runner.records import (
     CameraSample,
     CameraState,
@@ -64,7 +64,7 @@ def write_drive(
     directory.mkdir(parents=True, exist_ok=True)
     for side in sides:
         shift = OPERATOR_LATER_S if side == "operator" else 0.0
-        began = {"t": 0.0, "log": "began", "side": side, "format": 1, "time": EPOCH + shift}
+        began = {"t": 0.0, "log": "began", "side": side, "format": FORMAT, "time": EPOCH + shift}
         began |= {"versions": VERSIONS, "config": config}
         logged = [began, *change(side, json.loads(json.dumps(lines[side])))]
         if ended:

@@ -372,8 +372,8 @@ def test_a_lone_surrogate_is_written(tmp_path: Path) -> None:
             "{file}: line 1: side: 'operator': must be vehicle",
         ),
         (
-            lambda lines: [lines[0].replace('"format": 1', '"format": 9')],
-            "{file}: line 1: format: 9: this version reads format 1",
+            lambda lines: [lines[0].replace('"format": 2', '"format": 9')],
+            "{file}: line 1: format: 9: this version reads format 2",
         ),
         (
             lambda lines: [re.sub('"time": [0-9.]+', '"time": 1e18', lines[0])],

@@ -437,7 +437,7 @@ def test_files_that_are_not_a_drive_are_reported(tod: Command, drive: Path, tmp_
         assert (result.status, result.out) == (2, "")
         return result.err.removeprefix(str(path))
 
-    assert error(first.replace('"format": 1', '"format": 2')) == ": line 1: format: 2: this version reads format 1\n"
+    assert error(first.replace('"format": 2', '"format": 1')) == ": line 1: format: 1: this version reads format 2\n"
     operator = first.replace('"side": "vehicle"', '"side": "operator"')
     assert error(operator) == ": line 1: side: 'operator': has no events, they are in drive.jsonl\n"
     assert error(first.replace('"versions"', '"version"')).startswith(": line 1: version: unknown key, did you mean")

@@ -40,7 +40,7 @@ from runner.records import (
 )
 from runner.redact import redacted
 
-FORMAT = 1
+FORMAT = 2
 WITHOUT_LOG = "the drive continues without its log"
 FILES = {"vehicle": "drive.jsonl", "operator": "operator.jsonl", "link": "link.jsonl"}  # by side
 QUEUED_LINES = 10_000  # more than two minutes of a vehicle with eight cameras
