@@ -181,7 +181,8 @@ def _camera_samples(units, start):
     for camera, unit in units:
         arrivals[camera].append((round(unit.arrived - start, 4), round(1000 * (unit.arrived - unit.captured), 2)))
     zeros = dict.fromkeys(("fps", "kbps", "allocated_kbps", "demand_kbps", "width", "height"), 0)
-    zeros |= dict.fromkeys(("lost", "rebuilt", "frames", "bytes"), 0) | {"scaling": None, "latency_ms": None}
+    zeros |= dict.fromkeys(("lost", "rebuilt", "frames", "bytes", "damaged"), 0)
+    zeros |= {"scaling": None, "latency_ms": None, "stages_ms": {}}
     return {name: {**zeros, "arrivals": arrivals[name]} for name in CAMERAS}
 
 
