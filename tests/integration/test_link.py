@@ -332,7 +332,7 @@ def test_only_the_vehicle_gets_an_answer_at_the_links_address():
 @needs_root
 def test_the_next_run_removes_what_a_killed_one_left():
     code = (
-        "import os, signal, subprocess; from runner.link import *; from runner.core.model import Endpoint\n"
+        "import os, signal, subprocess; from runner.link import *; from runner.settings import Endpoint\n"
         "limit, end = Limit(lambda t: 100, 200, 0), Endpoint('127.0.0.1', 1)\n"
         "with limited_link('netns', limit, end, end, print) as link:\n"
         "    left = subprocess.Popen([*link.vehicle_command, 'sleep', '1000'], stdout=-3, stderr=-3)\n"
@@ -385,7 +385,7 @@ def test_the_relay_ends_with_its_link(monkeypatch):
 
 def test_without_root_the_relay_is_recommended():
     code = (
-        "import os; from runner.link import *; from runner.core.model import Endpoint\n"
+        "import os; from runner.link import *; from runner.settings import Endpoint\n"
         "os.geteuid() or os.seteuid(65534)\n"
         "end = Endpoint('127.0.0.1', 1)\n"
         "try:\n"

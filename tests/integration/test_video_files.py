@@ -298,7 +298,10 @@ def test_a_graph_without_counters_is_rejected(tmp_path):
     (tmp_path / "graph").mkdir()
     (tmp_path / "graph/mine.yaml").write_text(text.replace("{name: sent,", "{name: other,"))
     configuration(["source=test", "graph=mine"], tmp_path).vehicle()
-    with pytest.raises(ConfigError, match=r"command line: graph\.vehicle: log\.video needs an identity named sent"):
+    with pytest.raises(
+        ConfigError,
+        match=r"mine\.yaml: vehicle: log\.video needs an identity named sent .*; see command line: log\.video=true",
+    ):
         configuration(["source=test", "graph=mine", "log.video=true"], tmp_path).vehicle()
 
 
