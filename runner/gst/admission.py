@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from typing import TYPE_CHECKING
 
 from gi.repository import GstRtsp, GstRtspServer
@@ -30,7 +29,6 @@ class Admission:
 
     keys         None: anyone may watch
     max_viewers  of a camera over the uplink
-    changed      guards what the clients watch
 
     `controller` is the operator in control, "" for none: see `runner.gst.viewers`.
     """
@@ -41,10 +39,9 @@ class Admission:
         clients: Clients,
         keys: ViewerCheck | None,
         max_viewers: int,
-        changed: threading.Condition,
     ) -> None:
         self._cameras, self._clients, self._keys = cameras, clients, keys
-        self._max_viewers, self._changed = max_viewers, changed
+        self._max_viewers, self._changed = max_viewers, clients.changed
         self.controller = ""
 
     def on_setup(self, client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext) -> GstRtsp.RTSPStatusCode:

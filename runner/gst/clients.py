@@ -25,18 +25,18 @@ FIRST_REQUEST_S, CROWD, CROWDED_S = 5.0, 8, 1.0
 class Clients:
     """May be used from any thread.
 
-    changed    guards the connections and what they watch
+    changed    guards the state that clients' threads share, that of the cameras included
     on_report  called with a camera and why its viewer was disconnected
     """
 
-    def __init__(self, changed: threading.Condition, on_report: Callable[[str, str], None]) -> None:
-        self._changed, self._on_report = changed, on_report
+    def __init__(self, on_report: Callable[[str, str], None]) -> None:
+        self.changed, self._on_report = threading.Condition(), on_report
         self.connections: dict[GstRtspServer.RTSPClient, RtspConnection] = {}
         self._is_closed = False
         self._most = min(MOST, max(LEAST, (resource.getrlimit(resource.RLIMIT_NOFILE)[0] - RESERVED) // DESCRIPTORS))
 
     def add(self, client: GstRtspServer.RTSPClient, connection: RtspConnection) -> None:
-        with self._changed:
+        with self.changed:
             others = list(self.connections.items())
             self.connections[client] = connection
             if self._is_closed:
@@ -47,42 +47,42 @@ class Clients:
 
     def remove(self, client: GstRtspServer.RTSPClient) -> RtspConnection | None:
         """A client's connection has ended."""
-        with self._changed:
+        with self.changed:
             connection = self.connections.pop(client, None)
             if connection:
                 connection.release()
-                self._changed.notify_all()
+                self.changed.notify_all()
             return connection
 
     def close(self) -> None:
         """End every connection in its own thread."""
-        with self._changed:
+        with self.changed:
             self._is_closed = True
             for connection in self.connections.values():
                 connection.close()
-            self._changed.notify_all()
-            self._changed.wait_for(lambda: not self.connections, CLOSE_S)
+            self.changed.notify_all()
+            self.changed.wait_for(lambda: not self.connections, CLOSE_S)
 
     def of(self, client: GstRtspServer.RTSPClient) -> RtspConnection | None:
-        with self._changed:
+        with self.changed:
             return self.connections.get(client)
 
     def current(self) -> list[tuple[GstRtspServer.RTSPClient, RtspConnection]]:
-        with self._changed:
+        with self.changed:
             return list(self.connections.items())
 
     def watching(self, camera: str) -> list[RtspConnection]:
-        with self._changed:
+        with self.changed:
             return [connection for connection in self.connections.values() if camera in connection.cameras]
 
     def using(self, camera: str) -> list[RtspConnection]:
         """Those that watch a camera, or requested it last."""
-        with self._changed:
+        with self.changed:
             return [c for c in self.connections.values() if camera in (c.described, *c.cameras)]
 
     def copies(self) -> dict[str, int]:
         """By camera, the number of viewers outside the vehicle; cameras without any are omitted."""
-        with self._changed:
+        with self.changed:
             watched = [c.cameras for c in self.connections.values() if over_uplink(c.viewer.address)]
             return dict(Counter(name for cameras in watched for name in tuple(cameras)))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Iterable, Mapping
 
@@ -14,10 +13,8 @@ BLOCKED_S = 0.4  # a camera that should send but does not for this long and thre
 
 
 class LeftCameras:
-    """changed guards what the clients watch."""
-
-    def __init__(self, clients: Clients, pipelines: Mapping[str, CameraPipeline], changed: threading.Condition) -> None:
-        self._clients, self._pipelines, self._changed = clients, pipelines, changed
+    def __init__(self, clients: Clients, pipelines: Mapping[str, CameraPipeline]) -> None:
+        self._clients, self._pipelines, self._changed = clients, pipelines, clients.changed
         self._left: dict[str, float] = {}  # until when each is monitored
         self._progress: dict[str, tuple[int, float]] = {}  # of each, frame count and when it last changed
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from enum import Enum, auto
 from typing import TYPE_CHECKING
 
@@ -16,7 +16,7 @@ from gi.repository import GObject, Gst, GstRtsp, GstRtspServer
 
 from runner.graph import Plan, rtsp_url
 from runner.gst.camera_media import CameraFactory, address_pool, on_element
-from runner.gst.connections import RtspConnection
+from runner.gst.clients import Clients
 from runner.gst.lost import LostCameras
 from runner.gst.pipeline import Build, CameraPipeline
 from runner.gst.video_files import concerns_file
@@ -82,9 +82,7 @@ class ServedCamera:
 class ServedCameras:
     """The cameras of the server by name, each with its pipeline, if built.
 
-    changed    guards the state that the library's threads share; notified when a camera's stage changes
     stopped    set when the server stops
-    users      returns the connections that have requested a camera or watch it
     others     as for `runner.gst.server.CameraServer`
     """
 
@@ -97,12 +95,11 @@ class ServedCameras:
         on_report: OnReport,
         permissions: GstRtspServer.RTSPPermissions | None,
         refusal: Callable[[str], str | None],
-        users: Callable[[str], Iterable[RtspConnection]],
-        changed: threading.Condition,
+        clients: Clients,
         stopped: threading.Event,
     ) -> None:
         self._build, self._lost, self._on_report, self._refusal = build, lost, on_report, refusal
-        self._users, self._changed, self._stopped = users, changed, stopped
+        self._clients, self._changed, self._stopped = clients, clients.changed, stopped  # notified of a new stage, too
         self.threads = GstRtspServer.RTSPThreadPool()
         self.threads.set_max_threads(-1)  # one per client
         self.pipelines: dict[str, CameraPipeline] = {}
@@ -174,7 +171,7 @@ class ServedCameras:
             camera.stage = _Stage.ENDING
             if camera.opening and not camera.opening.problem:
                 camera.opening.problem = message.parse_error()[0].message
-            affected = list(self._users(camera.name))
+            affected = self._clients.using(camera.name)
         self._on_report(camera.name, message.parse_error()[0].message)
         # The library ends the pipeline when the last of them has left; until then no new viewer is admitted.
         for connection in affected:

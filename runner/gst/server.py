@@ -85,16 +85,16 @@ class CameraServer:
             self._keys = ViewerCheck(keyring, lambda what: on_report("keys", what), self._on_refused)
         self._report_refusal = LimitedReports(lambda what: on_report("keys", what))
         self._media, self._on_report = media, on_report
-        changed = self._changed = threading.Condition()  # guards the state shared by clients' threads
         self._stopped = threading.Event()
-        self._clients = Clients(changed, on_report)
-        permissions, users = self._keys and self._keys.permissions, self._clients.using
+        self._clients = Clients(on_report)
+        self._changed = self._clients.changed
+        permissions = self._keys and self._keys.permissions
         self._cameras = ServedCameras(
-            plans, media, build, lost, on_report, permissions, refusal, users, changed, self._stopped
+            plans, media, build, lost, on_report, permissions, refusal, self._clients, self._stopped
         )
         self.pipelines = self._cameras.pipelines
-        self.admission = Admission(self._cameras, self._clients, self._keys, media.max_viewers, changed)
-        self._left = LeftCameras(self._clients, self.pipelines, changed)
+        self.admission = Admission(self._cameras, self._clients, self._keys, media.max_viewers)
+        self._left = LeftCameras(self._clients, self.pipelines)
         self._server = GstRtspServer.RTSPServer()
         self._server.set_address(ip_address_of(media.host))  # of a name with several, IPv4
         self._server.set_service(str(media.port))
