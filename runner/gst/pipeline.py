@@ -39,6 +39,9 @@ _NOT_RECONFIGURED = TypeProbe(Gst.PadProbeType.EVENT_UPSTREAM, {Gst.EventType.RE
 # it would seek a clip or a test picture for every PLAY with a Range, Scale or Speed, flush the stream of all viewers,
 # and wait for a frame that a closed gate never passes.
 _NOT_SEEKABLE = TypeProbe(Gst.PadProbeType.QUERY_UPSTREAM, {Gst.QueryType.SEEKING: Gst.PadProbeReturn.HANDLED})
+# A viewer that joins changes no caps. The RTSP server (1.22) makes all elements negotiate again all the same, but what
+# it adds behind the payloader may not be linked yet: then they fail, and the pipeline ends for all viewers.
+_KEEPS_CAPS = TypeProbe(Gst.PadProbeType.EVENT_UPSTREAM, {Gst.EventType.RECONFIGURE: Gst.PadProbeReturn.DROP})
 
 
 class CameraPipeline:
@@ -97,7 +100,8 @@ class CameraPipeline:
         self.requests = RequestLimit(last, on_report)
         self._first_packet = BufferProbe(last, self._on_first_packet, in_lists=True)
         self._first_packet.arm()
-        _NOT_SEEKABLE.add_to(last)
+        for each in (_NOT_SEEKABLE, _KEEPS_CAPS):
+            each.add_to(last)
 
     @property
     def is_opening(self) -> bool:

@@ -393,6 +393,18 @@ def longest_allowed(untouched):
     return max(10 * SMALL_FRAME_S, untouched.longest_gap() + 2 * SMALL_FRAME_S)
 
 
+def test_no_element_negotiates_again_when_a_viewer_joins():
+    """What the library adds for it may not be linked yet, and negotiation would fail."""
+    with serving() as vehicle, watched(vehicle, udp=False):
+        asked = []
+        pad = vehicle.side._server.pipelines[CAMERA]._pipeline.get_by_name("encoder").get_static_pad("src")
+        kinds = Gst.PadProbeType.EVENT_UPSTREAM
+        pad.add_probe(kinds, lambda _, info: asked.append(info.get_event().type) or Gst.PadProbeReturn.OK)
+        with watched(vehicle, udp=True):
+            pass
+        assert Gst.EventType.RECONFIGURE not in asked
+
+
 # --- readers that stop or lag -----------------------------------------------------------------------------------------
 
 
