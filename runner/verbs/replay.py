@@ -7,9 +7,8 @@ events. An invalid line ends the run with an error that states its number; outpu
 cannot be accepted is answered with "accepted": false and the reason, and the run continues.
 
 A drive (the directory that log= wrote, or its drive.jsonl) is replayed with its own configuration: the decisions are
-those of the drive. Where a rule has been replaced since, its successor decides, which is said: decisions may differ,
-and measurements of the link tell follow_link something only with link=again. Overrides change that configuration and
-so answer "what if"; with log= the result is written as a new drive, for `report`, and to output= only if that is given.
+those of the drive. Overrides change that configuration and so answer "what if"; with log= the result is written as a
+new drive, for `report`, and to output= only if that is given. A drive of an older log format is refused.
 
 Predictions are taken from the input. With a pqos= on the command line they are dropped and that source predicts
 instead, from the positions and times of the input; its events are marked "source": "pqos".
