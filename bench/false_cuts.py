@@ -18,7 +18,8 @@ from pathlib import Path
 from uplinks import SETTLED_S, ensure_drive
 
 from runner.drive.read import read_drive
-from runner.records import DecisionMade, LinkSample
+from runner.records.decisions import DecisionMade
+from runner.records.lines import LinkSample
 from runner.simulation.figures import cuts
 
 KBPS, LOSS, ONE_WAY_MS = 3000, 0.01, 25

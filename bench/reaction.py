@@ -22,7 +22,7 @@ from uplinks import ensure_drive, row, totals
 from runner.drive.read import Drive, read_drive
 from runner.drive.series import series
 from runner.drive.statistics import statistics
-from runner.records import LinkSample
+from runner.records.lines import LinkSample
 from runner.system.files import write_whole
 
 WIDE_KBPS, NARROW_KBPS = 4400, 2200

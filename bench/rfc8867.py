@@ -40,7 +40,8 @@ from runner.configuration.config import configuration
 from runner.drive.read import Drive, read_drive
 from runner.drive.series import series
 from runner.drive.statistics import statistics
-from runner.records import DecisionMade, LinkSample
+from runner.records.decisions import DecisionMade
+from runner.records.lines import LinkSample
 
 EXPERIMENT = "experiment=rfc8867"
 WEIGHTED = "front_center"  # the camera whose weight the case `weights` triples

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 from runner.core.roles import Role
 from runner.drive.read import read_drive
-from runner.records import Sample
+from runner.records.operator import Sample
 from runner.security.authority import Authority
 
 WORDS = ("vehicle=delivery_robot", "source=test", "fps_max=15", "modes=open_loop", "pqos=constant", "page.serve=false")

@@ -40,7 +40,8 @@ from runner.drive.quality_file import DOCUMENT, DeliveredQuality, read_quality
 from runner.drive.read import Drive, read_drive
 from runner.drive.series import CameraSeries, Series, series
 from runner.drive.statistics import statistics
-from runner.records import DecisionMade, LinkSample
+from runner.records.decisions import DecisionMade
+from runner.records.lines import LinkSample
 from runner.system.files import write_whole
 
 EXPERIMENT = "experiment=wrong_prediction"

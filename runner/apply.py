@@ -50,7 +50,8 @@ from runner.gst.timers import Guarded, every
 from runner.gst.video_files import VideoFile, VideoFiles
 from runner.gst.watched import WatchedSource
 from runner.inputs import input_problem
-from runner.records import Arrivals, CameraReading, SentFrame
+from runner.records.reception import Arrivals, SentFrame
+from runner.records.vehicle import CameraReading
 from runner.settings import Media
 
 if TYPE_CHECKING:

@@ -16,19 +16,10 @@ from runner.core.events import ClockAdvanced, Event, PositionReported, to_json
 from runner.core.model import plain
 from runner.core.step import Run, start, step
 from runner.drive.log import FILES, FORMAT
-from runner.records import (
-    CameraSample,
-    CameraState,
-    CameraTelemetry,
-    DecisionMade,
-    LatencyStages,
-    LinkSample,
-    Position,
-    Sample,
-    Telemetry,
-    VehicleState,
-    line_to_json,
-)
+from runner.records.decisions import DecisionMade
+from runner.records.lines import LinkSample, line_to_json
+from runner.records.operator import CameraSample, LatencyStages, Sample
+from runner.records.vehicle import CameraState, CameraTelemetry, Position, Telemetry, VehicleState
 
 EPOCH = 1_770_000_000.0  # 2026-02-02T02:40:00Z
 OPERATOR_LATER_S = 1.5  # the operator starts logging later than the vehicle

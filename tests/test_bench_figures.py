@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from runner.drive.series import ReceivedSeries, Sent
-from runner.records import LinkSample
+from runner.records.lines import LinkSample
 
 pytestmark = pytest.mark.slow  # imports matplotlib
 NOTHING = np.array([])

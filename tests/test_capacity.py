@@ -14,7 +14,8 @@ from helpers import Command
 from runner.drive.capacity import CapacitySample, cells, limited_samples
 from runner.drive.read import read_drive
 from runner.drive.series import series
-from runner.records import ReceptionReport, ReceptionReported, UnitReceived, line_to_json
+from runner.records.lines import line_to_json
+from runner.records.reception import ReceptionReport, ReceptionReported, UnitReceived
 
 pytestmark = pytest.mark.slow  # draws figures of drives
 

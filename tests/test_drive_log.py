@@ -23,7 +23,7 @@ from runner.core.events import CameraSwitched
 from runner.drive.log import Log, new_drive
 from runner.drive.read import read_drive
 from runner.errors import RunError, UserError
-from runner.records import LinesDropped, Note
+from runner.records.lines import LinesDropped, Note
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 NOTES = """

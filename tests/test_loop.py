@@ -22,16 +22,8 @@ from runner.core.roles import DRIVER_EVENTS, Role, denial
 from runner.core.step import step
 from runner.drive.log import Log
 from runner.plans import compile_plans
-from runner.records import (
-    Outcome,
-    ReceptionReport,
-    ReceptionReported,
-    SpeedAdvice,
-    SteeringAngle,
-    Telemetry,
-    UnitReceived,
-    VehicleState,
-)
+from runner.records.reception import ReceptionReport, ReceptionReported, UnitReceived
+from runner.records.vehicle import Outcome, SpeedAdvice, SteeringAngle, Telemetry, VehicleState
 from runner.security import keyring
 from runner.security.keyring import Person
 from runner.system.reports import MOST_OF_PEER

@@ -10,7 +10,7 @@ import pytest
 from runner.core.events import EVENTS
 from runner.mqtt.messages import read_state
 from runner.operator.notes import CAUSES, decision_note
-from runner.records import VehicleState
+from runner.records.vehicle import VehicleState
 
 FULL = {"x": 0, "y": 0, "width": 1280, "height": 720}
 PART = {"x": 8, "y": 4, "width": 640, "height": 360}

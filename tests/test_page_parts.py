@@ -37,7 +37,8 @@ from runner.page.history import MAX_SAMPLES, History
 from runner.page.login import COOKIE, PageLogin
 from runner.page.server import PageServer
 from runner.page.viewer import CATCH_UP, HEADER, KEY, MAX_UNITS, RESTART, PageViewer
-from runner.records import CameraSample, LatencyStages, Outcome, Position, Sample
+from runner.records.operator import CameraSample, LatencyStages, Sample
+from runner.records.vehicle import Outcome, Position
 from runner.security import keyring
 from runner.security.authority import Authority
 from runner.security.keyring import Keyring

@@ -22,7 +22,7 @@ from runner.core.model import Mode
 from runner.errors import RunError
 from runner.metrics.side import metrics_of
 from runner.mqtt.link import ControlLink
-from runner.records import CameraTelemetry, Telemetry, VehicleState
+from runner.records.vehicle import CameraTelemetry, Telemetry, VehicleState
 from runner.settings import Endpoint
 
 pytest.importorskip("prometheus_client")

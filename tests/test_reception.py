@@ -14,7 +14,9 @@ from hypothesis import strategies as st
 from runner.core.budget import on_the_wire, video_kbps, wire_kbps
 from runner.core.events import LinkMeasured, LinkState
 from runner.mqtt.messages import MqttMessage, read_reception, topic
-from runner.records import ReceptionReport, ReceptionReported, UnitReceived, line_from_json, line_to_json, to_json
+from runner.records import to_json
+from runner.records.lines import line_from_json, line_to_json
+from runner.records.reception import ReceptionReport, ReceptionReported, UnitReceived
 from runner.schema import MAX_ERRORS
 from runner.vehicle.uplink import MeasuredUplink
 

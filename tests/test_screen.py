@@ -9,7 +9,7 @@ from typing import IO
 
 import pytest
 
-from runner.records import Note
+from runner.records.lines import Note
 from runner.vehicle.live import _Console
 from runner.verbs.screen import progress_bar, say
 from runner.verbs.table import LiveTable, show_summary

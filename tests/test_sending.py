@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from runner.core.events import LinkMeasured, LinkState
-from runner.records import ReceptionReport, ReceptionReported, SentFrame, UnitReceived
+from runner.records.reception import ReceptionReport, ReceptionReported, SentFrame, UnitReceived
 from runner.vehicle.sending import BUSY_S, KEPT_S, ON_ITS_WAY_S, SendingTimes
 from runner.vehicle.uplink import MeasuredUplink
 

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from runner.drive.read import Side
-from runner.records import Sample, VideoBegan, VideoShifted
+from runner.records.lines import VideoBegan, VideoShifted
+from runner.records.operator import Sample
 from runner.system.clocks import SECOND_NS
 
 if TYPE_CHECKING:

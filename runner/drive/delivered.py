@@ -42,7 +42,8 @@ from runner.errors import RunError
 from runner.h264.access_unit import coded_picture
 from runner.rate_quality.metrics.interface import Luma
 from runner.rate_quality.metrics.mssim import metric
-from runner.records import DecisionMade, Sample
+from runner.records.decisions import DecisionMade
+from runner.records.operator import Sample
 from runner.system.clocks import SECOND_NS
 
 if TYPE_CHECKING:

@@ -12,7 +12,10 @@ from runner.core.events import to_json as event_to_json
 from runner.drive.captures import ReadVideo, RecordedVideo, files
 from runner.drive.read import Drive, Side
 from runner.errors import RunError
-from runner.records import KINDS, Json, Note, Position, Record, Sample, line_to_json
+from runner.records import Json
+from runner.records.lines import KINDS, Note, Record, line_to_json
+from runner.records.operator import Sample
+from runner.records.vehicle import Position
 from runner.system.clocks import SECOND_NS
 
 if TYPE_CHECKING:

@@ -22,22 +22,22 @@ from msgspec import UNSET, UnsetType
 from runner.core.events import Event, describe, to_json
 from runner.core.step import Run
 from runner.errors import ArgumentError, RunError, UserError, reason
-from runner.records import (
+from runner.records import Json
+from runner.records.decisions import DecisionMade
+from runner.records.lines import (
     Began,
     ClockSet,
-    DecisionMade,
     Ended,
-    Json,
     LinesDropped,
     LinkSample,
     Note,
-    ReceptionReported,
     Record,
-    Telemetry,
     VideoBegan,
     VideoShifted,
     line_to_json,
 )
+from runner.records.reception import ReceptionReported
+from runner.records.vehicle import Telemetry
 from runner.redact import redacted
 
 FORMAT = 2

@@ -13,7 +13,9 @@ from runner.drive.captures import ReadVideo
 from runner.drive.exported import NOTE_TOPIC, POSITION_TOPIC, cameras_of, write_all
 from runner.drive.read import Drive
 from runner.errors import RunError, reason
-from runner.records import Json, Note, Position, line_to_json
+from runner.records import Json
+from runner.records.lines import Note, line_to_json
+from runner.records.vehicle import Position
 from runner.schema import referred
 from runner.system.clocks import SECOND_NS
 

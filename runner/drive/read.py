@@ -18,20 +18,10 @@ from msgspec import UNSET
 from runner.core.events import Event, parse
 from runner.drive.log import FILES, FORMAT
 from runner.errors import UserError, os_errors_as
-from runner.records import (
-    KINDS,
-    Began,
-    ClockSet,
-    Ended,
-    Json,
-    LinesDropped,
-    LinkSample,
-    ReceptionReported,
-    Record,
-    Sample,
-    from_json,
-    line_from_json,
-)
+from runner.records import Json, from_json
+from runner.records.lines import KINDS, Began, ClockSet, Ended, LinesDropped, LinkSample, Record, line_from_json
+from runner.records.operator import Sample
+from runner.records.reception import ReceptionReported
 from runner.schema import event_problem, log_problem, read_json
 from runner.system.clocks import KEPT_S
 

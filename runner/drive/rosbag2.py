@@ -14,7 +14,9 @@ from runner.drive.captures import ReadVideo
 from runner.drive.exported import NOTE_TOPIC, POSITION_TOPIC, VIDEO_TOPICS, cameras_of, write_all
 from runner.drive.read import Drive
 from runner.errors import RunError, os_errors_as
-from runner.records import Json, Note, Position, line_to_json
+from runner.records import Json
+from runner.records.lines import Note, line_to_json
+from runner.records.vehicle import Position
 from runner.system.clocks import SECOND_NS
 
 if TYPE_CHECKING:

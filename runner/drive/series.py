@@ -23,21 +23,11 @@ from runner.drive.log import FILES
 from runner.drive.read import Drive, Side
 from runner.errors import UserError
 from runner.pqos.bandwidth_map import EARTH_M
-from runner.records import (
-    CameraDecision,
-    CameraSample,
-    CameraTelemetry,
-    ClockSet,
-    DecisionMade,
-    LinkSample,
-    Note,
-    Position,
-    ReceptionReported,
-    Record,
-    Sample,
-    Telemetry,
-    VehicleState,
-)
+from runner.records.decisions import CameraDecision, DecisionMade
+from runner.records.lines import ClockSet, LinkSample, Note, Record
+from runner.records.operator import CameraSample, Sample
+from runner.records.reception import ReceptionReported
+from runner.records.vehicle import CameraTelemetry, Position, Telemetry, VehicleState
 from runner.system.clocks import STEP_S
 
 FloatSeries = NDArray[np.float64]

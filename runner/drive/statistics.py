@@ -30,7 +30,7 @@ from runner.drive.series import (
     spans,
 )
 from runner.rate_quality.curves import interpolated
-from runner.records import SLOW, SLOW_S
+from runner.records.vehicle import SLOW, SLOW_S
 
 SAMPLED_S = 0.25  # as the operator samples bitrates
 

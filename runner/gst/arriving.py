@@ -7,7 +7,7 @@ from collections import deque
 from dataclasses import dataclass
 from math import inf
 
-from runner.records import Arrival, ArrivedPacket
+from runner.records.reception import Arrival, ArrivedPacket
 
 MAX_FRAMES, MAX_PACKETS = 1024, 16_384  # not taken yet; beyond that the oldest are dropped
 TAIL_S = 0.01  # a frame whose last packet is missing counts as ended after this long without a packet ...

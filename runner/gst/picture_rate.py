@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 
 from runner.gst.allowance import Allowance
-from runner.records import SLOW, SLOW_S
+from runner.records.vehicle import SLOW, SLOW_S
 
 WINDOW_S = 2.0  # over which the rate is measured
 SPAN_S = 0.4  # the fastest part of that, as long as this, counts for the encoder: a stall is no lower rate

@@ -26,7 +26,7 @@ from runner.gst.video_files import VideoFile, VideoFiles
 from runner.gst.viewers import user_agent
 from runner.h264.access_unit import AccessUnit, read_unit
 from runner.h264.damage import HEAD_BYTES, Damage
-from runner.records import Arrival, ArrivedPacket
+from runner.records.reception import Arrival, ArrivedPacket
 from runner.system.held_up import LateCheck
 from runner.system.recent import RecentValue
 

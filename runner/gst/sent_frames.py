@@ -8,7 +8,7 @@ from collections import deque
 from gi.repository import Gst
 
 from runner.gst.clocks import unix_time
-from runner.records import SentFrame
+from runner.records.reception import SentFrame
 
 MAX_FRAMES = 256  # not taken yet; beyond that the oldest are dropped
 TICKS = 2**32  # of an RTP timestamp, which then starts over (RFC 3550)

@@ -22,7 +22,7 @@ from runner.link import netns
 from runner.link.ends import Ends
 from runner.link.limit import Limit, LinkCounters
 from runner.link.relayed import relayed
-from runner.records import LinkSample
+from runner.records.lines import LinkSample
 from runner.settings import Endpoint
 
 __all__ = ["KINDS", "Limit", "LimitedLink", "check_possible", "limited_link"]

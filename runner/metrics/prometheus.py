@@ -20,7 +20,8 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.exposition import ThreadingWSGIServer
 from prometheus_client.registry import Collector
 
-from runner.records import Sample, Telemetry, VehicleState
+from runner.records.operator import Sample
+from runner.records.vehicle import Telemetry, VehicleState
 from runner.settings import Endpoint
 from runner.system.ports import check_port_free
 

@@ -25,16 +25,9 @@ import re
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from runner.records import (
-    ClockAnswer,
-    ReceptionReport,
-    Reply,
-    Settings,
-    SteeringAngle,
-    Telemetry,
-    VehicleState,
-    from_json,
-)
+from runner.records import from_json
+from runner.records.reception import ReceptionReport
+from runner.records.vehicle import ClockAnswer, Reply, Settings, SteeringAngle, Telemetry, VehicleState
 from runner.schema import message_problem, read_json, shortened
 
 OFFLINE = {"online": False}

@@ -17,7 +17,9 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from runner.mqtt.messages import MqttMessage, read_clock
-from runner.records import Arrival, CameraState, CameraTelemetry, LatencyStages
+from runner.records.operator import LatencyStages
+from runner.records.reception import Arrival
+from runner.records.vehicle import CameraState, CameraTelemetry
 from runner.system.clocks import KEPT_S, MOST_DRIFT, STEP_S, ClockComparison, ClockDifference, Exchange
 from runner.system.kernel_clock import clock_error_s, wall_ahead_s
 from runner.system.recent import CURRENT_S

@@ -27,7 +27,8 @@ from runner.metrics.side import SideMetrics, metrics_of
 from runner.operator.log import DriveLog
 from runner.operator.station import Listener, Station
 from runner.plans import compile_plans
-from runner.records import Outcome, Sample, VehicleState
+from runner.records.operator import Sample
+from runner.records.vehicle import Outcome, VehicleState
 from runner.security.exposure import viewer_keyring
 from runner.settings import Setup
 from runner.system.held_up import LateCheck

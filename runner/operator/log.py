@@ -6,7 +6,9 @@ from dataclasses import replace
 
 from runner.drive.log import Log
 from runner.operator.station import Listener, Station
-from runner.records import CameraSample, Note, Offline, Sample, VehicleState
+from runner.records.lines import Note
+from runner.records.operator import CameraSample, Sample
+from runner.records.vehicle import Offline, VehicleState
 
 
 class DriveLog(Listener):

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from statistics import median
 from typing import TYPE_CHECKING
 
-from runner.records import CameraState
+from runner.records.vehicle import CameraState
 
 if TYPE_CHECKING:
     from runner.apply import Reception

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from runner.core.events import EVENTS
-from runner.records import CameraState, VehicleState
+from runner.records.vehicle import CameraState, VehicleState
 
 # First words of a note, by the event that caused the decision, where its name is not enough; fields as in
 # `runner.core.events.describe`.

@@ -8,7 +8,7 @@ from itertools import accumulate
 from math import inf
 from typing import NamedTuple
 
-from runner.records import ArrivedPacket
+from runner.records.reception import ArrivedPacket
 
 KEPT = 4096  # packets, those of a second at 40 Mbit/s: a frame that takes longer to arrive is not counted
 

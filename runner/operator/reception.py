@@ -6,7 +6,7 @@ from msgspec import UNSET
 
 from runner.operator.latency import Latency
 from runner.operator.packet_count import PacketCount
-from runner.records import Arrivals, ReceptionReport, UnitReceived
+from runner.records.reception import Arrivals, ReceptionReport, UnitReceived
 
 
 class ReceptionReports:

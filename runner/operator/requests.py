@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from runner.mqtt.messages import JsonObject, MqttMessage, read_reply
-from runner.records import Outcome
+from runner.records.vehicle import Outcome
 
 OnReply = Callable[[Outcome], None]
 

@@ -34,17 +34,11 @@ from runner.operator.meter import MeasuredRates, ReceptionMeter
 from runner.operator.notes import change_notes
 from runner.operator.reception import ReceptionReports
 from runner.operator.requests import OnReply, Requests
-from runner.records import (
-    Arrivals,
-    CameraSample,
-    CameraState,
-    CameraTelemetry,
-    Note,
-    Sample,
-    Telemetry,
-    VehicleState,
-    to_json,
-)
+from runner.records import to_json
+from runner.records.lines import Note
+from runner.records.operator import CameraSample, Sample
+from runner.records.reception import Arrivals
+from runner.records.vehicle import CameraState, CameraTelemetry, Telemetry, VehicleState
 from runner.security.keyring import Keyring
 from runner.settings import Setup
 from runner.system.held_up import LateCheck

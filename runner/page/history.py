@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Any
 
-from runner.records import Sample
+from runner.records.operator import Sample
 
 EVERY_S = 1.0
 MAX_SAMPLES = 300  # five minutes

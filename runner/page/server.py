@@ -33,7 +33,10 @@ from runner.page.login import PageLogin
 from runner.page.tls import PageTls
 from runner.page.viewer import PageViewer
 from runner.page.windows import Windows
-from runner.records import Note, Outcome, Sample, VehicleState, state_to_json, to_json
+from runner.records import to_json
+from runner.records.lines import Note
+from runner.records.operator import Sample
+from runner.records.vehicle import Outcome, VehicleState, state_to_json
 from runner.security.keyring import Keyring
 from runner.settings import Setup
 from runner.system.files import plotly_script

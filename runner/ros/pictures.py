@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from runner.core.intrinsics import Intrinsics, delivered_intrinsics
 from runner.core.model import Camera, Roi
-from runner.records import CameraState
+from runner.records.vehicle import CameraState
 from runner.ros.inputs import check_names, ros_name
 from runner.ros.process import NodeProcess, check_discovery
 from runner.settings import Setup

@@ -7,16 +7,10 @@ from collections.abc import Iterator
 
 from runner.core.decision import Decision
 from runner.core.step import Run
-from runner.records import (
-    CameraReading,
-    CameraTelemetry,
-    Record,
-    SpeedAdvice,
-    Telemetry,
-    VehicleState,
-    applied_to_json,
-    to_json,
-)
+from runner.records import to_json
+from runner.records.decisions import applied_to_json
+from runner.records.lines import Record
+from runner.records.vehicle import CameraReading, CameraTelemetry, SpeedAdvice, Telemetry, VehicleState
 from runner.settings import Setup
 from runner.vehicle import publishing
 from runner.vehicle.publishing import REASONS_S, STATE_S

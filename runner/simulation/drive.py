@@ -17,7 +17,7 @@ from runner.core.step import Run
 from runner.link.limit import TcpFlows
 from runner.link.losses import LossModel
 from runner.pqos import Pqos
-from runner.records import Arrival, ReceptionReported
+from runner.records.reception import Arrival, ReceptionReported
 from runner.settings import Setup
 from runner.simulation.control import ControlMessages, segments
 from runner.simulation.encoder import Encoder, EncoderModel

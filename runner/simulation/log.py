@@ -13,17 +13,11 @@ from runner.core.events import BitratePredicted, Event, describe
 from runner.core.model import Vehicle, plain
 from runner.core.step import Run
 from runner.drive.log import Log
-from runner.records import (
-    Arrival,
-    CameraSample,
-    CameraTelemetry,
-    LatencyStages,
-    LinkSample,
-    ReceptionReported,
-    Sample,
-    Telemetry,
-    applied_to_json,
-)
+from runner.records.decisions import applied_to_json
+from runner.records.lines import LinkSample
+from runner.records.operator import CameraSample, LatencyStages, Sample
+from runner.records.reception import Arrival, ReceptionReported
+from runner.records.vehicle import CameraTelemetry, Telemetry
 from runner.simulation.control import vehicle_state
 from runner.simulation.drive import Recorder, Simulation
 from runner.simulation.operator import Frame

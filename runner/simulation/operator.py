@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from msgspec import UNSET
 
-from runner.records import Arrival, ReceptionReport, UnitReceived
+from runner.records.reception import Arrival, ReceptionReport, UnitReceived
 
 RUN = 1  # of the operator's side
 # As in runner.gst.arriving and runner.gst.repair, which this package cannot import.

@@ -12,7 +12,7 @@ from runner.core.events import ClockAdvanced, ControlPassed, Event, OperatorConn
 from runner.core.step import Run, start, step
 from runner.errors import RunError
 from runner.pqos import Pqos
-from runner.records import ReceptionReport, ReceptionReported, SentFrame
+from runner.records.reception import ReceptionReport, ReceptionReported, SentFrame
 from runner.settings import Setup
 from runner.simulation.encoder import Encoder
 from runner.vehicle.operators import Operators

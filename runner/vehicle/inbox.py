@@ -8,7 +8,8 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-from runner.records import Outcome, ReceptionReport
+from runner.records.reception import ReceptionReport
+from runner.records.vehicle import Outcome
 
 MAX_QUEUED = 64  # requests of one sender; further ones are refused
 ROUND_S = 0.1

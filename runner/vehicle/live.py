@@ -42,16 +42,8 @@ from runner.mqtt.messages import (
     topic,
 )
 from runner.plans import as_offered, compile_plans, render_missing
-from runner.records import (
-    ClockAnswer,
-    Outcome,
-    Settings,
-    SpeedAdvice,
-    SteeringAngle,
-    Telemetry,
-    VehicleState,
-    to_json,
-)
+from runner.records import to_json
+from runner.records.vehicle import ClockAnswer, Outcome, Settings, SpeedAdvice, SteeringAngle, Telemetry, VehicleState
 from runner.security.exposure import vehicle_keyring
 from runner.security.keyring import Keyring
 from runner.settings import Setup

@@ -29,7 +29,8 @@ from runner.core.events import (
 )
 from runner.core.step import Run, start, step
 from runner.pqos import Pqos
-from runner.records import CameraReading, Outcome, ReceptionReport, ReceptionReported, SentFrame, Telemetry
+from runner.records.reception import ReceptionReport, ReceptionReported, SentFrame
+from runner.records.vehicle import CameraReading, Outcome, Telemetry
 from runner.schema import event_problem, shortened
 from runner.settings import Setup
 from runner.system.held_up import LateCheck

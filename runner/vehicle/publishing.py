@@ -11,7 +11,8 @@ from msgspec import UNSET
 from runner.core.events import Attention, PositionReported, SteeringReported
 from runner.core.model import plain
 from runner.core.step import Run
-from runner.records import (
+from runner.records.decisions import applied_to_json
+from runner.records.vehicle import (
     CameraReading,
     CameraState,
     CameraTelemetry,
@@ -20,7 +21,6 @@ from runner.records import (
     SteeringAngle,
     Telemetry,
     VehicleState,
-    applied_to_json,
 )
 from runner.settings import LatencyLimit
 

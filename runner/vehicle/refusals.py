@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from runner.records import Outcome
+from runner.records.vehicle import Outcome
 from runner.vehicle.inbox import Request
 
 REFUSALS = 10  # answered per sender between two ticks; further ones are only counted

@@ -10,7 +10,7 @@ from runner.core.commands import Command, KnobValues
 from runner.core.events import Event
 from runner.core.step import Run
 from runner.mqtt.messages import APPLY_S
-from runner.records import CameraReading, Outcome
+from runner.records.vehicle import CameraReading, Outcome
 from runner.vehicle.inbox import Answer
 
 _Kind = tuple[type, str | None]  # of a request: its event, and the camera that it names

@@ -16,7 +16,7 @@ from operator import attrgetter
 
 from msgspec import UNSET
 
-from runner.records import ReceptionReported, SentFrame
+from runner.records.reception import ReceptionReported, SentFrame
 
 BUSY_S = 0.04  # between two looks at a payloader, twice the usual time
 KEPT_S = 5.0  # a frame that arrives later is not looked up, and one that has not arrived by then is lost

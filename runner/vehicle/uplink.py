@@ -13,7 +13,7 @@ from runner.core.budget import on_the_wire
 from runner.core.events import LinkMeasured
 from runner.core.evidence import EvidenceMemory, LinkReport, ReceivedUnit, observe, rounded, summarise
 from runner.core.model import Graph, Vehicle, exact
-from runner.records import ReceptionReported, UnitReceived
+from runner.records.reception import ReceptionReported, UnitReceived
 from runner.vehicle.operators import PRESENT_S
 
 ROUND_TRIPS = 64  # remembered; the smallest is the round trip

@@ -38,7 +38,7 @@ from typing import Any, BinaryIO
 from runner.drive.captures import ReadVideo
 from runner.drive.read import Drive, read_drive
 from runner.errors import ArgumentError, RunError, UserError, os_errors_as
-from runner.records import VideoBegan
+from runner.records.lines import VideoBegan
 from runner.system import signals
 from runner.system.files import unfinished, unfinished_directory
 from runner.verbs import Arguments

@@ -30,7 +30,7 @@ from runner.configuration.config import configuration
 from runner.core.model import Camera, Vehicle
 from runner.errors import ArgumentError, RunError, suggest
 from runner.operator.station import Listener
-from runner.records import Note
+from runner.records.lines import Note
 from runner.security.exposure import KeysOfAll, page_keyring
 from runner.settings import Setup
 from runner.system.signals import stopping

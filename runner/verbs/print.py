@@ -35,7 +35,8 @@ from runner.core.step import start, step
 from runner.errors import ArgumentError, MissingBindings
 from runner.graph import Plan, may_lack_parameter_sets
 from runner.plans import compile_plans
-from runner.records import CameraDecision, to_json
+from runner.records import to_json
+from runner.records.decisions import CameraDecision
 from runner.redact import redacted
 from runner.verbs import Arguments
 

@@ -56,7 +56,9 @@ from runner.core.step import Run, start, step
 from runner.drive.log import FILES, Log, check_free
 from runner.drive.read import OTHER_KINDS, REPORTS, check_began, is_log, read_line, read_lines, text_lines
 from runner.errors import ArgumentError, UserError, os_errors_as
-from runner.records import KINDS, Began, ClockSet, ReceptionReported, decision_to_json, line_from_json
+from runner.records.decisions import decision_to_json
+from runner.records.lines import KINDS, Began, ClockSet, line_from_json
+from runner.records.reception import ReceptionReported
 from runner.schema import log_problem
 from runner.system.files import whole_file
 from runner.verbs import Arguments

@@ -20,7 +20,7 @@ from rich.text import Text
 
 from runner.operator.meter import ReceptionMeter, middle, percentile
 from runner.operator.station import CameraRow, Listener
-from runner.records import Note
+from runner.records.lines import Note
 from runner.redact import printable
 from runner.system.signals import urgent
 from runner.verbs.screen import forgiving

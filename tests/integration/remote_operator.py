@@ -20,7 +20,7 @@ from runner.drive.log import Log
 from runner.operator.live import LiveOperator
 from runner.operator.station import Listener, Station
 from runner.plans import compile_plans
-from runner.records import Note
+from runner.records.lines import Note
 from runner.security.exposure import viewer_keyring
 
 ASK_S = 0.1

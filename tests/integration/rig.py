@@ -25,7 +25,10 @@ from runner.errors import RunError
 from runner.graph import FEEDBACK, Plan
 from runner.link.netns import _check_allowed
 from runner.operator.station import Listener
-from runner.records import Note, Sample, VehicleState, state_to_json, to_json
+from runner.records import to_json
+from runner.records.lines import Note
+from runner.records.operator import Sample
+from runner.records.vehicle import VehicleState, state_to_json
 from runner.security.keyring import Keyring
 
 CHECKOUT = Path(__file__).resolve().parents[2]

@@ -11,7 +11,8 @@ from typing import Any
 from runner.apply import Reception
 from runner.core.commands import Command, KnobValue
 from runner.graph import Plan
-from runner.records import Arrivals, CameraReading, SentFrame
+from runner.records.reception import Arrivals, SentFrame
+from runner.records.vehicle import CameraReading
 
 FRAMES = 5  # delivered by a sending camera between two samples
 FRAME_BYTES = 1000

@@ -23,7 +23,8 @@ from runner.core.step import start, step
 from runner.h264.access_unit import read_unit
 from runner.operator.station import LinkState
 from runner.page.server import PageServer
-from runner.records import CameraState, VehicleState, applied_to_json
+from runner.records.decisions import applied_to_json
+from runner.records.vehicle import CameraState, VehicleState
 
 MARKS = [
     pytest.mark.gst,

@@ -12,7 +12,7 @@ from runner.drive.captures import files, received
 from runner.drive.read import read_drive
 from runner.drive.series import series
 from runner.drive.statistics import statistics
-from runner.records import ClockSet
+from runner.records.lines import ClockSet
 
 YEAR_S = 365.25 * 86400
 IN_1970_S = 100.0

@@ -13,7 +13,7 @@ from recipes import FIREWALLS, SRT, TWO_MACHINES, WIREGUARD, Site, files, watche
 
 from rig import needs_root, process, until
 from runner.drive.read import read_drive
-from runner.records import Sample
+from runner.records.operator import Sample
 
 pytestmark = needs_root
 VEHICLE, OPERATOR = "10.0.0.2", "10.0.0.1"

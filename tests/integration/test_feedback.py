@@ -14,7 +14,9 @@ from rig import NOISE, ROBOT_SIZES, SMALL_ROBOT, Operator, free_port, needs_root
 from runner.core.belief import ABSENT_S
 from runner.core.events import LinkMeasured, LinkState, OperatorConnected
 from runner.drive.read import read_drive
-from runner.records import DecisionMade, LinkSample, ReceptionReported
+from runner.records.decisions import DecisionMade
+from runner.records.lines import LinkSample
+from runner.records.reception import ReceptionReported
 
 pytestmark = [
     pytest.mark.gst,

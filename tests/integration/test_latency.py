@@ -14,7 +14,10 @@ from rig import ROBOT, Operator, clock_ahead, free_port, needs_compiler, needs_r
 from runner.drive.read import read_drive
 from runner.mqtt.link import ControlLink
 from runner.mqtt.messages import topic
-from runner.records import ReceptionReported, Sample, Telemetry, to_json
+from runner.records import to_json
+from runner.records.operator import Sample
+from runner.records.reception import ReceptionReported
+from runner.records.vehicle import Telemetry
 from runner.schema import message_problem
 
 AHEAD_MS, ONE_WAY_MS = 3700, 80

@@ -19,7 +19,7 @@ from runner.drive.read import read_drive
 from runner.errors import RunError
 from runner.mqtt.broker import private_broker
 from runner.operator.frames import live_frames
-from runner.records import Sample
+from runner.records.operator import Sample
 from runner.settings import Endpoint
 
 NAN = b'{"id": "n", "event": "total_set", "kbps": NaN}'

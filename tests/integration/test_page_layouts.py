@@ -43,16 +43,9 @@ from runner.h264.access_unit import read_unit
 from runner.operator.station import LinkState
 from runner.page.server import PageServer
 from runner.page.viewer import PageViewer
-from runner.records import (
-    CameraSample,
-    CameraState,
-    LatencyStages,
-    Outcome,
-    Position,
-    Sample,
-    VehicleState,
-    applied_to_json,
-)
+from runner.records.decisions import applied_to_json
+from runner.records.operator import CameraSample, LatencyStages, Sample
+from runner.records.vehicle import CameraState, Outcome, Position, VehicleState
 
 pytestmark = [pytest.mark.gst, needs_browser]
 aiohttp = pytest.importorskip("aiohttp")

@@ -23,7 +23,7 @@ from rig import CHECKOUT, SMALL_ROBOT, answers, clock_ahead, free_port, needs_br
 from runner.core.roles import Role
 from runner.drive.read import read_drive
 from runner.mqtt.broker import private_broker
-from runner.records import Sample
+from runner.records.operator import Sample
 from runner.security.authority import Authority
 from runner.settings import Endpoint
 

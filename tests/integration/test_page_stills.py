@@ -12,7 +12,7 @@ from painted import CAMERAS, SIZE, STEERED, STEERED_RAD, WITHIN_PX, ends_of, fou
 from stills import MARKS, Station, on_screen, serving, steering
 
 from browser import PADS, all_live, measure, opened, shot, until
-from runner.records import Sample
+from runner.records.operator import Sample
 
 pytestmark = MARKS
 

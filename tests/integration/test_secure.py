@@ -36,7 +36,7 @@ from runner.mqtt.broker import private_broker
 from runner.mqtt.link import ControlLink
 from runner.mqtt.login import Login
 from runner.operator.live import live_operator
-from runner.records import Sample
+from runner.records.operator import Sample
 from runner.security import keyring
 from runner.security.authority import Authority
 from runner.security.keyring import Keyring, mqtt_password, rtsp_password

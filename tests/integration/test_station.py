@@ -19,7 +19,8 @@ from runner.mqtt.messages import OFFLINE, topic
 from runner.operator.latency import stages
 from runner.operator.meter import MeasuredRates
 from runner.operator.station import SILENT_S, CameraRow, Listener, Station
-from runner.records import Arrival, Arrivals, CameraTelemetry
+from runner.records.reception import Arrival, Arrivals
+from runner.records.vehicle import CameraTelemetry
 from runner.settings import Endpoint
 from runner.verbs.table import _table
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import keyed
 from rig import ROBOT, clock_ahead, free_port, run
 from runner.drive.read import read_drive
-from runner.records import Sample
+from runner.records.operator import Sample
 
 SECONDS, AHEAD_S, FAST_PPM = 600, 3.7, 50
 SETTLED_S = 10.0  # before, a few exchanges between sides that are still starting leave a wider bound

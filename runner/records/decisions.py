@@ -1,0 +1,109 @@
+"""What was decided, commanded and applied, as records."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from msgspec import UNSET, UnsetType
+
+from runner.core.commands import Command, KnobValues
+from runner.core.decision import Believed, Decision, Setting
+from runner.core.model import Count, Limits, Mode, Roi, plain
+from runner.records import Amount, CameraName, Json, Number, Time, to_json
+
+Applied = Annotated[Mapping[str, Any], "by knob, the value read back; empty for a camera without a pipeline"]
+
+
+@dataclass(frozen=True, slots=True)
+class CameraDecision:
+    """The decision for one camera, see `runner.core.decision.Setting`.
+
+    on             whether the camera is switched on
+    sending        whether anything of it is encoded
+    demand_kbps    Eq. (1), kbit/s
+    kbps           allocated, kbit/s
+    scaling        selected factor; None while the camera is off or its source cannot be opened
+    width, height  of the encoded picture, px; 0 while the camera is off
+    reason         why, in words
+    """
+
+    on: bool
+    sending: bool
+    demand_kbps: Amount
+    kbps: Count
+    scaling: Annotated[Number, Limits(above=0, most=1)] | None
+    roi: Roi
+    width: Count
+    height: Count
+    reason: str
+
+    @classmethod
+    def of(cls, setting: Setting) -> CameraDecision:
+        return cls(**decided(setting))
+
+
+@dataclass(frozen=True, slots=True)
+class Turned:
+    """A knob of a camera that was turned.
+
+    value  the new one
+    """
+
+    camera: CameraName
+    knob: Annotated[str, Limits(among=("sending", "roi", "size", "bitrate")), "name of the knob"]
+    value: Any
+
+
+@dataclass(frozen=True, slots=True)
+class DecisionMade:
+    """A decision that changed something, its cause, and the resulting commands.
+
+    cause       the event that it comes from, in words
+    total_kbps  before the cap at demand, kbit/s
+    cameras     settings by camera
+    commands    knobs that were turned
+    believed    absent: no rule believes anything of the uplink
+    """
+
+    t: Time
+    cause: str
+    mode: Mode
+    total_kbps: Amount
+    cameras: Mapping[str, CameraDecision]
+    commands: tuple[Turned, ...]
+    believed: Believed | UnsetType = UNSET
+
+    @classmethod
+    def of(cls, t: float, cause: str, decision: Decision, commands: tuple[Command, ...]) -> DecisionMade:
+        cameras = {name: CameraDecision.of(setting) for name, setting in decision.settings.items()}
+        turned = tuple(Turned(**command.to_json()) for command in commands)
+        believed = decision.believed or UNSET
+        return cls(t, cause, decision.mode, plain(decision.total), cameras, turned, believed)
+
+
+def decision_to_json(decision: Decision) -> Json:
+    """The JSON object of a decision; without an intermediate record, since a replay writes thousands per second."""
+    cameras = {name: decided(setting) | {"roi": setting.roi.to_json()} for name, setting in decision.settings.items()}
+    document = {"mode": decision.mode, "total_kbps": plain(decision.total), "cameras": cameras}
+    return document if decision.believed is None else {**document, "believed": to_json(decision.believed)}
+
+
+def applied_to_json(camera: str, knobs: KnobValues) -> Applied:
+    """Current values of a camera's knobs, by name."""
+    return {knob: Command(camera, knob, value).to_json()["value"] for knob, value in knobs.items()}
+
+
+def decided(setting: Setting) -> Json:
+    return {
+        "on": setting.on,
+        "sending": setting.sending,
+        "demand_kbps": plain(setting.demand),
+        "kbps": setting.kbps,
+        "scaling": None if setting.scaling is None else plain(setting.scaling),
+        "roi": setting.roi,
+        "width": setting.width,
+        "height": setting.height,
+        "reason": setting.reason,
+    }

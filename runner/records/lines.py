@@ -1,0 +1,186 @@
+"""Lines of a drive's log: all their kinds, and those that nothing publishes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import msgspec
+from msgspec import UNSET, UnsetType
+
+from runner.core.model import Count, Limits, NonNegative
+from runner.records import CameraName, Json, Time, from_json, to_json
+from runner.records.decisions import DecisionMade
+from runner.records.operator import Sample
+from runner.records.reception import ReceptionReported
+from runner.records.vehicle import Offline, Telemetry, VehicleState
+
+Since1970 = Annotated[float, Limits(0, 2**32 - 1)]
+File = Annotated[str, "relative to the directory of the drive"]
+
+
+@dataclass(frozen=True, slots=True)
+class Began:
+    """First line of a log: side, versions and configuration.
+
+    side      who wrote it
+    format    version of the format
+    time      its start, s since 1970
+    versions  of the software in use, by name
+    config    the composed configuration
+    replayed  words of the replay that decided it anew, without input and output; absent: it was driven
+    """
+
+    t: Time
+    side: Annotated[str, Limits(among=("vehicle", "operator", "link"))]
+    format: Annotated[int, Limits(1)]
+    time: Since1970
+    versions: Mapping[str, str]
+    config: Mapping[str, Any]
+    replayed: tuple[str, ...] | UnsetType = UNSET
+
+
+@dataclass(frozen=True, slots=True)
+class Note:
+    """A note for the user.
+
+    text  one sentence
+    """
+
+    t: Time
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class VideoBegan:
+    """A video file has started.
+
+    captured  capture time of its first frame, s since 1970
+    """
+
+    t: Time
+    camera: CameraName
+    file: File
+    captured: Since1970
+
+
+@dataclass(frozen=True, slots=True)
+class VideoShifted:
+    """From a frame on, the offset of times in a video file changes, by a pause or a receiver that smooths them.
+
+    after_s   s from the file's first frame to this one, by the file
+    captured  capture time of this one, s since 1970
+    """
+
+    t: Time
+    camera: CameraName
+    file: File
+    after_s: NonNegative
+    captured: Since1970
+
+
+@dataclass(frozen=True, slots=True)
+class LinkSample:
+    """State of the limited link between the sides; counters run since it was made.
+
+    kbps       rate in force, kbit/s
+    queue_ms   how long a packet that arrives now waits, ms
+    bytes, packets  forwarded from vehicle to operator
+    dropped    packets that its queue dropped
+    lost       packets lost at random, after the queue
+    tcp_bytes  that competing TCP flows have delivered, without headers
+    """
+
+    t: Time
+    kbps: NonNegative
+    queue_ms: NonNegative
+    bytes: Count
+    packets: Count
+    dropped: Count
+    lost: Count = 0
+    tcp_bytes: Count = 0
+
+
+@dataclass(frozen=True, slots=True)
+class ClockSet:
+    """The wall clock of this side's machine was set; `t` does not follow it.
+
+    by_s  how far forward, s
+    """
+
+    t: Time
+    by_s: Annotated[float, Limits(1 - 2**32, 2**32 - 1)]
+
+
+@dataclass(frozen=True, slots=True)
+class LinesDropped:
+    """Lines were not written because the disk was too slow.
+
+    lines  their number
+    """
+
+    t: Time
+    lines: Annotated[int, Limits(1)]
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """Last line of a log that was closed."""
+
+    t: Time
+
+
+Record = (
+    Began
+    | DecisionMade
+    | Telemetry
+    | VehicleState
+    | Offline
+    | Sample
+    | ReceptionReported
+    | Note
+    | VideoBegan
+    | VideoShifted
+    | LinkSample
+    | ClockSet
+    | LinesDropped
+    | Ended
+)
+
+KINDS: dict[type[Any], str] = {  # value of a line's key `log`
+    Began: "began",
+    DecisionMade: "decision",
+    Telemetry: "telemetry",
+    VehicleState: "state",
+    Offline: "state",
+    Sample: "sample",
+    ReceptionReported: "reception",
+    Note: "note",
+    VideoBegan: "video",
+    VideoShifted: "video_shift",
+    LinkSample: "link",
+    ClockSet: "clock_set",
+    LinesDropped: "dropped",
+    Ended: "ended",
+}
+
+
+def line_to_json(record: Record) -> Json:
+    """A record as a log line."""
+    document = to_json(record)
+    return {"t": document.pop("t"), "log": KINDS[type(record)], **document}
+
+
+def line_from_json(document: Mapping[str, Any]) -> Record:
+    """The record described by a log line that satisfies its schema."""
+    kind = _BY_KIND[document["log"]]
+    kind = Offline if kind is VehicleState and not document["online"] else kind
+    try:
+        record: Record = from_json(kind, document)
+    except msgspec.ValidationError:  # to a schema, 1920.0 is a whole number, too
+        record = msgspec.convert(document, kind, strict=False)
+    return record
+
+
+_BY_KIND: dict[str, type[Any]] = {name: kind for kind, name in KINDS.items() if kind is not Offline}
