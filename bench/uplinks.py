@@ -35,10 +35,11 @@ from numpy.typing import NDArray
 from runner.configuration.config import configuration
 from runner.core.budget import wire_kbps
 from runner.core.model import Camera, exact, plain
+from runner.drive.camera_series import CameraSeries
 from runner.drive.log import FILES
 from runner.drive.quality_file import DOCUMENT, DeliveredQuality, read_quality
 from runner.drive.read import Drive, read_drive
-from runner.drive.series import CameraSeries, Series, series
+from runner.drive.series import Series, series
 from runner.drive.statistics import statistics
 from runner.records.decisions import DecisionMade
 from runner.records.lines import LinkSample

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from runner.drive.series import ReceivedSeries, Sent
+from runner.drive.camera_series import ReceivedSeries, Sent
 from runner.records.lines import LinkSample
 
 pytestmark = pytest.mark.slow  # imports matplotlib

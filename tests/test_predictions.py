@@ -11,8 +11,9 @@ from drives import believing, write_drive
 from runner.drive.figures import figures
 from runner.drive.predictions import EVERY_S, Compared, compared, worth
 from runner.drive.read import read_drive
-from runner.drive.series import FloatSeries, series
+from runner.drive.series import series
 from runner.drive.statistics import statistics
+from runner.drive.time_series import FloatSeries
 
 T = np.arange(0.0, 60.0, EVERY_S)
 LEVELS = np.exp(np.random.default_rng(1).normal(8, 0.5, 40))  # one for each two seconds

@@ -13,10 +13,13 @@ from helpers import vehicle
 
 from runner.configuration.compose import compose
 from runner.core.events import CameraSwitched
+from runner.drive.camera_series import sending_spans
+from runner.drive.panels import panels
 from runner.drive.read import read_drive
-from runner.drive.series import TimeSeries, counted, held, mean_held, panels, rate, sending_spans, series, spans
+from runner.drive.series import series
 from runner.drive.statistics import statistics
 from runner.drive.tables import camera_rows
+from runner.drive.time_series import TimeSeries, counted, held, mean_held, rate, spans
 from runner.errors import UserError
 
 NAN = float("nan")

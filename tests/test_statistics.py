@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from drives import write_drive, write_model
 
+from runner.drive.camera_series import CameraSeries, DecidedSeries, ReceivedSeries, Sent
 from runner.drive.latency import Freeze, Latency, freezes, latency, per_second
 from runner.drive.read import read_drive
-from runner.drive.series import CameraSeries, DecidedSeries, ReceivedSeries, Sent, series
+from runner.drive.series import series
 from runner.drive.statistics import (
     CameraStatistics,
     Model,

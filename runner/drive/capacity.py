@@ -15,7 +15,8 @@ import numpy as np
 
 from runner.core.events import LEAST_ERROR
 from runner.core.learned import WRONG
-from runner.drive.series import Flags, FloatSeries, Positions, Series, TimeSeries, held
+from runner.drive.series import Positions, Series
+from runner.drive.time_series import Flags, FloatSeries, TimeSeries, held
 from runner.pqos.bandwidth_map import offset
 
 WINDOW_S = 1.0  # over which the rates of the samples are measured

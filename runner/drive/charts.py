@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from runner.drive.series import FloatSeries
+from runner.drive.time_series import FloatSeries
 
 
 class Axis(NamedTuple):

@@ -9,7 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from runner.drive.checks import ClaimCheck
-from runner.drive.series import FloatSeries, Series, TimeSeries, held, spans
+from runner.drive.series import Series
+from runner.drive.time_series import FloatSeries, TimeSeries, held, spans
 
 SHORTEST_S = 5.0  # length from which a drive is checked
 STEP_S = 0.1  # interval at which step functions are sampled

@@ -12,11 +12,14 @@ from typing import Any
 
 import numpy as np
 
+from runner.drive.camera_series import CameraSeries
 from runner.drive.charts import Axis, Bars, Chart, Curve, Figure, MapTrack, Strip
 from runner.drive.latency import SECOND_S, latencies, per_second, to_arrival
+from runner.drive.panels import Panel
 from runner.drive.predictions import EVERY_S, Compared, compared
-from runner.drive.series import CameraSeries, FloatSeries, Panel, Positions, Series, TimeSeries, held
+from runner.drive.series import Positions, Series
 from runner.drive.statistics import DriveStatistics
+from runner.drive.time_series import FloatSeries, TimeSeries, held
 
 MINUTES_FROM_S = 900.0
 STEP_OFFSET = 0.014  # of the largest factor, between steps that would overlap

@@ -16,9 +16,10 @@ from runner.drive.charts import Chart, Curve, Figure, MapTrack
 from runner.drive.checks import ClaimCheck
 from runner.drive.colours import DAY, NIGHT
 from runner.drive.document import number, rules, when
-from runner.drive.series import FloatSeries, Series
+from runner.drive.series import Series
 from runner.drive.statistics import DriveStatistics
 from runner.drive.tables import LEGEND, VERDICTS, camera_rows, drive_rows, shown
+from runner.drive.time_series import FloatSeries
 from runner.system.files import plotly_script
 
 STATIC = Path(__file__).parent / "static"

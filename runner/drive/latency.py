@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from runner.drive.series import FloatSeries, Series
+from runner.drive.series import Series
+from runner.drive.time_series import FloatSeries
 
 FREEZE_GAPS = 30  # gaps over which the mean is taken (W3C webrtc-stats, freezeCount)
 FREEZE_FACTOR = 3.0  # of the mean gap

@@ -8,7 +8,8 @@ import numpy as np
 
 from runner.core.learned import MEMORY_S
 from runner.drive.capacity import carried
-from runner.drive.series import Flags, FloatSeries, Series, held
+from runner.drive.series import Series
+from runner.drive.time_series import Flags, FloatSeries, held
 
 EVERY_S = 0.1
 CHANGE_S = 0.4  # over which changes are compared

@@ -13,22 +13,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from runner.drive.camera_series import CameraSeries, ReceivedSeries, sending_spans
 from runner.drive.latency import NAN, UNKNOWN, Freeze, Latency, concatenated, freezes, latency
 from runner.drive.predictions import Worth, compared, worth
 from runner.drive.quality_file import DeliveredQuality
-from runner.drive.series import (
-    RATE_WINDOW_S,
-    CameraSeries,
-    Flags,
-    FloatSeries,
-    ReceivedSeries,
-    Series,
-    TimeSeries,
-    held,
-    mean_held,
-    sending_spans,
-    spans,
-)
+from runner.drive.series import Series
+from runner.drive.time_series import RATE_WINDOW_S, Flags, FloatSeries, TimeSeries, held, mean_held, spans
 from runner.rate_quality.curves import interpolated
 from runner.records.vehicle import SLOW, SLOW_S
 

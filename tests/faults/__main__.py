@@ -80,7 +80,7 @@ FAULTS = [
     Fault("link/relay.py", "up.put(len(data) + UDP_HEADERS,", "up.put(len(data) // 2,", "integration/test_link"),
     Fault("drive/latency.py", "FREEZE_FACTOR * means, means + FREEZE_MORE_S", "means, means", "test_statistics"),
     Fault(
-        "drive/series.py",
+        "drive/time_series.py",
         'np.searchsorted(line.t, at, "right") - 1',
         'np.searchsorted(line.t, at, "left") - 1',
         "test_series",
