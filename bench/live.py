@@ -52,7 +52,7 @@ def command_latency(source: Sequence[str], rounds: int) -> Iterator[Row]:
     """From a decision for all cameras to the last encoder that applies it; eight cameras as the demo runs them."""
     setup = _setup([*source, "fps_max=15"])
     with _streaming(setup) as side, _operator([*source, "fps_max=15"]):
-        _until(lambda: all(camera.frames > 30 for camera in side.read().values()))
+        _until(lambda: all(camera.encoded.frames > 30 for camera in side.read().values()))
         for what, sizes in (("bitrate", []), ("bitrate and size", [(960, 520), (480, 260)])):
             last, each = [], []
             for n in range(rounds):

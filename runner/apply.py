@@ -51,7 +51,7 @@ from runner.gst.video_files import VideoFile, VideoFiles
 from runner.gst.watched import WatchedSource
 from runner.inputs import input_problem
 from runner.records.reception import Arrivals, SentFrame
-from runner.records.vehicle import CameraReading
+from runner.records.vehicle import CameraReading, SenderStages
 from runner.settings import Media
 
 if TYPE_CHECKING:
@@ -342,7 +342,7 @@ class VehicleSide:
         lost, copies = self._lost.reasons(), self._server.copies() if self._server else {}
         return {name: self._read(name, lost.get(name), copies.get(name, 0)) for name in self._wanted}
 
-    def stages(self) -> dict[str, tuple[float, float]]:
+    def stages(self) -> dict[str, SenderStages]:
         """By camera, latency from capture to the encoder, and through it, ms; unknown ones are omitted.
 
         To be called a few times a second, from one thread: each call also checks the next picture of each source.
@@ -381,7 +381,7 @@ class VehicleSide:
         if pipeline is None:
             return CameraReading(fault=refusal, lost=lost, copies=copies)
         fault, untimed, slow_fps = pipeline.source_fault or refusal, pipeline.untimed, pipeline.slow_fps
-        return CameraReading(dict(pipeline.knobs.applied), *pipeline.counters(), fault, lost, untimed, slow_fps, copies)
+        return CameraReading(dict(pipeline.knobs.applied), pipeline.counters(), fault, lost, untimed, slow_fps, copies)
 
     def _on_found(self, name: str) -> None:
         """From the thread that tries again. A viewer makes the server open its camera."""

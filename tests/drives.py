@@ -19,7 +19,7 @@ from runner.drive.log import FILES, FORMAT
 from runner.records.decisions import DecisionMade
 from runner.records.lines import LinkSample, line_to_json
 from runner.records.operator import CameraSample, LatencyStages, Sample
-from runner.records.vehicle import CameraState, CameraTelemetry, Position, Telemetry, VehicleState
+from runner.records.vehicle import CameraReading, CameraState, CameraTelemetry, Position, Telemetry, VehicleState
 
 EPOCH = 1_770_000_000.0  # 2026-02-02T02:40:00Z
 OPERATOR_LATER_S = 1.5  # the operator starts logging later than the vehicle
@@ -148,7 +148,8 @@ class _Made:
         self.vehicle_log.append(line_to_json(made))
         if event.t >= OPERATOR_LATER_S or not self.operator_log:
             shifted = max(0.0, round(event.t - OPERATOR_LATER_S + 0.02, 6))
-            cameras = {name: CameraState.at(setting, 1, {}, None) for name, setting in decision.settings.items()}
+            unread = CameraReading()
+            cameras = {name: CameraState.at(setting, 1, name, unread) for name, setting in decision.settings.items()}
             state = VehicleState(shifted, cause, decision.mode, made.total_kbps, plain(decision.asked), cameras)
             self.operator_log.append(line_to_json(state))
 
@@ -187,7 +188,7 @@ class _Made:
         self.arrivals[name].append((round(arrived - OPERATOR_LATER_S, 6), round(ms, 2)))
 
     def _telemetry(self, t: float) -> dict[str, Any]:
-        cameras = {name: CameraTelemetry({}, count["frames"], count["bytes"]) for name, count in self.count.items()}
+        cameras = {name: CameraTelemetry(count["frames"], count["bytes"], {}) for name, count in self.count.items()}
         return line_to_json(Telemetry(t, self._predicted(), self._place(), cameras, self.refused))
 
     def _place(self) -> Position | None:

@@ -52,7 +52,7 @@ class LeftCameras:
         if not pipeline or not watching or any(connection.interleaved for connection in watching):
             self._progress.pop(name, None)
             return
-        frames, since = pipeline.counters()[0], now
+        frames, since = pipeline.counters().frames, now
         if self._progress.get(name, (-1, now))[0] == frames and not (pipeline.paused or pipeline.source_fault):
             since = self._progress[name][1]
         if now - since > BLOCKED_S + 3 * pipeline.frame_s:

@@ -19,10 +19,11 @@ from runner.gst.probes import BufferProbe, PassingBuffer, TypeProbe
 from runner.gst.rate_limit import RateLimits
 from runner.gst.repeats import RepeatDetector
 from runner.gst.requests import RequestLimit
-from runner.gst.sender_stages import EncoderWatch, SenderStages
+from runner.gst.sender_stages import EncoderWatch
 from runner.gst.sent_frames import SentFrames
 from runner.gst.source import loop_clip
 from runner.gst.watched import WatchedSource
+from runner.records.vehicle import NOTHING_ENCODED, EncoderCounts, SenderStages
 
 if TYPE_CHECKING:
     from runner.gst.pushed import PushedPictures
@@ -209,9 +210,9 @@ class CameraPipeline:
         slow = self._rate.slow_fps
         return None if slow is None else max(1, round(slow))
 
-    def counters(self) -> tuple[int, int]:
-        """Frames and bytes that the encoder has output so far, counted in C."""
-        return passed_counts(self._sent) if self._sent else (0, 0)
+    def counters(self) -> EncoderCounts:
+        """What the encoder has output so far, counted in C."""
+        return EncoderCounts(*passed_counts(self._sent)) if self._sent else NOTHING_ENCODED
 
     @property
     def frame_s(self) -> float:

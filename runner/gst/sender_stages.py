@@ -4,23 +4,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable
-from typing import NamedTuple
 
 from gi.repository import Gst
 
 from runner.gst.clocks import captured_at
 from runner.gst.probes import BufferProbe, PassingBuffer
+from runner.records.vehicle import SenderStages
 from runner.system.recent import RecentValue
 
 SAME_S = 1e-4  # capture times of the same picture before and after the encoder differ by less
 MAX_PICTURES = 100  # pictures that leave the encoder before the awaited one is given up
-
-
-class SenderStages(NamedTuple):
-    """Latencies of one picture, ms. capture: to the encoder's input, including conversion, cropping and scaling."""
-
-    capture_ms: float
-    encode_ms: float
 
 
 class EncoderWatch:
@@ -64,7 +57,7 @@ class EncoderWatch:
         if ahead_s < -SAME_S and self._remaining:
             return False  # an earlier picture
         if abs(ahead_s) < SAME_S:  # otherwise the encoder has dropped the picture
-            self._measured.set(SenderStages(capture_ms, 1000 * (now - captured) - capture_ms))
+            self._measured.set(SenderStages(round(capture_ms, 2), round(1000 * (now - captured) - capture_ms, 2)))
         return True
 
 

@@ -34,11 +34,11 @@ from runner.operator.meter import MeasuredRates, ReceptionMeter
 from runner.operator.notes import change_notes
 from runner.operator.reception import ReceptionReports
 from runner.operator.requests import OnReply, Requests
-from runner.records import to_json
+from runner.records import combined, to_json
 from runner.records.lines import Note
 from runner.records.operator import CameraSample, Sample
 from runner.records.reception import Arrivals
-from runner.records.vehicle import CameraState, CameraTelemetry, Telemetry, VehicleState
+from runner.records.vehicle import NOTHING_ENCODED, CameraState, CameraTelemetry, Telemetry, VehicleState
 from runner.security.keyring import Keyring
 from runner.settings import Setup
 from runner.system.held_up import LateCheck
@@ -371,22 +371,15 @@ def _expiring(ends: Mapping[str, float]) -> tuple[str, ...]:
 
 def _camera_sample(row: CameraRow, measured: CameraTelemetry | None) -> CameraSample:
     received, state = row.received, row.state
-    return CameraSample(
+    return combined(
+        CameraSample,
+        measured or NOTHING_ENCODED,
+        received,
         fps=round(row.rates.fps, 1),
         kbps=round(row.rates.kbps, 1),
         allocated_kbps=state.kbps if state else 0,
         demand_kbps=state.demand_kbps if state else 0,
         scaling=state.scaling if state else None,
-        width=received.width,
-        height=received.height,
-        latency_ms=received.latency_ms,
-        lost=received.lost,
-        rebuilt=received.rebuilt,
-        foreign=received.foreign,
-        frames=received.frames,
-        bytes=received.bytes,
         arrivals=(),
-        damaged=received.damaged,
-        buffer_ms=received.buffer_ms,
         stages_ms=stages(received, measured),
     )

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping
+from dataclasses import fields
 from typing import Annotated, Any, TypeVar
 
 import msgspec
@@ -39,6 +40,12 @@ def from_json(kind: type[T], document: Mapping[str, Any]) -> T:
     if kind not in _prepared:
         _prepare(kind)
     return msgspec.convert(document, kind)
+
+
+def combined(kind: type[T], *records: Any, **values: Any) -> T:
+    """A record of some kind from what others have of the same name, of several the last, and from values of its own."""
+    names = [each.name for each in fields(kind)]  # type: ignore[arg-type]
+    return kind(**{key: getattr(of, key) for of in records for key in names if hasattr(of, key)} | values)
 
 
 _preparing = threading.Lock()

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from runner.core.model import Count, NonNegative, Share
 from runner.records import Amount, Number, Time
-from runner.records.vehicle import Position
+from runner.records.vehicle import EncoderCounts, Position
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,7 @@ class LatencyStages:
 
 
 @dataclass(frozen=True, slots=True)
-class CameraSample:
+class CameraSample(EncoderCounts):
     """Reception of one camera. Rates cover the last second, counters run since the start.
 
     fps         frames received, Hz
@@ -38,7 +38,7 @@ class CameraSample:
     allocated_kbps, demand_kbps, scaling  as the vehicle has decided; None while the camera is off or nothing is known
     width, height  of the decoded picture, px; 0 before the first
     lost        RTP packets that never arrived
-    frames, bytes  access units received, and their size
+    frames, bytes  access units received, and their size, not those that the encoder has put out
     damaged     frames whose picture shows packet loss, until it is healed
     buffer_ms   how long a picture waits for retransmitted packets, ms; None: no retransmission
     foreign     packets from senders other than the vehicle, dropped
@@ -60,8 +60,6 @@ class CameraSample:
     latency_ms: float | None
     lost: Count
     rebuilt: Count
-    frames: Count
-    bytes: Count
     damaged: Count
     stages_ms: LatencyStages
     arrivals: tuple[tuple[float, float | None], ...]

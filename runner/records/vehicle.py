@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Annotated, Any, NamedTuple
 
 from msgspec import UNSET, UnsetType
@@ -13,7 +13,7 @@ from runner.core.decision import NOTHING, Believed, Setting
 from runner.core.events import Attention, Latitude, Longitude, PositionReported, Steering
 from runner.core.model import Count, Limits, Mode, NonNegative, Share
 from runner.records import Amount, Clock, Json, Number, Time, to_json
-from runner.records.decisions import Applied, CameraDecision, decided
+from runner.records.decisions import Applied, CameraDecision, applied_to_json, decided
 
 SLOW, SLOW_S = 0.7, 2.0  # a camera is slow if it has delivered less than this share of its rate for so long, s
 
@@ -55,22 +55,14 @@ class CameraState(CameraDecision):
     slow_fps: Annotated[int, Limits(1)] | UnsetType = UNSET
 
     @classmethod
-    def at(
-        cls,
-        setting: Setting,
-        weight: Number,
-        applied: Applied,
-        fault: str | None,
-        untimed: bool = False,
-        slow_fps: int | None = None,
-    ) -> CameraState:
+    def at(cls, setting: Setting, weight: Number, camera: str, reading: CameraReading) -> CameraState:
         return cls(
             **decided(setting),
             weight=weight,
-            applied=applied,
-            fault=fault,
-            untimed=untimed or UNSET,
-            slow_fps=slow_fps or UNSET,
+            applied=applied_to_json(camera, reading.applied),
+            fault=reading.fault or reading.lost,
+            untimed=reading.untimed or UNSET,
+            slow_fps=reading.slow_fps or UNSET,
         )
 
 
@@ -119,16 +111,27 @@ class Offline:
 
 
 @dataclass(frozen=True, slots=True)
-class CameraTelemetry:
-    """Values read back as applied, and the encoder's output since its pipeline was built.
+class EncoderCounts:
+    """What the encoder of a camera counts since its pipeline was built.
 
     frames, bytes  that the encoder has put out
+    """
+
+    frames: Count
+    bytes: Count
+
+
+NOTHING_ENCODED = EncoderCounts(*[0 for _ in fields(EncoderCounts)])
+
+
+@dataclass(frozen=True, slots=True)
+class CameraTelemetry(EncoderCounts):
+    """Values read back as applied, and the encoder's output since its pipeline was built.
+
     capture_ms, encode_ms  ms of the last sampled picture from its capture to the encoder, and through it; None: unknown
     """
 
     applied: Applied
-    frames: Count
-    bytes: Count
     capture_ms: float | None = None
     encode_ms: float | None = None
 
@@ -234,11 +237,17 @@ class Settings:
     settings: Mapping[str, str | int | float | bool | list[Any] | None]
 
 
+class SenderStages(NamedTuple):
+    """Latencies of one picture, ms. capture: to the encoder's input, including conversion, cropping and scaling."""
+
+    capture_ms: float
+    encode_ms: float
+
+
 class CameraReading(NamedTuple):
     """What the elements of a camera on the vehicle say; without a pipeline, as the defaults.
 
     applied        by knob, the values read back
-    frames, bytes  that its encoder has output since its pipeline was built
     fault          of its source: it has failed, is awaited, refuses the login, or repeats a picture; None: none
     lost           why its source cannot be opened; None: it can
     untimed        whether its source does not know the capture time of its last picture
@@ -247,8 +256,7 @@ class CameraReading(NamedTuple):
     """
 
     applied: KnobValues = NOTHING
-    frames: int = 0
-    bytes: int = 0
+    encoded: EncoderCounts = NOTHING_ENCODED
     fault: str | None = None
     lost: str | None = None
     untimed: bool = False

@@ -7,10 +7,17 @@ from collections.abc import Iterator
 
 from runner.core.decision import Decision
 from runner.core.step import Run
-from runner.records import to_json
+from runner.records import combined, to_json
 from runner.records.decisions import applied_to_json
 from runner.records.lines import Record
-from runner.records.vehicle import CameraReading, CameraTelemetry, SpeedAdvice, Telemetry, VehicleState
+from runner.records.vehicle import (
+    NOTHING_ENCODED,
+    CameraReading,
+    CameraTelemetry,
+    SpeedAdvice,
+    Telemetry,
+    VehicleState,
+)
 from runner.settings import Setup
 from runner.vehicle import publishing
 from runner.vehicle.publishing import REASONS_S, STATE_S
@@ -24,7 +31,10 @@ class ControlMessages:
 
     def __init__(self, setup: Setup, run: Run) -> None:
         applied = {name: applied_to_json(name, run.commanded.get(name, {})) for name in setup.vehicle.cameras}
-        cameras = {name: CameraTelemetry(own, 1234, 1_234_567, 1.23, 4.56) for name, own in applied.items()}
+        sizes = {"frames": 1234, "bytes": 1_234_567, "capture_ms": 1.23, "encode_ms": 4.56}
+        cameras = {
+            name: combined(CameraTelemetry, NOTHING_ENCODED, applied=own, **sizes) for name, own in applied.items()
+        }
         self.telemetry = _bytes(Telemetry(12.345678, 1234.5, None, cameras, 0, 0, 1.0))
         self.state = _bytes(
             vehicle_state(run, run.state.t, "link_measured kbps 1234.5 queue_ms 12.3 loss 0 state clear")

@@ -13,13 +13,15 @@ from runner.core.events import BitratePredicted, Event, describe
 from runner.core.model import Vehicle, plain
 from runner.core.step import Run
 from runner.drive.log import Log
+from runner.records import combined
 from runner.records.decisions import applied_to_json
 from runner.records.lines import LinkSample
 from runner.records.operator import CameraSample, LatencyStages, Sample
 from runner.records.reception import Arrival, ReceptionReported
-from runner.records.vehicle import CameraTelemetry, Telemetry
+from runner.records.vehicle import CameraTelemetry, EncoderCounts, Telemetry
 from runner.simulation.control import vehicle_state
 from runner.simulation.drive import Recorder, Simulation
+from runner.simulation.encoder import Encoder
 from runner.simulation.operator import Frame
 
 TELEMETRY_TICKS = 2
@@ -109,7 +111,7 @@ class DriveFiles(Recorder):
     def _telemetry(self, t: float, simulation: Simulation) -> Telemetry:
         commanded = simulation.vehicle.run.commanded
         cameras = {
-            name: CameraTelemetry(applied_to_json(name, commanded.get(name, {})), encoder.frames, encoder.bytes)
+            name: combined(CameraTelemetry, _counts(encoder), applied=applied_to_json(name, commanded.get(name, {})))
             for name, encoder in simulation.encoders.items()
         }
         return Telemetry(t, self._predicted, None, cameras, 0)
@@ -120,7 +122,9 @@ class DriveFiles(Recorder):
         for name, received in self._received.items():
             arrivals = tuple((round(frame.arrived, 4), _latency_ms(frame)) for frame in received.arrivals(t))
             setting, seconds = decision.settings[name], min(t, RATE_S)
-            cameras[name] = CameraSample(
+            cameras[name] = combined(
+                CameraSample,
+                _counts(simulation.encoders[name]),
                 fps=round(len(received.recent) / seconds, 1),
                 kbps=round(sum(size for _, size in received.recent) * 8 / 1000 / seconds, 1),
                 allocated_kbps=setting.kbps,
@@ -140,6 +144,10 @@ class DriveFiles(Recorder):
         allocated = sum(setting.kbps for setting in decision.settings.values())
         actual = round(sum(camera.kbps for camera in cameras.values()), 1)
         return Sample(t, self._predicted, allocated, actual, None, 0, cameras, 0, 0.0, EXACT_MS)
+
+
+def _counts(encoder: Encoder) -> EncoderCounts:
+    return EncoderCounts(encoder.frames, encoder.bytes)
 
 
 def _latency_ms(frame: Arrival) -> float:

@@ -11,12 +11,14 @@ from msgspec import UNSET
 from runner.core.events import Attention, PositionReported, SteeringReported
 from runner.core.model import plain
 from runner.core.step import Run
+from runner.records import combined
 from runner.records.decisions import applied_to_json
 from runner.records.vehicle import (
     CameraReading,
     CameraState,
     CameraTelemetry,
     Position,
+    SenderStages,
     SpeedAdvice,
     SteeringAngle,
     Telemetry,
@@ -83,17 +85,14 @@ class Publisher:
         run: Run,
         t: float,
         cameras: Mapping[str, CameraReading],
-        stages: Mapping[str, tuple[float, float]],
+        stages: Mapping[str, SenderStages],
         refused: int,
         errors: int,
     ) -> Telemetry:
         """What was read back from the elements, and what the encoders have output so far."""
         measured = {
-            name: CameraTelemetry(
-                applied_to_json(name, camera.applied),
-                camera.frames,
-                camera.bytes,
-                *(round(ms, 2) for ms in stages.get(name, ())),
+            name: combined(
+                CameraTelemetry, camera.encoded, stages.get(name), applied=applied_to_json(name, camera.applied)
             )
             for name, camera in cameras.items()
         }
@@ -135,14 +134,7 @@ def vehicle_state(
     """The state as the vehicle publishes it. operator: in control, "" for none."""
     decision = run.decision
     states = {
-        name: CameraState.at(
-            decision.settings[name],
-            plain(run.state.weights[name]),
-            applied_to_json(name, camera.applied),
-            camera.fault or camera.lost,
-            camera.untimed,
-            camera.slow_fps,
-        )
+        name: CameraState.at(decision.settings[name], plain(run.state.weights[name]), name, camera)
         for name, camera in cameras.items()
     }
     return VehicleState(

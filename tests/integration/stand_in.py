@@ -12,10 +12,14 @@ from runner.apply import Reception
 from runner.core.commands import Command, KnobValue
 from runner.graph import Plan
 from runner.records.reception import Arrivals, SentFrame
-from runner.records.vehicle import CameraReading
+from runner.records.vehicle import CameraReading, EncoderCounts, SenderStages
 
 FRAMES = 5  # delivered by a sending camera between two samples
 FRAME_BYTES = 1000
+
+
+def encoded(frames: int) -> EncoderCounts:
+    return EncoderCounts(frames, FRAME_BYTES * frames)
 
 
 class RecordingVehicle:
@@ -60,11 +64,11 @@ class RecordingVehicle:
         for name, knobs in applied.items():
             self._sent[name] += FRAMES if knobs.get("sending") else 0
         return {
-            name: CameraReading(knobs, self._sent[name], FRAME_BYTES * self._sent[name], lost=self.lost.get(name))
+            name: CameraReading(knobs, encoded(self._sent[name]), lost=self.lost.get(name))
             for name, knobs in applied.items()
         }
 
-    def stages(self) -> dict[str, tuple[float, float]]:
+    def stages(self) -> dict[str, SenderStages]:
         return {}
 
     def sent_frames(self) -> dict[str, list[SentFrame]]:

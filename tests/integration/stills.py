@@ -23,8 +23,7 @@ from runner.core.step import start, step
 from runner.h264.access_unit import read_unit
 from runner.operator.station import LinkState
 from runner.page.server import PageServer
-from runner.records.decisions import applied_to_json
-from runner.records.vehicle import CameraState, VehicleState
+from runner.records.vehicle import CameraReading, CameraState, VehicleState
 
 MARKS = [
     pytest.mark.gst,
@@ -74,7 +73,7 @@ class Station(SimpleNamespace):
     def published(self):
         run = self.run
         cameras = {
-            name: CameraState.at(setting, 1, applied_to_json(name, run.commanded[name]), None)
+            name: CameraState.at(setting, 1, name, CameraReading(run.commanded[name]))
             for name, setting in run.decision.settings.items()
         }
         totals = (plain(run.decision.total), plain(run.decision.asked))

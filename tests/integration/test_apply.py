@@ -86,8 +86,8 @@ def test_a_fault_while_looking_at_one_camera_is_named_and_leaves_the_others_alon
 
 def sent_in_frames(side, count):
     """Bytes in which the encoder outputs a number of frames."""
-    before = side.read()[CAMERA]
-    now = until(lambda: (camera := side.read()[CAMERA]).frames >= before.frames + count and camera)
+    before = side.read()[CAMERA].encoded
+    now = until(lambda: (sent := side.read()[CAMERA].encoded).frames >= before.frames + count and sent)
     return (now.bytes - before.bytes) * count / (now.frames - before.frames)
 
 
@@ -162,14 +162,14 @@ def test_switching_off_stops_the_encoder_and_on_resumes_it():
         until(lambda: side.read()[CAMERA].applied["sending"] is False)
 
         def stands_still():
-            frames = side.read()[CAMERA].frames
+            frames = side.read()[CAMERA].encoded.frames
             time.sleep(0.5)
-            return side.read()[CAMERA].frames == frames
+            return side.read()[CAMERA].encoded.frames == frames
 
         until(stands_still)  # a last frame may be in the encoder
-        frames = side.read()[CAMERA].frames
+        frames = side.read()[CAMERA].encoded.frames
         turn(side, sending=True)
-        until(lambda: side.read()[CAMERA].frames > frames + 10)
+        until(lambda: side.read()[CAMERA].encoded.frames > frames + 10)
         assert client.errors == []
         assert reported == [f"{CAMERA}: pipeline built"]
 

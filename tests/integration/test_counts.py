@@ -79,7 +79,7 @@ def test_a_frame_costs_no_call_into_python_on_the_vehicle(calls, streaming):
     viewing = {name for name in calls if name.startswith(("Receiver", "RepairBuffer"))}
     assert viewing
     before, sent = Counter(calls), side.read()
-    until(lambda: all(camera.frames > sent[name].frames + FRAMES for name, camera in side.read().items()))
+    until(lambda: all(now.encoded.frames > sent[name].encoded.frames + FRAMES for name, now in side.read().items()))
     during = calls - before
     assert {name: count for name, count in during.items() if name not in viewing} == {}
     assert sum(during.values()) > FRAMES  # the counters work

@@ -43,9 +43,8 @@ from runner.h264.access_unit import read_unit
 from runner.operator.station import LinkState
 from runner.page.server import PageServer
 from runner.page.viewer import PageViewer
-from runner.records.decisions import applied_to_json
 from runner.records.operator import CameraSample, LatencyStages, Sample
-from runner.records.vehicle import CameraState, Outcome, Position, VehicleState
+from runner.records.vehicle import CameraReading, CameraState, Outcome, Position, VehicleState
 
 pytestmark = [pytest.mark.gst, needs_browser]
 aiohttp = pytest.importorskip("aiohttp")
@@ -64,7 +63,7 @@ class Station(SimpleNamespace):
     def __init__(self, vehicle):
         run = step(vehicle, start(vehicle), parse({"t": 0, "event": "bitrate_predicted", "kbps": 3000}))
         cameras = {
-            name: CameraState.at(setting, 1, applied_to_json(name, run.commanded[name]), None)
+            name: CameraState.at(setting, 1, name, CameraReading(run.commanded[name]))
             for name, setting in run.decision.settings.items()
         }
         totals = (plain(run.decision.total), plain(run.decision.asked))

@@ -48,7 +48,7 @@ class Vehicle:
             until(lambda: self.side.read()[camera].applied.items() >= knobs.items())
 
     def frames(self, camera=CAMERA):
-        return self.side.read()[camera].frames
+        return self.side.read()[camera].encoded.frames
 
     def pipelines(self, camera=CAMERA):
         return self.reported.count(f"{camera}: pipeline built")
@@ -459,12 +459,12 @@ def test_a_reader_that_is_slow_is_closed():
         vehicle.turn(SMALL_CAMERA, size=(640, 480), bitrate=2000)
         untouched = stack.enter_context(watched(vehicle, UNTOUCHED))
         viewers = [stack.enter_context(watched(vehicle, SMALL_CAMERA, udp=udp)) for udp in (True, False)]
-        began, sent = time.monotonic(), vehicle.side.read()[SMALL_CAMERA].bytes
+        began, sent = time.monotonic(), vehicle.side.read()[SMALL_CAMERA].encoded.bytes
         slow = stack.enter_context(RtspClient(vehicle.url(SMALL_CAMERA), small=True))
         assert slow.open() == [200, 200, 200]
         taken, closed = 0, False
         while not closed:
-            half = (vehicle.side.read()[SMALL_CAMERA].bytes - sent) / 2
+            half = (vehicle.side.read()[SMALL_CAMERA].encoded.bytes - sent) / 2
             time.sleep(0.01)
             try:
                 data = slow.tcp.recv(2048) if taken < half else b"nothing yet"

@@ -76,9 +76,9 @@ def fed(hz, *words, noise=255):
 
 
 def kbps(side, seconds):
-    began, before = time.monotonic(), side.read()["rear"].bytes
+    began, before = time.monotonic(), side.read()["rear"].encoded.bytes
     time.sleep(seconds)
-    return 8 * (side.read()["rear"].bytes - before) / (time.monotonic() - began) / 1000
+    return 8 * (side.read()["rear"].encoded.bytes - before) / (time.monotonic() - began) / 1000
 
 
 @pytest.mark.parametrize(
@@ -137,9 +137,9 @@ def test_a_clip_that_stood_still_once_plays_at_its_rate_again(tmp_path, disturb)
         until(lambda: client.frames_with_retry() > 5)
         disturb(side)
         time.sleep(STILL_S)
-        began, before = time.monotonic(), side.read()["rear"].frames
+        began, before = time.monotonic(), side.read()["rear"].encoded.frames
         time.sleep(1.5)
-        assert (side.read()["rear"].frames - before) / (time.monotonic() - began) == pytest.approx(25, rel=0.15)
+        assert (side.read()["rear"].encoded.frames - before) / (time.monotonic() - began) == pytest.approx(25, rel=0.15)
 
 
 @pytest.mark.soak
@@ -153,11 +153,11 @@ def test_a_jammed_viewer_over_tcp_makes_no_camera_slow():
             client.delay_s = 0.014  # about half the bitrate
             client.read()
             time.sleep(3)
-            first, paces = side.read()["rear"].frames, []
+            first, paces = side.read()["rear"].encoded.frames, []
             for _ in range(300):
                 paces.append(side._pipeline("rear").knobs.pace)
                 time.sleep(0.02)
-            assert side.read()["rear"].frames - first < 6 * 28  # it is jammed
+            assert side.read()["rear"].encoded.frames - first < 6 * 28  # it is jammed
     assert set(paces) == {1.0}
     assert not [line for line in reported if "Hz" in line]
 

@@ -427,5 +427,5 @@ def test_the_table_shows_the_names_of_cameras_on_a_narrow_terminal(width):
 def test_no_part_of_a_latency_is_negative():
     """The parts are those of other pictures than the sum."""
     received = Reception(waited_ms=30.0, decode_ms=20.0, latency_ms=40.0)
-    parts = stages(received, CameraTelemetry({}, 1, 1, capture_ms=5.0, encode_ms=6.0))
+    parts = stages(received, CameraTelemetry(1, 1, {}, capture_ms=5.0, encode_ms=6.0))
     assert (parts.link, parts.buffer) == (None, 30.0)

@@ -106,7 +106,7 @@ def test_both_sides_store_what_they_send_and_receive(sides, tmp_path):
         sizes = [(320, 180), (160, 90), (640, 360), (320, 180)]
         found, count = decoded(tmp_path / f"video/{name}.vehicle.0.ts")
         assert found[-4:] == sizes  # a caller sends before any knob is turned
-        assert -2 <= count - sent[name].frames <= more
+        assert -2 <= count - sent[name].encoded.frames <= more
         # On a busy machine packets get lost on loopback, too; what arrives is stored unchanged.
         whole = received[name].decoded >= received[name].frames - 1 and received[name].lost == 0
         found, count = decoded(tmp_path / f"video/{name}.operator.0.ts", whole)

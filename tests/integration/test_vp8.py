@@ -65,8 +65,8 @@ def sending(conf: Path):
 
 def kbps(side, frames=20):
     """The encoder's output bitrate at 15 Hz."""
-    before = side.read()["rear"]
-    after = until(lambda: (camera := side.read()["rear"]).frames >= before.frames + frames and camera)
+    before = side.read()["rear"].encoded
+    after = until(lambda: (sent := side.read()["rear"].encoded).frames >= before.frames + frames and sent)
     return 8 * (after.bytes - before.bytes) / 1000 / ((after.frames - before.frames) / 15)
 
 

@@ -114,6 +114,10 @@ export interface LatencyStages {
 
 /** Reception of one camera. Rates cover the last second, counters run since the start */
 export interface CameraSample {
+  /** frames, bytes: access units received, and their size, not those that the encoder has put out */
+  frames: number;
+  /** frames, bytes: access units received, and their size, not those that the encoder has put out */
+  bytes: number;
   /** frames received, Hz */
   fps: number;
   /** encoded video received, kbit/s */
@@ -134,10 +138,6 @@ export interface CameraSample {
   lost: number;
   /** how often the receiver's pipeline was rebuilt */
   rebuilt: number;
-  /** frames, bytes: access units received, and their size */
-  frames: number;
-  /** frames, bytes: access units received, and their size */
-  bytes: number;
   /** frames whose picture shows packet loss, until it is healed */
   damaged: number;
   /** the parts of it */
