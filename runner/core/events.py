@@ -1,7 +1,7 @@
 """Events: one vocabulary for the control link, the drive log and `replay`.
 
 An `Event` is valid once built; `parse` turns JSON that schemas/event.schema.json accepts into one. That schema is made
-from the classes below: from their docstrings, and the limits in their types.
+from the classes below: from their docstrings, and the limits and notes in their types.
 """
 
 from __future__ import annotations
@@ -25,12 +25,9 @@ CameraName = Annotated[str, Limits(1), "name of a camera of the vehicle"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Event:
-    """Something that happened.
+    """Something that happened."""
 
-    t  s since the start of the run; never decreases
-    """
-
-    t: NonNegative
+    t: Annotated[NonNegative, "s since the start of the run; never decreases"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,66 +39,48 @@ class ModeSelected(_Event):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BitratePredicted(_Event):
-    """Prediction of the bitrate available for all cameras together, from pQoS.
+    """Prediction of the bitrate available for all cameras together, from pQoS; its source may know more of it.
 
-    kbps        the prediction, kbit/s
-    lower_kbps  likely lower bound, if the source knows it; used by modes that go beyond the paper, kbit/s
-    valid_s     how long it may be used, if the source knows it; used by modes that go beyond the paper, s
-    bias, error mean of ln(capacity / kbps), and the standard deviation from it, if the source knows them; used by
-                follow_link until it knows better
+    Modes that go beyond the paper use the other values, follow_link bias and error until it knows better.
     """
 
-    kbps: Rate
-    lower_kbps: Rate | None = None
-    valid_s: NonNegative | None = None
-    bias: Annotated[float, Limits(-10, 10)] | None = None
-    error: Annotated[float, Limits(LEAST_ERROR, 10)] | None = None
+    kbps: Annotated[Rate, "the prediction, kbit/s"]
+    lower_kbps: Annotated[Rate | None, "likely lower bound, kbit/s"] = None
+    valid_s: Annotated[NonNegative | None, "how long it may be used, s"] = None
+    bias: Annotated[float | None, Limits(-10, 10), "mean of ln(capacity / kbps)"] = None
+    error: Annotated[float | None, Limits(LEAST_ERROR, 10), "standard deviation of ln(capacity / kbps)"] = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PositionReported(_Event):
-    """Where the vehicle is.
+    """Where the vehicle is."""
 
-    lat, lon     degrees north and east (WGS-84)
-    speed_mps    speed over ground, m/s
-    heading_deg  direction of travel, degrees clockwise from north
-    """
-
-    lat: Latitude
-    lon: Longitude
-    speed_mps: NonNegative | None = None
-    heading_deg: Annotated[float, Limits(0, 360)] | None = None
+    lat: Annotated[Latitude, "degrees north (WGS-84)"]
+    lon: Annotated[Longitude, "degrees east (WGS-84)"]
+    speed_mps: Annotated[NonNegative | None, "speed over ground, m/s"] = None
+    heading_deg: Annotated[float | None, Limits(0, 360), "direction of travel, degrees clockwise from north"] = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SteeringReported(_Event):
-    """The front wheels are turned.
+    """The front wheels are turned."""
 
-    rad  their angle (bicycle model), rad, positive to the left
-    """
-
-    rad: Steering
+    rad: Annotated[Steering, "their angle (bicycle model), rad, positive to the left"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TotalSet(_Event):
-    """The operator sets the total bitrate, mode collective.
+    """The operator sets the total bitrate, mode collective."""
 
-    kbps  of all cameras, kbit/s
-    """
-
-    kbps: Rate
+    kbps: Annotated[Rate, "of all cameras, kbit/s"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraSwitched(_Event):
-    """The operator switches a camera on or off, any mode.
-
-    on  true: on, false: off
-    """
+    """The operator switches a camera on or off, any mode."""
 
     camera: CameraName
-    on: bool
+    on: Annotated[bool, "true: on, false: off"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -117,15 +96,11 @@ class RoiSet(_Event):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraConfigured(_Event):
-    """The operator sets bitrate, scaling factor or both of a camera, mode single; None: unchanged.
-
-    kbps     from 1 to its b_full, kbit/s
-    scaling  factor of its resolution, in ]0, 1]
-    """
+    """The operator sets bitrate, scaling factor or both of a camera, mode single; None: unchanged."""
 
     camera: CameraName
-    kbps: Rate | None = None
-    scaling: Annotated[Fraction, Limits(0)] | None = None
+    kbps: Annotated[Rate | None, "from 1 to its b_full, kbit/s"] = None
+    scaling: Annotated[Fraction | None, Limits(0), "factor of its resolution, in ]0, 1]"] = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -189,22 +164,14 @@ class Evidence(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkMeasured(_Event):
-    """The uplink, by what the operator's side received of all cameras, see `runner.core.evidence`.
+    """The uplink, by what the operator's side received of all cameras, see `runner.core.evidence`."""
 
-    kbps      received in the last 0.5 s, kbit/s
-    queue_ms  standing queue in front of the link, ms
-    loss      share of the packets of the last second that was lost, 0 to 1
-    state     stalled: nothing arrives
-    rtt_ms    round trip of the control link, ms
-    evidence  of the link's capacity
-    """
-
-    kbps: Rate
-    queue_ms: NonNegative
-    loss: Share
-    state: LinkState
-    rtt_ms: NonNegative
-    evidence: Evidence
+    kbps: Annotated[Rate, "received in the last 0.5 s, kbit/s"]
+    queue_ms: Annotated[NonNegative, "standing queue in front of the link, ms"]
+    loss: Annotated[Share, "share of the packets of the last second that was lost, 0 to 1"]
+    state: Annotated[LinkState, "stalled: nothing arrives"]
+    rtt_ms: Annotated[NonNegative, "round trip of the control link, ms"]
+    evidence: Annotated[Evidence, "of the link's capacity"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -219,25 +186,18 @@ class CopiesCounted(_Event):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SourceReported(_Event):
-    """A camera's source cannot be opened, or can be again; until this is reported, it can.
-
-    works   whether it can
-    reason  why it cannot, for the operator; None: it can
-    """
+    """A camera's source cannot be opened, or can be again; until this is reported, it can."""
 
     camera: CameraName
-    works: bool
-    reason: str | None = None
+    works: Annotated[bool, "whether it can"]
+    reason: Annotated[str | None, "why it cannot, for the operator; None: it can"] = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControlPassed(_Event):
-    """Another operator is in control; measurements of the previous one are no longer valid.
+    """Another operator is in control; measurements of the previous one are no longer valid."""
 
-    operator  its id; "": none is present
-    """
-
-    operator: str
+    operator: Annotated[str, 'its id; "": none is present']
 
 
 class Attention(StrEnum):
@@ -252,12 +212,9 @@ class Attention(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AttentionChanged(_Event):
-    """The attention stated by the operator in control has changed.
+    """The attention stated by the operator in control has changed."""
 
-    attention  None: none stated, for example without a page
-    """
-
-    attention: Attention | None = None
+    attention: Annotated[Attention | None, "None: none stated, for example without a page"] = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

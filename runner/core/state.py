@@ -28,41 +28,25 @@ class Manual:
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """Inputs of the rules. A value that no event has set yet is None.
-
-    t                 seconds, time of the last event
-    on                by camera, whether the operator has it on; the rules see a camera that is lost as off
-    manual            by camera: settings of mode single, or the last ones of a camera that is off
-    prediction        the last one, whatever the mode when it arrived
-    total_set         kbit/s, the operator's last total
-    collective_total  kbit/s, total of mode collective
-    link              the newest measurement of the uplink; None: no operator measures it
-    position          the newest one
-    steering          the newest one
-    copies            by camera, copies of its stream that leave the vehicle; 1 for cameras not named
-    lost              by camera whose source cannot be opened, why
-    operator_since    t at which the operator's side connected, or took control of an unmeasured link; None: gone
-    operator_lost     t at which the operator's side disconnected
-    attention         of the driver, as the operator in control states it
-    """
+    """Inputs of the rules: by camera, or the newest that was reported. What no event has set yet is None."""
 
     mode: Mode
-    on: Mapping[str, bool]
+    on: Mapping[str, bool]  # as the operator has it; the rules see a camera that is lost as off
     rois: Mapping[str, Roi]
     weights: Mapping[str, Fraction]
-    manual: Mapping[str, Manual]
-    t: float = 0.0
-    prediction: ev.BitratePredicted | None = None
-    total_set: Kbps | None = None
-    collective_total: Kbps | None = None
-    operator_since: float | None = None
-    operator_lost: float | None = None
-    attention: ev.Attention | None = None
-    link: ev.LinkMeasured | None = None
+    manual: Mapping[str, Manual]  # settings of mode single, or the last ones of a camera that is off
+    t: float = 0.0  # s, time of the last event
+    prediction: ev.BitratePredicted | None = None  # whatever the mode when it arrived
+    total_set: Kbps | None = None  # kbit/s, the operator's last total
+    collective_total: Kbps | None = None  # kbit/s, total of mode collective
+    operator_since: float | None = None  # t of its side's connection, or of control of an unmeasured link; None: gone
+    operator_lost: float | None = None  # t at which the operator's side disconnected
+    attention: ev.Attention | None = None  # of the driver, as the operator in control states it
+    link: ev.LinkMeasured | None = None  # None: no operator measures it
     position: ev.PositionReported | None = None
     steering: ev.SteeringReported | None = None
-    copies: Mapping[str, int] = field(default_factory=lambda: NOTHING)
-    lost: Mapping[str, str] = field(default_factory=lambda: NOTHING)
+    copies: Mapping[str, int] = field(default_factory=lambda: NOTHING)  # that leave the vehicle; 1 for others
+    lost: Mapping[str, str] = field(default_factory=lambda: NOTHING)  # why its source cannot be opened
 
     @staticmethod
     def initial(vehicle: Vehicle, mode: Mode) -> State:

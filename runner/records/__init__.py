@@ -1,8 +1,8 @@
 """Records that both sides publish and log, each a frozen dataclass whose fields are the keys of its JSON. Pure.
 
 Only this package writes and reads that JSON; its schemas, control and drive, are made from the classes: from their
-docstrings, and the limits in their types. A key whose field has a default may be missing. Bitrates are kbit/s, sizes
-px, times s.
+docstrings, and the limits and notes in their types. A key whose field has a default may be missing. Bitrates are
+kbit/s, sizes px, times s.
 """
 
 from __future__ import annotations

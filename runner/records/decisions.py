@@ -20,24 +20,19 @@ Applied = Annotated[Mapping[str, Any], "by knob, the value read back; empty for 
 class CameraDecision:
     """The decision for one camera, see `runner.core.decision.Setting`.
 
-    on             whether the camera is switched on
-    sending        whether anything of it is encoded
-    demand_kbps    Eq. (1), kbit/s
-    kbps           allocated, kbit/s
     scaling        selected factor; None while the camera is off or its source cannot be opened
     width, height  of the encoded picture, px; 0 while the camera is off
-    reason         why, in words
     """
 
-    on: bool
-    sending: bool
-    demand_kbps: Amount
-    kbps: Count
+    on: Annotated[bool, "whether the camera is switched on"]
+    sending: Annotated[bool, "whether anything of it is encoded"]
+    demand_kbps: Annotated[Amount, "Eq. (1), kbit/s"]
+    kbps: Annotated[Count, "allocated, kbit/s"]
     scaling: Annotated[Number, Limits(above=0, most=1)] | None
     roi: Roi
     width: Count
     height: Count
-    reason: str
+    reason: Annotated[str, "why, in words"]
 
     @classmethod
     def of(cls, setting: Setting) -> CameraDecision:
@@ -46,34 +41,24 @@ class CameraDecision:
 
 @dataclass(frozen=True, slots=True)
 class Turned:
-    """A knob of a camera that was turned.
-
-    value  the new one
-    """
+    """A knob of a camera that was turned."""
 
     camera: CameraName
     knob: Annotated[str, Limits(among=("sending", "roi", "size", "bitrate")), "name of the knob"]
-    value: Any
+    value: Annotated[Any, "the new one"]
 
 
 @dataclass(frozen=True, slots=True)
 class DecisionMade:
-    """A decision that changed something, its cause, and the resulting commands.
-
-    cause       the event that it comes from, in words
-    total_kbps  before the cap at demand, kbit/s
-    cameras     settings by camera
-    commands    knobs that were turned
-    believed    absent: no rule believes anything of the uplink
-    """
+    """A decision that changed something, its cause, and the resulting commands."""
 
     t: Time
-    cause: str
+    cause: Annotated[str, "the event that it comes from, in words"]
     mode: Mode
-    total_kbps: Amount
-    cameras: Mapping[str, CameraDecision]
-    commands: tuple[Turned, ...]
-    believed: Believed | UnsetType = UNSET
+    total_kbps: Annotated[Amount, "before the cap at demand, kbit/s"]
+    cameras: Annotated[Mapping[str, CameraDecision], "settings by camera"]
+    commands: Annotated[tuple[Turned, ...], "knobs that were turned"]
+    believed: Annotated[Believed | UnsetType, "absent: no rule believes anything of the uplink"] = UNSET
 
     @classmethod
     def of(cls, t: float, cause: str, decision: Decision, commands: tuple[Command, ...]) -> DecisionMade:

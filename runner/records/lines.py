@@ -24,104 +24,75 @@ File = Annotated[str, "relative to the directory of the drive"]
 class Began:
     """First line of a log: side, versions and configuration.
 
-    side      who wrote it
-    format    version of the format
-    time      its start, s since 1970
-    versions  of the software in use, by name
-    config    the composed configuration
     replayed  words of the replay that decided it anew, without input and output; absent: it was driven
     """
 
     t: Time
-    side: Annotated[str, Limits(among=("vehicle", "operator", "link"))]
-    format: Annotated[int, Limits(1)]
-    time: Since1970
-    versions: Mapping[str, str]
-    config: Mapping[str, Any]
+    side: Annotated[str, Limits(among=("vehicle", "operator", "link")), "who wrote it"]
+    format: Annotated[int, Limits(1), "version of the format"]
+    time: Annotated[Since1970, "its start, s since 1970"]
+    versions: Annotated[Mapping[str, str], "of the software in use, by name"]
+    config: Annotated[Mapping[str, Any], "the composed configuration"]
     replayed: tuple[str, ...] | UnsetType = UNSET
 
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """A note for the user.
-
-    text  one sentence
-    """
+    """A note for the user."""
 
     t: Time
-    text: str
+    text: Annotated[str, "one sentence"]
 
 
 @dataclass(frozen=True, slots=True)
 class VideoBegan:
-    """A video file has started.
-
-    captured  capture time of its first frame, s since 1970
-    """
+    """A video file has started."""
 
     t: Time
     camera: CameraName
     file: File
-    captured: Since1970
+    captured: Annotated[Since1970, "capture time of its first frame, s since 1970"]
 
 
 @dataclass(frozen=True, slots=True)
 class VideoShifted:
-    """From a frame on, the offset of times in a video file changes, by a pause or a receiver that smooths them.
-
-    after_s   s from the file's first frame to this one, by the file
-    captured  capture time of this one, s since 1970
-    """
+    """From a frame on, the offset of times in a video file changes, by a pause or a receiver that smooths them."""
 
     t: Time
     camera: CameraName
     file: File
-    after_s: NonNegative
-    captured: Since1970
+    after_s: Annotated[NonNegative, "s from the file's first frame to this one, by the file"]
+    captured: Annotated[Since1970, "capture time of this one, s since 1970"]
 
 
 @dataclass(frozen=True, slots=True)
 class LinkSample:
-    """State of the limited link between the sides; counters run since it was made.
-
-    kbps       rate in force, kbit/s
-    queue_ms   how long a packet that arrives now waits, ms
-    bytes, packets  forwarded from vehicle to operator
-    dropped    packets that its queue dropped
-    lost       packets lost at random, after the queue
-    tcp_bytes  that competing TCP flows have delivered, without headers
-    """
+    """State of the limited link between the sides; counters run since it was made."""
 
     t: Time
-    kbps: NonNegative
-    queue_ms: NonNegative
-    bytes: Count
-    packets: Count
-    dropped: Count
-    lost: Count = 0
-    tcp_bytes: Count = 0
+    kbps: Annotated[NonNegative, "rate in force, kbit/s"]
+    queue_ms: Annotated[NonNegative, "how long a packet that arrives now waits, ms"]
+    bytes: Annotated[Count, "forwarded from vehicle to operator"]
+    packets: Annotated[Count, "forwarded from vehicle to operator"]
+    dropped: Annotated[Count, "packets that its queue dropped"]
+    lost: Annotated[Count, "packets lost at random, after the queue"] = 0
+    tcp_bytes: Annotated[Count, "that competing TCP flows have delivered, without headers"] = 0
 
 
 @dataclass(frozen=True, slots=True)
 class ClockSet:
-    """The wall clock of this side's machine was set; `t` does not follow it.
-
-    by_s  how far forward, s
-    """
+    """The wall clock of this side's machine was set; `t` does not follow it."""
 
     t: Time
-    by_s: Annotated[float, Limits(1 - 2**32, 2**32 - 1)]
+    by_s: Annotated[float, Limits(1 - 2**32, 2**32 - 1), "how far forward, s"]
 
 
 @dataclass(frozen=True, slots=True)
 class LinesDropped:
-    """Lines were not written because the disk was too slow.
-
-    lines  their number
-    """
+    """Lines were not written because the disk was too slow."""
 
     t: Time
-    lines: Annotated[int, Limits(1)]
+    lines: Annotated[int, Limits(1), "their number"]
 
 
 @dataclass(frozen=True, slots=True)

@@ -68,11 +68,7 @@ class Arrivals(NamedTuple):
 class UnitReceived(NamedTuple):
     """A frame as the operator's side received it; a list in JSON, since there are hundreds a second.
 
-    ago_s    s from the arrival of its last packet to the report
     delay_s  s from its capture, by the vehicle's clock, to that arrival; minus a constant, since clocks differ
-    bytes    without packet headers
-    whole    whether no packet of it was initially missing
-    train_s  s from the arrival of its first packet to that of its last
     train_packets, train_bytes  what arrived in that time of all cameras, repeated packets included, without the first
              packet; 0: it was one packet, or the transport does not tell
     carried_packets, carried_bytes  what arrived of all cameras after the last packet of the previous unit and until the
@@ -80,11 +76,11 @@ class UnitReceived(NamedTuple):
     """
 
     camera: str
-    ago_s: Span
+    ago_s: Annotated[Span, "s from the arrival of its last packet to the report"]
     delay_s: Clock
-    bytes: Size
-    whole: bool = True
-    train_s: Span = 0.0
+    bytes: Annotated[Size, "without packet headers"]
+    whole: Annotated[bool, "whether no packet of it was initially missing"] = True
+    train_s: Annotated[Span, "s from the arrival of its first packet to that of its last"] = 0.0
     train_packets: Size = 0
     train_bytes: Size = 0
     carried_packets: Size = 0
@@ -108,42 +104,36 @@ class UnitReceived(NamedTuple):
 class ReceptionReport:
     """What the operator's side has received since its previous report; the vehicle estimates the uplink from it.
 
-    at             s, by the operator's monotonic clock
-    as_of          s, the operator's estimate of the vehicle's time, see `runner.vehicle.operators`
-    units          in order of arrival
     packets, lost  RTP packets of all cameras received, and initially missing: some may have been recovered
     latency_ms     upper bound of the age of the oldest displayed picture, capture to decoding, ms; absent: unknown
     damaged        cameras whose newest picture shows unrecovered packet loss; absent: none
     sent           s since 1970 by the operator's clock; present if the vehicle should answer with a `ClockAnswer`
     run            random number of this run of the operator's side, to which delays and times are relative
-    offset_s       the constant that delays are less by, s; absent: no unit
     """
 
-    at: Clock
-    as_of: Clock
-    units: Annotated[tuple[UnitReceived, ...], Limits(most=2000)]
+    at: Annotated[Clock, "s, by the operator's monotonic clock"]
+    as_of: Annotated[Clock, "s, the operator's estimate of the vehicle's time, see `runner.vehicle.operators`"]
+    units: Annotated[tuple[UnitReceived, ...], Limits(most=2000), "in order of arrival"]
     packets: Packets
     lost: Packets
     latency_ms: Annotated[float, Limits(0, 10**12)] | UnsetType = UNSET
     damaged: Annotated[tuple[str, ...], Limits(most=1000, unique=True)] | UnsetType = UNSET
     sent: Clock | UnsetType = UNSET
     run: Annotated[int, Limits(0, 2**32 - 1)] | UnsetType = UNSET
-    offset_s: Clock | UnsetType = UNSET
+    offset_s: Annotated[Clock | UnsetType, "the constant that delays are less by, s; absent: no unit"] = UNSET
 
 
 @dataclass(frozen=True, slots=True)
 class ReceptionReported:
     """A reception report that arrived at the vehicle at t.
 
-    operator      id of its sender
-    in_control    whether that operator was in control; only its reports are used
     late_s        of each unit: s by which the vehicle at least took longer than usual to send it; absent: none was late
     all_received  nothing was on its way when the report was made; absent: unknown, or not so, or the report has units
     """
 
     t: Time
-    operator: str
-    in_control: bool
+    operator: Annotated[str, "id of its sender"]
+    in_control: Annotated[bool, "whether that operator was in control; only its reports are used"]
     report: ReceptionReport
     late_s: Annotated[tuple[NonNegative, ...], Limits(most=2000)] | UnsetType = UNSET
     all_received: bool | UnsetType = UNSET

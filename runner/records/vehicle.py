@@ -20,17 +20,12 @@ SLOW, SLOW_S = 0.7, 2.0  # a camera is slow if it has delivered less than this s
 
 @dataclass(frozen=True, slots=True)
 class Position:
-    """Position of the vehicle; None: unknown.
+    """Position of the vehicle; None: unknown."""
 
-    lat, lon     degrees (WGS-84)
-    speed_mps    as its receiver reports it, m/s; absent: unknown
-    heading_deg  the same, degrees clockwise from north
-    """
-
-    lat: Latitude
-    lon: Longitude
-    speed_mps: float | UnsetType = UNSET
-    heading_deg: float | UnsetType = UNSET
+    lat: Annotated[Latitude, "degrees north (WGS-84)"]
+    lon: Annotated[Longitude, "degrees east (WGS-84)"]
+    speed_mps: Annotated[float | UnsetType, "as its receiver reports it, m/s; absent: unknown"] = UNSET
+    heading_deg: Annotated[float | UnsetType, "of travel, degrees clockwise from north"] = UNSET
 
     @classmethod
     def of(cls, event: PositionReported) -> Position:
@@ -40,19 +35,17 @@ class Position:
 
 @dataclass(frozen=True, slots=True)
 class CameraState(CameraDecision):
-    """The decision for one camera, the values read back as applied, and the fault of its source, if any.
+    """The decision for one camera, the values read back as applied, and the fault of its source, if any."""
 
-    weight    in the allocation
-    fault     None: none known
-    untimed   true: its source provides no capture times, so latency is unknown; absent otherwise
-    slow_fps  rate of its pictures, Hz, while the camera is slow; absent otherwise
-    """
-
-    weight: Amount
+    weight: Annotated[Amount, "in the allocation"]
     applied: Applied
-    fault: str | None = None
-    untimed: bool | UnsetType = UNSET
-    slow_fps: Annotated[int, Limits(1)] | UnsetType = UNSET
+    fault: Annotated[str | None, "None: none known"] = None
+    untimed: Annotated[
+        bool | UnsetType, "true: its source provides no capture times, so latency is unknown; absent otherwise"
+    ] = UNSET
+    slow_fps: Annotated[
+        int | UnsetType, Limits(1), "rate of its pictures, Hz, while the camera is slow; absent otherwise"
+    ] = UNSET
 
     @classmethod
     def at(cls, setting: Setting, weight: Number, camera: str, reading: CameraReading) -> CameraState:
@@ -68,32 +61,22 @@ class CameraState(CameraDecision):
 
 @dataclass(frozen=True, slots=True)
 class VehicleState:
-    """State of a vehicle that is online.
-
-    cause       the event that triggered the decision, in words
-    asked_kbps  the total of the prediction or the operator, kbit/s
-    total_kbps  the same after all rules, such as what the measured link carries
-    cameras     decisions and applied values by camera
-    online      false: the vehicle is offline, and its state unknown
-    fault       why the rules could not decide, so that an earlier decision stays in force
-    attention   of the driver; absent: the operator in control states none
-    operator    id of the operator in control; absent: none
-    certificate_ends  when the certificate of the vehicle expires, s since 1970; absent: it has none
-    believed    of the uplink; absent: nothing
-    """
+    """State of a vehicle that is online."""
 
     t: Time = field(compare=False)
-    cause: str
+    cause: Annotated[str, "the event that triggered the decision, in words"]
     mode: Mode
-    total_kbps: Amount
-    asked_kbps: Amount
-    cameras: Mapping[str, CameraState]
-    fault: str | None = None
-    online: bool = True
-    attention: Attention | UnsetType = UNSET
-    operator: str | UnsetType = UNSET
-    certificate_ends: float | UnsetType = UNSET
-    believed: Believed | UnsetType = UNSET
+    total_kbps: Annotated[Amount, "kbit/s, after all rules, such as what the measured link carries"]
+    asked_kbps: Annotated[Amount, "the total of the prediction or the operator, kbit/s"]
+    cameras: Annotated[Mapping[str, CameraState], "decisions and applied values by camera"]
+    fault: Annotated[str | None, "why the rules could not decide, so that an earlier decision stays in force"] = None
+    online: Annotated[bool, "false: the vehicle is offline, and its state unknown"] = True
+    attention: Annotated[Attention | UnsetType, "of the driver; absent: the operator in control states none"] = UNSET
+    operator: Annotated[str | UnsetType, "id of the operator in control; absent: none"] = UNSET
+    certificate_ends: Annotated[
+        float | UnsetType, "when the certificate of the vehicle expires, s since 1970; absent: it has none"
+    ] = UNSET
+    believed: Annotated[Believed | UnsetType, "of the uplink; absent: nothing"] = UNSET
 
     @property
     def total_words(self) -> str:
@@ -112,13 +95,10 @@ class Offline:
 
 @dataclass(frozen=True, slots=True)
 class EncoderCounts:
-    """What the encoder of a camera counts since its pipeline was built.
+    """What the encoder of a camera counts since its pipeline was built."""
 
-    frames, bytes  that the encoder has put out
-    """
-
-    frames: Count
-    bytes: Count
+    frames: Annotated[Count, "frames that the encoder has put out"]
+    bytes: Annotated[Count, "their size"]
 
 
 NOTHING_ENCODED = EncoderCounts(*[0 for _ in fields(EncoderCounts)])
@@ -126,34 +106,26 @@ NOTHING_ENCODED = EncoderCounts(*[0 for _ in fields(EncoderCounts)])
 
 @dataclass(frozen=True, slots=True)
 class CameraTelemetry(EncoderCounts):
-    """Values read back as applied, and the encoder's output since its pipeline was built.
-
-    capture_ms, encode_ms  ms of the last sampled picture from its capture to the encoder, and through it; None: unknown
-    """
+    """Values read back as applied, and the encoder's output since its pipeline was built."""
 
     applied: Applied
-    capture_ms: float | None = None
-    encode_ms: float | None = None
+    capture_ms: Annotated[
+        float | None, "ms of the last sampled picture from its capture to the encoder; None: unknown"
+    ] = None
+    encode_ms: Annotated[float | None, "ms that it took through the encoder; None: unknown"] = None
 
 
 @dataclass(frozen=True, slots=True)
 class Telemetry:
-    """Measured on the vehicle, a few times a second: also its heartbeat.
-
-    predicted_kbps  last prediction of the total, kbit/s; None before the first
-    cameras         measured values by camera
-    refused         requests refused since the start
-    errors          exceptions caught by the control loop since the start
-    speed_factor    as in `SpeedAdvice`; None: not advised
-    """
+    """Measured on the vehicle, a few times a second: also its heartbeat."""
 
     t: Time
-    predicted_kbps: Amount | None
+    predicted_kbps: Annotated[Amount | None, "last prediction of the total, kbit/s; None before the first"]
     position: Position | None
-    cameras: Mapping[str, CameraTelemetry]
-    refused: Count
-    errors: Count = 0
-    speed_factor: Share | None = None
+    cameras: Annotated[Mapping[str, CameraTelemetry], "measured values by camera"]
+    refused: Annotated[Count, "requests refused since the start"]
+    errors: Annotated[Count, "exceptions caught by the control loop since the start"] = 0
+    speed_factor: Annotated[Share | None, "as in `SpeedAdvice`; None: not advised"] = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,41 +133,31 @@ class SpeedAdvice:
     """Share of full speed that the latency of the operator's pictures allows, ten times a second.
 
     The driving function must assume 0 once `expires_s` have passed without a newer one.
-
-    speed_factor  the share
-    latency_ms    glass to glass, at most, ms; None: unknown
-    expires_s     how long it may be used, s
     """
 
     t: Time
-    speed_factor: Share
-    latency_ms: NonNegative | None
-    expires_s: Annotated[float, Limits(above=0)]
+    speed_factor: Annotated[Share, "the share"]
+    latency_ms: Annotated[NonNegative | None, "glass to glass, at most, ms; None: unknown"]
+    expires_s: Annotated[float, Limits(above=0), "how long it may be used, s"]
 
 
 @dataclass(frozen=True, slots=True)
 class SteeringAngle:
-    """The steering angle as of its report, to match it to the picture captured at that time.
+    """The steering angle as of its report, to match it to the picture captured at that time."""
 
-    at   when it was reported, s since 1970 by the vehicle's clock, as capture times are
-    rad  as in `runner.core.events.SteeringReported`
-    """
-
-    at: Clock
-    rad: Steering
+    at: Annotated[Clock, "when it was reported, s since 1970 by the vehicle's clock, as capture times are"]
+    rad: Annotated[Steering, "as in `runner.core.events.SteeringReported`"]
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Outcome of a request.
-
-    result  applied: read back from the elements
-    reason  why, in words
-    """
+    """Outcome of a request."""
 
     t: Time
-    result: Annotated[str, Limits(among=("applied", "refused", "expired", "timed out"))]
-    reason: str
+    result: Annotated[
+        str, Limits(among=("applied", "refused", "expired", "timed out")), "applied: read back from the elements"
+    ]
+    reason: Annotated[str, "why, in words"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,29 +174,23 @@ class Reply(Outcome):
 class ClockAnswer:
     """The vehicle's clock, for an operator that compares it with its own, see `runner.system.clocks`.
 
-    sent                of the report that is answered, s since 1970 by the operator's clock
     received, answered  s since 1970, by the vehicle's clock
-    set_s               how far that clock is ahead of the vehicle's monotonic clock
     error_s             its maximum error against UTC according to the kernel; None: not synchronised
     """
 
-    sent: Clock
+    sent: Annotated[Clock, "of the report that is answered, s since 1970 by the operator's clock"]
     received: Clock
     answered: Clock
-    set_s: Clock
+    set_s: Annotated[Clock, "how far that clock is ahead of the vehicle's monotonic clock"]
     error_s: NonNegative | None
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Settings on which both sides' configurations must agree.
+    """Settings on which both sides' configurations must agree."""
 
-    run       random name of the vehicle's process: distinguishes vehicles of one name
-    settings  by path, such as cameras.front.fps
-    """
-
-    run: str
-    settings: Mapping[str, str | int | float | bool | list[Any] | None]
+    run: Annotated[str, "random name of the vehicle's process: distinguishes vehicles of one name"]
+    settings: Annotated[Mapping[str, str | int | float | bool | list[Any] | None], "by path, such as cameras.front.fps"]
 
 
 class SenderStages(NamedTuple):

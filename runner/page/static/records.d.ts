@@ -33,6 +33,7 @@ export interface CameraState {
   reason: string;
   /** in the allocation */
   weight: number;
+  /** by knob, the value read back; empty for a camera without a pipeline */
   applied: Record<string, any>;
   /** null: none known */
   fault: string | null;
@@ -62,11 +63,12 @@ export interface Believed {
 
 /** State of a vehicle that is online */
 export interface VehicleState {
+  /** s since the start of the run, or of the log that contains this */
   t: number;
   /** the event that triggered the decision, in words */
   cause: string;
   mode: "single" | "automatic" | "collective";
-  /** the same after all rules, such as what the measured link carries */
+  /** kbit/s, after all rules, such as what the measured link carries */
   total_kbps: number;
   /** the total of the prediction or the operator, kbit/s */
   asked_kbps: number;
@@ -88,23 +90,23 @@ export interface VehicleState {
 
 /** Position of the vehicle; None: unknown */
 export interface Position {
-  /** lat, lon: degrees (WGS-84) */
+  /** degrees north (WGS-84) */
   lat: number;
-  /** lat, lon: degrees (WGS-84) */
+  /** degrees east (WGS-84) */
   lon: number;
   /** as its receiver reports it, m/s; absent: unknown */
   speed_mps?: number;
-  /** the same, degrees clockwise from north */
+  /** of travel, degrees clockwise from north */
   heading_deg?: number;
 }
 
 /** Parts of the latency from capture to decoding, ms, each of a recently sampled picture; None: unknown */
 export interface LatencyStages {
-  /** to the encoder's input on the vehicle, with conversion, cropping and scaling */
+  /** to the encoder's input on the vehicle, also conversion, crop and scaling */
   capture: number | null;
   /** through the encoder */
   encode: number | null;
-  /** from there to the operator's side: the remainder. The only part that depends on the clocks, accurate to within `clock_bound_ms` */
+  /** from there to the operator's side: the remainder, accurate to within `clock_bound_ms` */
   link: number | null;
   /** in the jitter buffer */
   buffer: number | null;
@@ -114,9 +116,9 @@ export interface LatencyStages {
 
 /** Reception of one camera. Rates cover the last second, counters run since the start */
 export interface CameraSample {
-  /** frames, bytes: access units received, and their size, not those that the encoder has put out */
+  /** access units received */
   frames: number;
-  /** frames, bytes: access units received, and their size, not those that the encoder has put out */
+  /** their size */
   bytes: number;
   /** frames received, Hz */
   fps: number;
@@ -152,6 +154,7 @@ export interface CameraSample {
 
 /** What the operator's side measures a few times a second */
 export interface Sample {
+  /** s since the start of the run, or of the log that contains this */
   t: number;
   /** as in `Telemetry` */
   predicted_kbps: number | null;
@@ -168,7 +171,7 @@ export interface Sample {
   dropped: number;
   /** how far the vehicle's clock is ahead, ms; null: unknown, as are all latencies */
   clock_ahead_ms: number | null;
-  /** maximum error of that and of each latency, ms; null: unknown. Older logs lack it: there `clock_ahead_ms` was derived from negative latencies, and latencies are differences of both clocks */
+  /** maximum error of that and of each latency, ms; null: unknown */
   clock_bound_ms: number | null;
   /** as in `SpeedAdvice`; null: not advised */
   speed_factor: number | null;
