@@ -33,7 +33,7 @@ class CameraSample(EncoderCounts):
     buffer_ms   how long a picture waits for retransmitted packets, ms; None: no retransmission
     arrivals    in a log, of each access unit since the previous sample: time, s, and ms since its capture if known
 
-    Latencies are accurate to within the sample's `clock_bound_ms`.
+    Latencies are accurate to within the sample's `clock_bound_ms`. Counts of the encoder alone are those of telemetry.
     """
 
     frames: Annotated[Count, "access units received"]
