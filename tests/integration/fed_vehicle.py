@@ -50,11 +50,11 @@ class Feed:
 
     def _lose(self, camera: str) -> None:
         """Drop the packets of one picture before the server numbers the copies that it keeps for retransmission."""
+        import inside
+
         from runner.gst import Gst
 
-        server = self._live.side._server
-        assert server
-        packets = server.pipelines[camera]._elements[-1].get_static_pad("src")
+        packets = inside.sender(self._live.side, camera).get_by_name("pay0").get_static_pad("src")
 
         def drop(_pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
             packets.remove_probe(info.id)

@@ -23,7 +23,7 @@ import pytest
 
 from runner.errors import RunError
 from runner.graph import FEEDBACK, Plan
-from runner.link.netns import _check_allowed
+from runner.link import check_possible
 from runner.operator.station import Listener
 from runner.records import to_json
 from runner.records.lines import Note
@@ -134,10 +134,10 @@ needs_compiler = pytest.mark.skipif(not shutil.which("cc"), reason="needs a C co
 def _no_namespaces() -> str:
     """Why this process cannot make network namespaces; "" if it can."""
     try:
-        _check_allowed()
+        check_possible("netns")
     except RunError as error:
         return str(error)
-    return "" if shutil.which("ip") else "iproute2 is not installed"
+    return ""
 
 
 needs_root = pytest.mark.skipif(bool(_no_namespaces()), reason=_no_namespaces())
@@ -306,7 +306,7 @@ class Operator:
         from runner.mqtt.messages import OPERATOR_GONE, read_state, topic
 
         login = Login(Keyring(keys), print) if keys else None
-        self.name = login.user if login else name or f"op{free_port()}"
+        self.broker, self.name = broker, login.user if login else name or f"op{free_port()}"
         self.states: queue.Queue[Any] = queue.Queue()
         self.last: Any = None  # state
         self.replies: dict[str, Any] = {}
@@ -361,9 +361,11 @@ class Operator:
         """The last state if it fulfils a condition, otherwise the next one that does."""
         return self.last if self.last and wanted(self.last) else self.state(wanted)
 
-    def publish(self, payload: bytes, **options: Any) -> None:
-        """Publish any payload as a request."""
-        self.link._client.publish(self.requests, payload, qos=1, **options)
+    def publish(self, payload: bytes, topic: str = "", retain: bool = False) -> None:
+        """Publish any payload as a request, or to another topic, as any program can that the broker lets in."""
+        from paho.mqtt.publish import single
+
+        single(topic or self.requests, payload, 1, retain, self.broker.host, self.broker.port)
 
 
 def run(*words: str, **options: Any) -> subprocess.CompletedProcess[str]:
@@ -431,7 +433,7 @@ class Client:
         from runner.gst import Gst
         from runner.gst.caps import structure
 
-        self._gst, self._structure = Gst, structure
+        self.gst, self._structure = Gst, structure
         line = plan.receiver if feedback else plan.receiver.replace(f"/{FEEDBACK} ", " ")
         if pictures:
             head, _, _ = line.rpartition(" ! ")
@@ -454,18 +456,18 @@ class Client:
         picture = self._structure(pad.get_current_caps())
         self.sizes.append((picture.get_int("width")[1], picture.get_int("height")[1]))
         self.times.append(time.monotonic())
-        return self._gst.PadProbeReturn.OK
+        return self.gst.PadProbeReturn.OK
 
     def _on_message(self, _bus: Any, message: Any) -> Any:
-        if message.type in (self._gst.MessageType.ERROR, self._gst.MessageType.WARNING):
+        if message.type in (self.gst.MessageType.ERROR, self.gst.MessageType.WARNING):
             self.errors.append(message.get_structure().to_string())
-        return self._gst.BusSyncReply.PASS
+        return self.gst.BusSyncReply.PASS
 
     def picture(self) -> Any:
         """The newest picture as an array of RGB."""
         import numpy as np
 
-        sample = self._sink.emit("try-pull-sample", 5 * self._gst.SECOND)
+        sample = self._sink.emit("try-pull-sample", 5 * self.gst.SECOND)
         caps = self._structure(sample.get_caps())
         width, height = caps.get_int("width")[1], caps.get_int("height")[1]
         data = sample.get_buffer().extract_dup(0, sample.get_buffer().get_size())
@@ -482,10 +484,10 @@ class Client:
     def reconnect(self) -> None:
         self.close()
         self.errors.clear()
-        self.pipeline.set_state(self._gst.State.PLAYING)
+        self.pipeline.set_state(self.gst.State.PLAYING)
 
     def close(self) -> None:
-        self.pipeline.set_state(self._gst.State.NULL)
+        self.pipeline.set_state(self.gst.State.NULL)
 
     def end(self) -> None:
         """Let go of the pipeline: it holds this client by its callbacks, and would keep two descriptors open."""

@@ -150,6 +150,12 @@ class RtspClient:
         self._thread.start()
         return self
 
+    def wait(self, seconds: float) -> None:
+        """Wait until the reading thread has ended, as with the connection."""
+        assert self._thread
+        self._thread.join(seconds)
+        assert not self._thread.is_alive()
+
     def is_reading(self) -> bool:
         return bool(self._thread and self._thread.is_alive())
 
@@ -190,8 +196,7 @@ class RtspClient:
             with suppress(OSError):
                 socket.socket.shutdown(sock, socket.SHUT_RDWR)  # TLS's own would let the thread read what is encrypted
         if self._thread:
-            self._thread.join(10)
-            assert not self._thread.is_alive()
+            self.wait(10)
         for sock in sockets:
             sock.close()
 
@@ -279,11 +284,9 @@ class RtspClient:
             return
 
     def _read_udp(self) -> None:
-        try:
-            while data := self._rtp[0].recv(2048):
-                self._keep(data)
-        except OSError:
-            return
+        while all(data := [sock.recv(2048) for sock in select.select(self._rtp[::2], [], [])[0]]):  # of each SETUP
+            for each in data:
+                self._keep(each)
 
 
 def is_closed(sock: socket.socket, until: float) -> bool:

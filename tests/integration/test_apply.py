@@ -10,6 +10,7 @@ import time
 from contextlib import ExitStack
 from fractions import Fraction
 
+import inside
 import numpy as np
 import pytest
 
@@ -18,7 +19,7 @@ from runner.core.commands import Command
 from runner.core.model import Roi
 from runner.errors import RunError
 from runner.gst.knobs import KnobPanel
-from runner.gst.pipeline import CameraPipeline
+from runner.gst.picture_rate import PictureRate
 from runner.gst.pushed import PushedPictures
 
 CAMERA = "front_left"
@@ -61,23 +62,24 @@ def test_a_knob_turned_while_a_pipeline_is_built_is_set(monkeypatch):
 
 
 def test_a_fault_while_looking_at_one_camera_is_named_and_leaves_the_others_alone(monkeypatch):
-    look = CameraPipeline._look
+    look, looked = PictureRate.look, []
 
-    def failing(self, now):
-        if self._plan.camera.name == CAMERA:
+    def failing(rate, *words):
+        looked.append(rate)
+        if rate is looked[0]:
             raise ValueError("no such property")
-        look(self, now)
+        look(rate, *words)
 
     with streaming(cameras=(CAMERA, "front_right")) as (side, _, plans, reported), ExitStack() as stack:
-        for plan in plans:
-            stack.enter_context(watching(plan))
-        until(lambda: set(side.sent_frames()) == {CAMERA, "front_right"})
-        pipeline = side._pipeline(CAMERA)
+        stack.enter_context(watching(plans[0]))
+        until(lambda: side.sent_frames().get(CAMERA))
         turn(side, bitrate=500)
-        pipeline.knobs.pace = 4.0
-        monkeypatch.setattr(CameraPipeline, "_look", failing)
+        inside.camera(side, CAMERA).knobs.pace = 4.0
+        monkeypatch.setattr(PictureRate, "look", failing)
         until(lambda: f"{CAMERA}: its pictures are not counted: ValueError: no such property" in reported)
-        until(lambda: pipeline.knobs.pace == 1)
+        until(lambda: inside.camera(side, CAMERA).knobs.pace == 1)
+        stack.enter_context(watching(plans[1]))
+        until(lambda: side.sent_frames().get("front_right"))
         side.sent_frames()
         sent = []
         until(lambda: sent.extend(side.sent_frames()["front_right"]) or len(sent) > 1)

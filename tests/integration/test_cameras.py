@@ -13,6 +13,7 @@ import subprocess
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+import inside
 import pytest
 import yaml
 
@@ -123,7 +124,7 @@ def test_a_v4l2_device_is_streamed_with_the_times_of_its_driver():
             assert check_machine([plan]) == {}
             turn(side, sending=True, size=(480, 260), bitrate=500)
             until(lambda: len(client.sizes) > 10)
-            pad = side._pipeline(CAMERA)._pipeline.get_by_name("raw").get_static_pad("src")
+            pad = inside.sender(side, CAMERA).get_by_name("raw").get_static_pad("src")
             pad.add_probe(Gst.PadProbeType.BUFFER, lambda _, info: noted(captured, info.get_buffer().pts))
             until(lambda: len(captured) > 15)
             assert set(client.sizes[-5:]) == {(480, 260)}

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections import Counter
 from contextlib import ExitStack
+from weakref import WeakKeyDictionary
 
 import pytest
 
@@ -26,7 +27,8 @@ BUFFERS = Gst.PadProbeType.BUFFER | Gst.PadProbeType.BUFFER_LIST
 @pytest.fixture
 def calls(monkeypatch):
     """How often each probe of buffers was called."""
-    counted, add_probe, handle = Counter(), Gst.Pad.add_probe, BufferProbe.handle
+    counted, names = Counter(), WeakKeyDictionary()
+    add_probe, make, handle = Gst.Pad.add_probe, BufferProbe.__init__, BufferProbe.handle
 
     def add_counted(pad, mask, callback, *data):
         def on_buffer(*words):
@@ -36,11 +38,16 @@ def calls(monkeypatch):
 
         return add_probe(pad, mask, on_buffer, *data)
 
+    def make_named(probe, pad, on_buffer, **options):
+        names[probe] = on_buffer.__qualname__
+        make(probe, pad, on_buffer, **options)
+
     def handle_counted(probe, address):
-        counted[probe._on_buffer().__qualname__] += 1
+        counted[names[probe]] += 1
         return handle(probe, address)
 
     monkeypatch.setattr(Gst.Pad, "add_probe", add_counted)
+    monkeypatch.setattr(BufferProbe, "__init__", make_named)
     monkeypatch.setattr(BufferProbe, "handle", handle_counted)
     return counted
 

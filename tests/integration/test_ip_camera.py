@@ -9,6 +9,7 @@ import threading
 import time
 from contextlib import ExitStack, contextmanager
 
+import inside
 import pytest
 
 from rig import STREAM_END_SIGNALS, count_handlers, free_port, ip_camera, rtp_session, streaming, until, watching
@@ -95,7 +96,7 @@ def test_frames_keep_the_times_of_a_camera_that_is_faster_or_slower(fps_max):
 
     with driving(f"fps_max={fps_max}", "source.frozen_s=10") as (_, side, _, plan, reported), watching(plan) as client:
         until(lambda: len(client.sizes) > 10)
-        source = side._pipeline("rear")._pipeline
+        source = inside.sender(side, "rear")
         source.get_by_name("rate").get_static_pad("src").add_probe(Gst.PadProbeType.BUFFER, noting(sent))
         source.get_by_name("convert").get_static_pad("sink").add_probe(Gst.PadProbeType.BUFFER, noting(decoded))
         until(lambda: len(sent) > 20)
@@ -113,7 +114,7 @@ def test_a_camera_that_ends_its_stream_is_reported_and_connected_again():
     """The client's own handlers of RTCP BYE and time-outs may deadlock with the failure of its connection."""
     with driving("source.frozen_s=3") as (camera, side, _, plan, reported), watching(plan) as client:
         until(lambda: len(client.sizes) > 10)
-        session, ssrc = rtp_session(side._pipeline("rear")._pipeline.get_by_name("source"))
+        session, ssrc = rtp_session(inside.sender(side, "rear").get_by_name("source"))
         assert [count_handlers(session, name) for name in STREAM_END_SIGNALS] == [2, 2, 2]
         camera.send_signal(signal.SIGSTOP)
         time.sleep(1)  # frames in flight arrive
@@ -147,7 +148,7 @@ def test_frames_blocked_downstream_are_no_fault_of_the_source():
 
     with driving("source.frozen_s=3") as (_, side, _, plan, reported), watching(plan) as client:
         until(lambda: len(client.sizes) > 10)
-        below = side._pipeline("rear")._pipeline.get_by_name("gate").get_static_pad("src")
+        below = inside.sender(side, "rear").get_by_name("gate").get_static_pad("src")
         held = below.add_probe(Gst.PadProbeType.BLOCK_DOWNSTREAM, lambda *_: Gst.PadProbeReturn.OK)
         time.sleep(5)  # more than the limit for a frozen source
         assert side.read()["rear"].fault is None

@@ -6,6 +6,7 @@ import re
 import time
 from contextlib import contextmanager
 
+import inside
 import pytest
 from mini_camera import mini_camera
 
@@ -85,7 +86,7 @@ def test_only_the_chosen_video_of_a_camera_is_set_up(media, medium, chosen):
         until(lambda: client.frames_with_retry() > 5)
         assert camera.set_up == [chosen]
         assert reported == ["rear: pipeline built"]
-        source = side._pipeline("rear")._pipeline.get_by_name("source")
+        source = inside.sender(side, "rear").get_by_name("source")
         assert source.get_property("tcp-timeout") == 1_000_000  # as in its file again: the camera has streamed
 
 
@@ -204,14 +205,15 @@ def test_a_refused_login_is_tried_again_when_its_file_changes(credentials, login
 def test_an_attempt_logs_in_once_although_playing_is_requested_late(credentials, asked):
     """As by a busy machine, which goes on to PLAYING while the camera is being asked."""
     from runner.gst import Gst
+    from runner.gst.credentials import Login
     from runner.gst.watched import WatchedSource
 
     words = (f'source.credentials="{credentials}"',)
     with (
         mini_camera(login="basic", delays_s={"DESCRIBE": 0.2}) as camera,
-        robot(camera.address, *words) as (side, plan, reported),
+        robot(camera.address, *words) as (_, plan, reported),
     ):
-        pipeline, login = Gst.Pipeline(), side._logins["rear"]
+        pipeline, login = Gst.Pipeline(), Login(plan, reported.append)
         pipeline.add(WatchedSource(plan, login, set(), reported.append))
         pipeline.set_state(Gst.State.PAUSED)
         until(lambda: sum(method == "DESCRIBE" for method, _ in camera.asked) == asked)
@@ -229,17 +231,17 @@ def test_a_login_that_is_refused_while_the_camera_streams_counts_as_refused(cred
     words = (f'source.credentials="{credentials}"',)
     with (
         mini_camera(login="basic", password="right") as camera,
-        robot(camera.address, *words) as (side, plan, _),
+        robot(camera.address, *words) as (side, plan, reported),
         watching(plan) as client,
     ):
         until(lambda: client.frames_with_retry() > 5)
-        source, logins = side._pipeline("rear")._pipeline.get_by_name("source"), len(camera.logins)
+        source, logins = inside.sender(side, "rear").get_by_name("source"), len(camera.logins)
         why = GLib.Error.new_literal(Gst.ResourceError.quark(), "Unauthorized", Gst.ResourceError.NOT_AUTHORIZED)
         source.post_message(Gst.Message.new_error(source, why, ""))
         source.set_locked_state(True)
         source.set_state(Gst.State.PAUSED)
         time.sleep(2)  # longer than a camera may be frozen
-        assert side._logins["rear"].refusal
+        assert any(line.startswith("rear: the camera refuses the user or the password") for line in reported)
         assert len(camera.logins) == logins
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import socket
 import subprocess
 import sys
@@ -16,12 +17,12 @@ from pathlib import Path
 import pytest
 from machines import machines
 
-from rig import CHECKOUT, NOISE, free_port, needs_root, over_tcp, process, streaming, until, watching
+from rig import CHECKOUT, NOISE, children_named, free_port, needs_root, over_tcp, process, streaming, until, watching
 from runner.configuration.config import configuration
 from runner.core.commands import Command
 from runner.errors import RunError
 from runner.link import Limit, limited_link
-from runner.link.limit import OneWay, Policing, Rates, TcpFlows
+from runner.link.limit import OneWay, Policing, TcpFlows
 from runner.mqtt.broker import private_broker
 from runner.plans import compile_plans
 from runner.settings import Endpoint
@@ -33,6 +34,7 @@ SETTLE_S, MEASURE_S = 2.0, 4.0
 KINDS = [pytest.param("netns", marks=needs_root), "relay"]
 # Over a relay there are also the drives of test_latency.py and test_live.py.
 MAINLY_NETNS = [KINDS[0], pytest.param("relay", marks=pytest.mark.soak)]
+CHILDREN = {"netns": "tunnel", "relay": "relay"}
 WIDE = Limit(lambda t: 5000, queue_ms=200, delay_ms=0)
 
 
@@ -208,13 +210,13 @@ def _narrow(client, kbps):
         nonlocal passed
         size = info.get_buffer().get_size()
         if passed + size > (time.monotonic() - began) * kbps * 125:
-            return client._gst.PadProbeReturn.DROP
+            return client.gst.PadProbeReturn.DROP
         passed += size
-        return client._gst.PadProbeReturn.OK
+        return client.gst.PadProbeReturn.OK
 
     def limit(element):
         if element.get_factory() and element.get_factory().get_name() == "udpsrc":
-            element.get_static_pad("src").add_probe(client._gst.PadProbeType.BUFFER, take)
+            element.get_static_pad("src").add_probe(client.gst.PadProbeType.BUFFER, take)
 
     client.pipeline.connect("deep-element-added", lambda _pipeline, _bin, element: limit(element))
     return lambda: passed
@@ -271,13 +273,14 @@ def test_queued_packets_do_not_block_their_sender():
         "print(sum(out.sendto(bytes(1200), (sys.argv[1], 9)) for _ in range(300)))\n"
     )
     slow = Limit(lambda t: 100, queue_ms=60_000, delay_ms=0)  # sending them takes 29 s
-    with limited_link("netns", slow, *_ends(), print) as link:
+    lines = []
+    with limited_link("netns", slow, *_ends(), lines.append) as link:
         command = [*link.vehicle_command, sys.executable, "-c", code, link.broker.host]
         done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=30)
-        waits = link._shaper.limit(Rates(100, None))
+        link.start(time.time())
     assert done.stdout.strip() == str(300 * 1200)
-    assert waits.dropped == 0
-    assert waits.queue_ms > 1000
+    assert lines[0].dropped == 0
+    assert lines[0].queue_ms > 1000
 
 
 @needs_root
@@ -368,19 +371,27 @@ def test_a_link_that_fails_is_reported(kind):
         link.start(time.time())
         until(lambda: lines)
         link.check()
-        child = link._shaper._child
-        child._process.kill()
-        until(lambda: link._failure)
-    assert child._process.poll() is not None
+        (child,) = children_named(os.getpid(), f"runner.link.{CHILDREN[kind]}")
+        os.kill(child, signal.SIGKILL)
+        until(lambda: fails(link.check))
+    assert not Path(f"/proc/{child}").exists()
+
+
+def fails(check):
+    try:
+        check()
+    except RunError:
+        return True
+    return False
 
 
 def test_the_relay_ends_with_its_link(monkeypatch):
     monkeypatch.setattr("runner.link.child.END_S", 10.0)
-    with pytest.raises(ZeroDivisionError), limited_link("relay", WIDE, *_ends(), print) as link:
-        relay = link._shaper._child._process
-        assert relay.poll() is None
+    with pytest.raises(ZeroDivisionError), limited_link("relay", WIDE, *_ends(), print):
+        began, (relay,) = time.monotonic(), children_named(os.getpid(), "runner.link.relay")
         1 / 0  # noqa: B018
-    assert relay.poll() == 0
+    assert not Path(f"/proc/{relay}").exists()
+    assert time.monotonic() - began < 10  # it was not killed
 
 
 def test_without_root_the_relay_is_recommended():
@@ -427,7 +438,8 @@ out.sendto(b"!" * 1000, (sys.argv[1], int(sys.argv[2])))
 def test_both_directions_of_a_namespace_lose_and_delay_any_packet():
     """As the relay does with UDP. Half of the packets pass one way, and half of those come back."""
     lossy = replace(WIDE, delay_ms=50, loss=0.5, reverse=OneWay(lambda t: 5000, 200, 150, loss=0.5))
-    with limited_link("netns", lossy, *_ends(), print) as link, socket.socket(type=socket.SOCK_DGRAM) as echo:
+    lines = []
+    with limited_link("netns", lossy, *_ends(), lines.append) as link, socket.socket(type=socket.SOCK_DGRAM) as echo:
         echo.bind((link.broker.host, 0))
         echo.settimeout(20)
         words = (sys.executable, "-c", ECHO, link.broker.host, str(echo.getsockname()[1]))
@@ -440,10 +452,10 @@ def test_both_directions_of_a_namespace_lose_and_delay_any_packet():
                 passed += 1
                 echo.sendto(data, address)
             returned = int(vehicle.communicate(timeout=30)[0])
-        counters = link._shaper.limit(Rates(5000, 5000))
+        link.start(time.time())
     assert 60 < passed < 140
     assert 0.3 * passed < returned < 0.7 * passed
-    assert counters.lost == 200 - passed
+    assert lines[-1].lost == 200 - passed
 
 
 FLOOD = """
@@ -459,13 +471,14 @@ for number in range(250):  # of 1028 bytes on the link each, 2056 kbit/s
 def test_a_policer_drops_what_exceeds_its_rate_without_a_queue():
     """Of a second at 2056 kbit/s it passes 1028 kbit/s and its depth; nothing waits."""
     policed = replace(WIDE, policer=Policing(1028, 64))
-    with limited_link("netns", policed, *_ends(), print) as link:
+    lines = []
+    with limited_link("netns", policed, *_ends(), lines.append) as link:
         flood = (sys.executable, "-c", FLOOD, link.broker.host)
         subprocess.run([*link.vehicle_command, *flood], check=True, timeout=30)
-        counters = link._shaper.limit(Rates(5000, None))
-    assert counters.queue_ms == 0
-    assert counters.packets + counters.dropped == 250
-    assert 125 <= counters.packets <= 150
+        link.start(time.time())
+    assert lines[-1].queue_ms == 0
+    assert lines[-1].packets + lines[-1].dropped == 250
+    assert 125 <= lines[-1].packets <= 150
 
 
 @needs_root

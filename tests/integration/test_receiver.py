@@ -10,8 +10,10 @@ import time
 from collections import Counter
 from contextlib import ExitStack, contextmanager
 from itertools import pairwise
+from pathlib import Path
 from statistics import median
 
+import inside
 import pytest
 
 from rig import SMALL_ROBOT, STREAM_END_SIGNALS, count_handlers, free_port, rtp_session, until
@@ -104,7 +106,7 @@ def test_the_end_of_a_stream_is_handled_here_and_not_by_the_client():
     setup, plans = compiled()
     with sending(setup, plans), receiving(plans) as (side, messages, more):
         more()
-        pipeline, elements = side._receivers["front"]._supervised._pipeline, []
+        pipeline, elements = inside.receiver(side, "front"), []
         pipeline.get_bus().connect("message::eos", lambda *_: elements.append("ended"))
         session, ssrc = rtp_session(pipeline.get_by_name("client"))
         sources = {source.props.ssrc: source for source in session.props.sources}
@@ -147,17 +149,24 @@ def test_a_client_is_not_stopped_while_it_frees_its_connection():
     setup, plans = compiled()
     with sending(setup, plans), receiving(plans) as (side, _, more):
         more()
-        source = side._receivers["front"]._client
+        source = inside.receiver(side, "front").get_by_name("client")
         assert source.get_property("teardown-timeout") > 1000 * source.get_property("tcp-timeout")  # ns, µs
+
+
+def open_ports():
+    """UDP ports of this process on all addresses, which anybody reaches: those of RTSP clients."""
+    own = {descriptor.stat().st_ino for descriptor in Path("/proc/self/fd").iterdir() if descriptor.exists()}
+    bound = [line.split() for line in Path("/proc/self/net/udp").read_text().splitlines()[1:]]
+    places = [words[1].split(":") for words in bound if int(words[9]) in own]
+    return [int(port, 16) for address, port in places if int(address, 16) == 0]
 
 
 def test_packets_of_other_senders_are_dropped_and_counted():
     setup, plans = compiled()
     with sending(setup, plans), receiving(plans) as (side, messages, more):
         more()
-        sockets = [sock for r in side._receivers.values() for sock in r._filter._sockets.values()]
-        assert len(sockets) >= 2 * len(CAMERAS)  # RTP and RTCP
-        ports = [taken.getsockname()[1] for taken in sockets]
+        ports = open_ports()
+        assert len(ports) >= 2 * len(CAMERAS)  # RTP and RTCP
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
             stranger.bind(("127.0.0.2", 0))
             for number in range(500):
@@ -191,17 +200,15 @@ def test_an_unresponsive_server_is_retried_every_two_seconds():
 def test_loss_during_a_rebuild_shows_until_a_wave_is_complete():
     """Another viewer keeps the stream running, so that it does not begin with an IDR picture."""
     setup, plans = compiled("media.max_viewers=2")
-    with sending(setup, plans), receiving(plans) as (_, _, watched), receiving(plans) as (side, messages, more):
+    with sending(setup, plans), receiving(plans) as (_, _, watched), receiving(plans) as (side, _, more):
         watched()
         more()
         assert side.sample(SENDING)["front"].damaged == 0
-        receiver = side._receivers["front"]
-        side._glib.call("restarting", lambda: receiver._supervised.restart("as requested"))
+        inside.fail(inside.receiver(side, "front"), "made to fail")
+        until(lambda: side.sample(SENDING)["front"].rebuilt == 1, every_s=0.1)
         more()
-        until(lambda: side.sample(SENDING)["front"].damaged > 0 or not receiver.is_damaged, every_s=0.1)
-        seen = side.sample(SENDING)["front"]
-        assert seen.damaged > 0, messages
-        until(lambda: side.sample(SENDING) and not receiver.is_damaged, every_s=0.1)
+        until(lambda: side.sample(SENDING)["front"].damaged > 0, every_s=0.1)
+        until(lambda: not side.take_arrivals().damaged, every_s=0.1)
 
 
 def test_what_was_rebuilt_is_freed_at_once():
@@ -217,12 +224,12 @@ def test_what_was_rebuilt_is_freed_at_once():
     setup, plans = compiled()
     with sending(setup, plans), receiving(plans[:1]) as (side, _, more):
         more()
-        before, receiver = alive(), side._receivers["front"]
+        before = alive()
         assert len(before) == 3
         gc.disable()
         try:
             for number in range(1, 4):
-                side._glib.call("restarting", lambda: receiver._supervised.restart("as requested"))
+                inside.fail(inside.receiver(side, "front"), "made to fail")
                 until(lambda n=number: side.sample(SENDING)["front"].rebuilt == n, every_s=0.1)
                 more()
             until(lambda: alive() == before, every_s=0.2)
@@ -233,7 +240,7 @@ def test_what_was_rebuilt_is_freed_at_once():
 @pytest.mark.alone
 def test_a_receiver_that_locks_up_does_not_delay_the_others(monkeypatch):
     """As rtspsrc can on network faults, on its way to NULL."""
-    from runner.gst import Gst, aside, receiver
+    from runner.gst import Gst, aside
 
     monkeypatch.setattr(aside, "HUNG_S", 1.0)
     freed = threading.Event()
@@ -244,19 +251,15 @@ def test_a_receiver_that_locks_up_does_not_delay_the_others(monkeypatch):
                 freed.wait(30)
             return Gst.Bin.do_change_state(self, transition)
 
-    class Locking(receiver.Receiver):
-        def _on_built(self, pipeline):
-            if self._name == "front":
-                pipeline.add(Stuck())
-            return super()._on_built(pipeline)
-
-    monkeypatch.setattr("runner.apply.Receiver", Locking)
     setup, plans = compiled()
     with sending(setup, plans):
         try:
             with receiving(plans) as (side, messages, more):
                 more()
-                side._glib.call("a fault", lambda: side._receivers["front"]._supervised.restart("locked up"))
+                stuck, pipeline = Stuck(), inside.receiver(side, "front")
+                pipeline.add(stuck)
+                stuck.sync_state_with_parent()
+                inside.fail(pipeline, "locked up")
                 more(30)  # both: another receiver replaces the stuck one
                 until(lambda: any(aside.HUNG in what for what in messages))
                 began = time.monotonic()
@@ -270,27 +273,26 @@ def test_a_receiver_that_locks_up_does_not_delay_the_others(monkeypatch):
 def test_calls_run_although_timers_keep_gstreamer_s_thread_busy():
     from gi.repository import GLib
 
-    from runner import apply
-
-    glib = apply._Glib()
-    busy = GLib.timeout_add(0, lambda: True)  # always due, as a timer is on an overloaded machine
-    try:
-        for _ in range(3):
-            glib.call("reading the counters", lambda: None)
-    finally:
-        GLib.source_remove(busy)
-        glib.end(lambda: None)
+    with receiving([]) as (side, _, _more):
+        busy = GLib.timeout_add(0, lambda: True)  # always due, as a timer is on an overloaded machine
+        try:
+            for _ in range(3):
+                assert side.sample({}) == {}
+        finally:
+            GLib.source_remove(busy)
 
 
 def test_work_that_hangs_in_gstreamer_s_thread_is_reported(monkeypatch):
-    from runner import apply
+    from gi.repository import GLib
 
-    glib, freed = apply._Glib(), threading.Event()
-    try:
-        with monkeypatch.context() as patch, pytest.raises(RunError) as raised:
-            patch.setattr(apply, "CALL_S", 0.2)
-            glib.call("reading the counters", lambda: freed.wait(30))
-        assert str(raised.value) == "GStreamer hangs: reading the counters takes more than 0.2 s"
-    finally:
-        freed.set()
-        glib.end(lambda: None)
+    freed = threading.Event()
+    with receiving([]) as (side, _, _more):
+        try:
+            GLib.idle_add(lambda: freed.wait(30) and False)
+            with monkeypatch.context() as patch, pytest.raises(RunError) as raised:
+                patch.setattr("runner.apply.CALL_S", 0.2)
+                until(lambda: side.sample({}))
+            what = "reading the receivers' counters"
+            assert str(raised.value) == f"GStreamer hangs: {what} takes more than 0.2 s"
+        finally:
+            freed.set()

@@ -566,7 +566,7 @@ def test_a_new_pipeline_is_not_ended_for_the_certificate_of_the_last_one(keys):
     certificate = Gio.TlsCertificate.new_from_file(str(keys / NAME / keyring.CERTIFICATE))
     pipeline = Gst.parse_launch("rtspsrc name=client ! fakesink")
     assert login.prepare(pipeline, pipeline.get_by_name("client")) is None
-    assert login._accept(None, None, certificate, None)
+    assert pipeline.get_by_name("client").emit("accept-certificate", None, certificate, Gio.TlsCertificateFlags(0))
     assert login.withdrawn() is None
     changed(keys, "rotate", NAME)
     until(login.withdrawn)

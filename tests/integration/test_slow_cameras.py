@@ -7,6 +7,7 @@ import time
 from contextlib import contextmanager
 from fractions import Fraction
 
+import inside
 import numpy as np
 import pytest
 
@@ -107,7 +108,7 @@ def test_openh264_is_not_restarted_by_the_pictures_that_it_leaves_out_itself():
 
 def jump_ahead(side):
     """Make the times of a clip's pictures jump ahead, as a skip does that goes too far."""
-    above = side._pipeline("rear")._pipeline.get_by_name("pace").get_static_pad("sink").get_peer()
+    above = inside.sender(side, "rear").get_by_name("pace").get_static_pad("sink").get_peer()
     above.set_offset(above.get_offset() + int(STILL_S / 2 * 1e9))
 
 
@@ -119,9 +120,7 @@ def hold_up(side):
         time.sleep(STILL_S)
         return Gst.PadProbeReturn.REMOVE
 
-    side._pipeline("rear")._pipeline.get_by_name("gate").get_static_pad("src").add_probe(
-        Gst.PadProbeType.BUFFER, on_picture
-    )
+    inside.sender(side, "rear").get_by_name("gate").get_static_pad("src").add_probe(Gst.PadProbeType.BUFFER, on_picture)
 
 
 @pytest.mark.parametrize("disturb", [jump_ahead, pytest.param(hold_up, marks=[pytest.mark.soak, pytest.mark.sources])])
@@ -155,7 +154,7 @@ def test_a_jammed_viewer_over_tcp_makes_no_camera_slow():
             time.sleep(3)
             first, paces = side.read()["rear"].encoded.frames, []
             for _ in range(300):
-                paces.append(side._pipeline("rear").knobs.pace)
+                paces.append(inside.camera(side, "rear").knobs.pace)
                 time.sleep(0.02)
             assert side.read()["rear"].encoded.frames - first < 6 * 28  # it is jammed
     assert set(paces) == {1.0}

@@ -13,10 +13,10 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from itertools import pairwise
 
+import inside
 import pytest
 
 from rig import CHECKOUT, SMALL_ROBOT, free_port, until, watching
-from runner import graph
 from runner.apply import OperatorSide, VehicleSide, VideoFiles, check_plan, read_video
 from runner.configuration.config import configuration
 from runner.core.commands import Command
@@ -186,8 +186,8 @@ def test_an_operator_without_a_vehicle_leaves_no_files(tmp_path, monkeypatch):
     monkeypatch.setattr(SupervisedPipeline, "start", lambda self: (starts.update([self]), start(self)))
     sides = Sides(tmp_path)
     sides.stop()
-    with sides.receiving() as operator:
-        until(lambda: all(starts[receiver._supervised] > 2 for receiver in operator._receivers.values()))
+    with sides.receiving():
+        until(lambda: len(starts) == len(CAMERAS) and min(starts.values()) > 2)
     assert sides.first_frames == []
     assert list(tmp_path.iterdir()) == []
 
@@ -239,12 +239,7 @@ def stream_continues(sides, camera="front"):
 
 
 def test_a_full_disk_ends_the_file_and_not_the_stream(sides, monkeypatch, tmp_path):
-    def full(directory, camera, side):
-        path = tmp_path / f"{camera}.{side}.ts"
-        path.symlink_to("/dev/full")
-        return path
-
-    monkeypatch.setattr(video_files, "_new_file", full)
+    inside.storing_video_at(monkeypatch, tmp_path, "/dev/full")
     stream_continues(sides)
     assert any("space" in line.lower() for line in sides.reported), sides.reported
 
@@ -268,16 +263,9 @@ def test_a_directory_that_cannot_be_made_ends_the_file_and_not_the_stream(sides,
 
 def test_a_disk_that_stalls_does_not_delay_the_stream(tmp_path, monkeypatch):
     """A pipe without a reader accepts 64 kB and then blocks."""
-    monkeypatch.setitem(graph._FILE_QUEUE.properties, "max-size-bytes", 20_000)
-    sides = Sides(tmp_path)
-
-    def stalled(directory, camera, side):
-        path = tmp_path / f"{camera}.{side}.ts"
-        path.symlink_to(f"/proc/self/fd/{ends[1]}")
-        return path
-
     ends = os.pipe()
-    monkeypatch.setattr(video_files, "_new_file", stalled)
+    inside.storing_video_at(monkeypatch, tmp_path, f"/proc/self/fd/{ends[1]}", queue_bytes=20_000)
+    sides = Sides(tmp_path)
     try:
         with sides.receiving() as operator:
             until(lambda: any("too slow" in line for line in sides.reported))

@@ -45,7 +45,7 @@ def soak(seed: int, scale: float) -> list[str]:
                         problems.append(f"{client.url}: a reader that stopped was not closed")
                 for client in slow:
                     if client.is_reading():
-                        client._thread.join(30)
+                        client.wait(30)
                     if client.is_reading():
                         problems.append(f"{client.url}: a reader at half the rate was not closed")
         print(f"{rounds} rounds of {2 * len(CAMERAS)} readers", flush=True)

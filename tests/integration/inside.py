@@ -1,0 +1,73 @@
+"""The only place in which tests reach for elements of running pipelines, which no side shows to anybody.
+
+Tests do so to see what nobody outside can (that no event reaches an encoder, that a picture keeps its driver's time),
+or to make an element fail or stall as hardware and networks do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+
+def camera(side: Any, name: str) -> Any:
+    """The `CameraPipeline` of one camera of a `VehicleSide`."""
+    return side._pipeline(name)
+
+
+def sender(side: Any, name: str) -> Any:
+    """The pipeline by which a `VehicleSide` sends a camera."""
+    return camera(side, name)._pipeline
+
+
+def receiver(side: Any, name: str) -> Any:
+    """The pipeline by which an `OperatorSide` receives a camera: at the moment, since it is rebuilt when it fails."""
+    return side._receivers[name]._supervised._pipeline
+
+
+def fail(pipeline: Any, why: str) -> None:
+    """Make an element of a pipeline report an error, as one does that loses its device or its connection."""
+    from runner.gst import GLib, Gst
+
+    source = next(iter(pipeline.iterate_elements()), pipeline)
+    error = GLib.Error.new_literal(Gst.ResourceError.quark(), why, Gst.ResourceError.READ)
+    pipeline.post_message(Gst.Message.new_error(source, error, ""))
+
+
+def losing(monkeypatch: Any, kind: str, pad: str, is_lost: Callable[[Any], bool]) -> None:
+    """Let each element of a kind in an operator's receivers lose packets at a pad.
+
+    A relay would decide about packets of all cameras and of the control link, and could not know when it may.
+
+    is_lost  called with each buffer
+    """
+    from runner.gst import Gst, receiver
+
+    def lose(_pad: Any, info: Any) -> Any:
+        return Gst.PadProbeReturn.DROP if is_lost(info.get_buffer()) else Gst.PadProbeReturn.OK
+
+    class Lossy(receiver.Receiver):
+        def _on_element(self, pipeline: Any, parent: Any, element: Any) -> None:
+            super()._on_element(pipeline, parent, element)
+            if element.get_factory() and element.get_factory().get_name() == kind:
+                element.get_static_pad(pad).add_probe(Gst.PadProbeType.BUFFER, lose)
+
+    monkeypatch.setattr("runner.apply.Receiver", Lossy)
+
+
+def storing_video_at(monkeypatch: Any, directory: Path, device: str, queue_bytes: int = 8_000_000) -> None:
+    """Make the files of both sides' video links to a device: no directory stands for a disk that is full or hangs.
+
+    queue_bytes  how much may wait for it
+    """
+    from runner import graph
+    from runner.gst import video_files
+
+    def new_file(_directory: Path, camera: str, side: str) -> Path:
+        path = directory / f"{camera}.{side}.ts"
+        path.symlink_to(device)
+        return path
+
+    monkeypatch.setattr(video_files, "_new_file", new_file)
+    monkeypatch.setitem(graph._FILE_QUEUE.properties, "max-size-bytes", queue_bytes)
