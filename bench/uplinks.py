@@ -187,10 +187,10 @@ def figures(path: Path) -> Figures:
     counts = usable & (times > SETTLED_S) & np.isfinite(ms)
     return {
         "frozen": 100 * whole.frozen,
-        "back_s": _recovery_s(over_time, link_t, link_kbps),
+        "back_s": recovery_s(over_time, link_t, link_kbps),
         "p50_ms": float(np.percentile(ms[counts], 50)),
         "p99_ms": float(np.percentile(ms[counts], 99)),
-        "used": 100 * _link_use(logged, over_time),
+        "used": 100 * link_use(logged, over_time),
         "damaged": 100 * whole.damaged,
         "lost": float(whole.lost or 0),
         **mssim(path, logged),
@@ -276,7 +276,7 @@ def totals(drive: Drive) -> list[tuple[float, float]]:
     return [(line.t, on_wire(line)) for line in drive.sides["vehicle"].of(DecisionMade)]
 
 
-def _link_use(drive: Drive, over_time: Series) -> float:
+def link_use(drive: Drive, over_time: Series) -> float:
     """Bytes that passed over those that could have: at most what the link carried and the cameras may send."""
     most = float(plain(sum(camera.rate_quality.b_full for camera in cameras(drive).values())))
     samples = [sample for sample in drive.sides["link"].of(LinkSample) if sample.t > SETTLED_S]
@@ -284,12 +284,12 @@ def _link_use(drive: Drive, over_time: Series) -> float:
     return (samples[-1].bytes - samples[0].bytes) * 8 / 1000 / could
 
 
-def _recovery_s(over_time: Series, t: Floats, kbps: Floats) -> float:
+def recovery_s(over_time: Series, t: Floats, kbps: Floats) -> float:
     """Time from the end of an outage until a camera is live again, over all cameras and outages: p95, s.
 
     A camera is live once an undamaged picture arrives that was captured since. inf: never; nan: there was no outage
     """
-    waits = [_wait(camera, end) for end in _outages(t, kbps) for camera in over_time.cameras.values()]
+    waits = [_wait(camera, end) for end in outages(t, kbps) for camera in over_time.cameras.values()]
     return float(np.percentile(waits, 95, method="higher")) if waits else float("nan")
 
 
@@ -310,7 +310,7 @@ def _wait(camera: CameraSeries, since: float) -> float:
     return np.inf
 
 
-def _outages(t: Floats, kbps: Floats) -> Iterator[float]:
+def outages(t: Floats, kbps: Floats) -> Iterator[float]:
     """The end of each outage."""
     began: float | None = None
     for now, rate in zip(t, kbps, strict=True):

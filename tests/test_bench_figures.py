@@ -71,24 +71,24 @@ def over_time(**cameras: Any) -> Any:
 def test_an_outage_ends_when_the_link_is_usable_again(uplinks: ModuleType) -> None:
     t = np.array([0.0, 5, 7, 7.5, 9, 9.5, 12])
     kbps = np.array([2000.0, 0, 100, 800, 20, 900, 900])
-    assert list(uplinks._outages(t, kbps)) == [7.5], "half a second without a link is none"
+    assert list(uplinks.outages(t, kbps)) == [7.5], "half a second without a link is none"
 
 
 def test_the_first_undamaged_picture_captured_after_an_outage_ends_it(uplinks: ModuleType) -> None:
     t, kbps = np.array([0.0, 5, 7]), np.array([2000.0, 0, 2000])
     queued = received(7.04, 7.06, 7.4, ms=100)  # captured at 6.94, 6.96 and 7.3
     seen = over_time(front={"received": queued}, rear={"received": received(7.1, 7.2, 7.6, damaged=2)})
-    assert uplinks._recovery_s(seen, t, kbps) == pytest.approx(0.6), "the slower camera's"
+    assert uplinks.recovery_s(seen, t, kbps) == pytest.approx(0.6), "the slower camera's"
     never = over_time(front={"received": queued}, rear={"received": received(3.0)})
-    assert uplinks._recovery_s(never, t, kbps) == np.inf
-    assert np.isnan(uplinks._recovery_s(seen, t, np.full(3, 2000.0))), "no outage"
+    assert uplinks.recovery_s(never, t, kbps) == np.inf
+    assert np.isnan(uplinks.recovery_s(seen, t, np.full(3, 2000.0))), "no outage"
 
 
 def test_the_share_of_a_link_that_was_used(uplinks: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     camera = SimpleNamespace(rate_quality=SimpleNamespace(b_full=Fraction(4000)))
     monkeypatch.setattr(uplinks, "cameras", lambda drive: {"front": camera})
-    assert uplinks._link_use(link((0, 2000)), None) == pytest.approx(0.5, abs=0.01)
-    assert uplinks._link_use(link((0, 8000)), None) == pytest.approx(1, abs=0.01), "the cameras can use 4000 at most"
+    assert uplinks.link_use(link((0, 2000)), None) == pytest.approx(0.5, abs=0.01)
+    assert uplinks.link_use(link((0, 8000)), None) == pytest.approx(1, abs=0.01), "the cameras can use 4000 at most"
 
 
 def test_frames_that_a_busy_machine_dropped(uplinks: ModuleType) -> None:

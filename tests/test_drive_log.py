@@ -213,6 +213,17 @@ def test_a_drive_is_flushed_to_the_disk_while_it_is_logged(tmp_path: Path, monke
     assert set(threads) == {"log"}
 
 
+def opened(monkeypatch: pytest.MonkeyPatch, descriptor: int) -> None:
+    """Make the file of the next log this one."""
+    real = os.open
+
+    def opens(path: Any, flags: int, *words: Any, **options: Any) -> int:
+        is_new = str(path).endswith(".jsonl") and flags & os.O_CREAT
+        return descriptor if is_new else real(path, flags, *words, **options)
+
+    monkeypatch.setattr("runner.drive.log.os.open", opens)
+
+
 @pytest.mark.parametrize(("limit", "most"), [("QUEUED_LINES", 100), ("QUEUED_BYTES", 500_000)])
 def test_a_hanging_disk_does_not_block_and_dropped_lines_are_counted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, most: int
@@ -220,7 +231,7 @@ def test_a_hanging_disk_does_not_block_and_dropped_lines_are_counted(
     """The file is a pipe that is not read until all notes are queued."""
     monkeypatch.setattr(f"runner.drive.log.{limit}", most)
     read_end, write_end = os.pipe()
-    monkeypatch.setattr("runner.drive.log._create", lambda path: write_end)
+    opened(monkeypatch, write_end)
     log = begun(tmp_path)
     for number in range(1000):  # would never end if any of them waited for the disk
         log.note(f"{number} " + "x" * 5000)
@@ -242,7 +253,7 @@ def test_a_disk_that_hangs_forever_does_not_keep_the_process_alive(
 ) -> None:
     monkeypatch.setattr("runner.drive.log.CLOSE_S", 0.1)
     read_end, write_end = os.pipe()
-    monkeypatch.setattr("runner.drive.log._create", lambda path: write_end)
+    opened(monkeypatch, write_end)
     messages: list[str] = []
     log = Log(tmp_path, "vehicle", {}, {}, messages.append)
     log.begin()

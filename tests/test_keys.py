@@ -28,11 +28,10 @@ from runner.errors import RunError, UserError
 from runner.mqtt.login import Login
 from runner.mqtt.messages import MAX_MESSAGE_BYTES
 from runner.security import keyring
-from runner.security.authority import Authority, Issued
+from runner.security.authority import Authority
 from runner.security.broker_files import broker_settings
 from runner.security.exposure import keyring_of
 from runner.security.keyring import Keyring
-from runner.verbs.doctor import _certificates
 
 NOW = datetime(2026, 5, 1, tzinfo=UTC)
 FIRST = ("vehicle=car", "host=10.0.0.2,car.example", "controller=alice", "broker=10.0.0.1")
@@ -76,17 +75,17 @@ def verified(authority, name, *options):
         ),
     ],
 )
-def test_doctor_names_a_certificate_that_expires_within_30_days(tmp_path, age_d, words):
+def test_doctor_names_a_certificate_that_expires_within_30_days(tod, tmp_path, age_d, words):
     now = datetime.now(UTC)
     issued = now - timedelta(days=age_d, hours=-1)
     authority = Authority(tmp_path / "keys", lambda: issued)
     with authority.opened():
         authority.issue("car", Role.VEHICLE, [])
-    (found,) = _certificates(tmp_path / "keys" / "car")
-    line = f"{'ok     ' if found.fine else 'MISSING'} {found.what}"
+    listed = tod("doctor", "ros", f"keys={tmp_path / 'keys' / 'car'}").out.splitlines()
+    (line,) = (each for each in listed if "certificate" in each)
     ends, begins = issued + timedelta(days=365), issued - timedelta(hours=1)
     assert line.startswith(words.format(end=f"{ends:%Y-%m-%d}", begin=f"{begins:%Y-%m-%d}", now=f"{now:%Y-%m-%d}"))
-    assert list(_certificates(tmp_path / "keys")) == [found]  # of all holders, as for a demo
+    assert line in tod("doctor", "ros", f"keys={tmp_path / 'keys'}").out  # of all holders, as for a demo
 
 
 @pytest.mark.parametrize(
@@ -283,20 +282,26 @@ def test_issuing_again_changes_nothing(authority):
     assert certificate(authority, "car").serial_number != before
 
 
-def test_the_next_run_completes_what_a_killed_run_left_out(authority):
-    killed = Issued("bob", Role.WATCHER, "ab", (), NOW + timedelta(days=1))
-    authority._write_issued([*authority._issued(), killed])
+def killed_here(*_):
+    raise KeyboardInterrupt
+
+
+def test_the_next_run_completes_what_a_killed_run_left_out(authority, monkeypatch):
+    with monkeypatch.context() as killed, pytest.raises(KeyboardInterrupt):
+        killed.setattr(keyring, "Holder", killed_here)
+        authority.issue("bob", Role.WATCHER, [])
+    (bob,) = (issued for issued in authority.holders() if issued.name == "bob")
     authority.issue("eve", Role.WATCHER, [])
     assert set(Keyring(authority.directory / "car").people()) == {"eve", *(f"a-{role}" for role in PEOPLE)}
     assert authority.issue("bob", Role.WATCHER, [])
     assert "bob" in Keyring(authority.directory / "car").people()
-    assert Keyring(authority.directory / "car").revoked() == {0xAB}
+    assert Keyring(authority.directory / "car").revoked() == {int(bob.serial, 16)}
 
 
 def test_an_interrupted_revocation_is_completed_by_repeating_it(authority, monkeypatch):
     serial = certificate(authority, "a-watcher").serial_number
     with monkeypatch.context() as killed, pytest.raises(KeyboardInterrupt):
-        killed.setattr(Authority, "_distribute", lambda _: (_ for _ in ()).throw(KeyboardInterrupt))
+        killed.setattr("runner.security.authority.revocation_list", killed_here)
         authority.revoke("a-watcher")
     assert Keyring(authority.directory / "car").revoked() == set()
     authority.revoke("a-watcher")

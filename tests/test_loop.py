@@ -48,6 +48,7 @@ class Watched:
         self.published: list[Any] = []
         self.reports: list[str] = []
         self.publishes: Callable[[Any], bool] = lambda record: True
+        self._heard = (0.0, time.monotonic())
         log = Log(None, "vehicle", {}, {}, self.reports.append)
         report = self.reports.append
         self.loop = ControlLoop(setup, self.side, pqos, track, log, self._publish, report, access or Access())
@@ -56,7 +57,14 @@ class Watched:
         accepted = self.publishes(record)
         if accepted:
             self.published.append(record)
+        if isinstance(record, Telemetry):
+            self._heard = (record.t, time.monotonic())
         return accepted
+
+    def now(self) -> float:
+        """The vehicle's time, as an operator knows it: that of its newest telemetry, and the time since."""
+        t, heard = self._heard
+        return t + time.monotonic() - heard
 
     def of(self, kind: type[Any]) -> list[Any]:
         return [record for record in self.published if isinstance(record, kind)]
@@ -456,7 +464,7 @@ def test_no_speed_is_advised_while_nobody_sees_the_pictures() -> None:
             before, longest_s = len(watched.of(SpeedAdvice)), 0.0
             for _ in range(20):
                 at = time.monotonic()
-                numbers = {"at": at, "as_of": watched.loop._now(), "packets": 0, "lost": 0, "run": 1}
+                numbers = {"at": at, "as_of": watched.now(), "packets": 0, "lost": 0, "run": 1}
                 watched.loop.take(QueuedReport("driver", ReceptionReport(units=(), latency_ms=400, **numbers)))
                 time.sleep(0.03)
                 longest_s = max(longest_s, time.monotonic() - at)
@@ -475,7 +483,7 @@ def test_a_second_process_of_the_driver_neither_ends_control_nor_advises_a_speed
     watched = Watched("latency.fixed_ms=0")
 
     def report(run: int, latency_ms: float) -> None:
-        numbers = {"at": time.monotonic(), "as_of": watched.loop._now(), "packets": 0, "lost": 0}
+        numbers = {"at": time.monotonic(), "as_of": watched.now(), "packets": 0, "lost": 0}
         watched.loop.take(QueuedReport("driver", ReceptionReport(units=(), latency_ms=latency_ms, run=run, **numbers)))
 
     def says_goodbye(run: int | None, *, will: bool) -> Outcome:

@@ -334,18 +334,17 @@ def test_vmaf_process_that_dies(vmaf: Metric, when: str, left: Callable[[], list
 
 
 @pytest.fixture
-def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], str]:
+def fake(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], str]:
     """An ffmpeg that has libvmaf and runs the given shell words instead of scoring."""
 
     def write(words: str, filters: str = " .. libvmaf           VV->V      Calculate the VMAF") -> str:
-        exe = tmp_path / "ffmpeg"
+        exe = tmp_path_factory.mktemp("tool") / "ffmpeg"  # what is known of an earlier one concerns it alone
         exe.write_text(
             f"#!/bin/sh\ncase $2 in\n-filters) echo '{filters}';;\n"
             f"-version) echo 'ffmpeg version 1.2.3 Copyright';;\n*) {words};;\nesac\n"
         )
         exe.chmod(0o755)
         monkeypatch.setenv("TOD_FFMPEG", str(exe))
-        vmaf_module._version.cache_clear()
         vmaf_module.libvmaf_version.cache_clear()
         return str(exe)
 
@@ -386,7 +385,7 @@ def test_vmaf_gives_up_on_a_process_that_hangs(
     assert left() == before
 
 
-def test_vmaf_without_a_tool(fake: Callable[..., str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_vmaf_without_a_tool(fake: Callable[..., str], monkeypatch: pytest.MonkeyPatch) -> None:
     exe = fake("exit 0", filters=" .. vmafmotion V->V nothing")
     with pytest.raises(RunError) as raised:
         find_metric("vmaf")
@@ -396,12 +395,13 @@ def test_vmaf_without_a_tool(fake: Callable[..., str], monkeypatch: pytest.Monke
     )
     monkeypatch.delenv("TOD_FFMPEG")
     monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", exe)
-    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setenv("PATH", str(Path(exe).parent))
     with pytest.raises(RunError) as raised:
         find_metric("vmaf")
     assert str(raised.value) == "VMAF needs an ffmpeg with libvmaf: install the extra vmaf, see docs/install.md"
-    fake("exit 0")
-    monkeypatch.chdir(tmp_path)
+    exe = fake("exit 0")
+    monkeypatch.chdir(Path(exe).parent)
+    monkeypatch.setenv("PATH", str(Path(exe).parent))
     monkeypatch.setenv("TOD_FFMPEG", "./ffmpeg")
     assert vmaf_module.find_tool() == vmaf_module.Tool(exe, "1.2.3")
     monkeypatch.delenv("TOD_FFMPEG")  # it is on the PATH, too

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import os
 import re
+import socket
+import sys
 import threading
 from dataclasses import replace
+from itertools import count
 
 import numpy as np
 import pytest
@@ -31,13 +34,13 @@ class Topic:
         camera = configuration([*WORDS, *TOPICS]).vehicle().cameras["front"]
         self.reports = []
         self._stream = CameraStream(camera, lambda name, what: self.reports.append(f"{name}: {what}"))
-        self._memory = os.memfd_create("picture")
+        self.memory = os.memfd_create("picture")
 
     def get(self, at, age=0.0, **form):
         """The capture time of a picture, s; None if it is left out."""
         age_ns = None if age is None else round(age * SECOND_NS)
         message = {"at": round(at * SECOND_NS), "age": age_ns, **(form or RAW)}
-        picture = self._stream.add(message, self._memory)
+        picture = self._stream.add(message, self.memory)
         return picture and picture.captured / SECOND_NS
 
     def take_reports(self):
@@ -101,11 +104,11 @@ def test_pictures_that_cannot_be_shown_are_left_out(wrong, rule):
 def test_bytes_determine_the_type_of_compressed_pictures():
     cv2 = pytest.importorskip("cv2")
     topic = Topic()
-    os.write(topic._memory, b"GIF89a")
+    os.write(topic.memory, b"GIF89a")
     assert topic.get(1, size=6, stated="jpeg") is None
     assert topic.take_reports() == ["format 'jpeg' is not supported; expected JPEG or PNG: such pictures are skipped"]
     png = cv2.imencode(".png", np.zeros((960, 1280), np.uint8))[1].tobytes()
-    os.pwrite(topic._memory, png, 0)
+    os.pwrite(topic.memory, png, 0)
     assert topic.get(2, size=len(png), stated="jpeg") == 2
     assert topic.take_reports() == ["pictures are png 1280x960"]
     assert topic.get(3, size=len(png) - 9, stated="jpeg") is None
@@ -249,24 +252,37 @@ def test_pictures_that_the_middleware_does_not_number_are_lost_as_far_as_it_know
     assert losses(monkeypatch, [], lost_in_transport=1, counted=counted).startswith(lost)
 
 
-def test_a_node_is_started_again_after_any_error(monkeypatch):
+WORKS_ONCE = """
+import socket, sys
+process = socket.socket(fileno=int(sys.argv[-1]))
+process.send(b'{"kind": "ready"}')
+sys.exit(3)
+"""
+
+
+def test_a_node_is_started_again_after_any_error(monkeypatch, tmp_path):
     monkeypatch.setattr("runner.ros.process.RETRY_S", (0.0, 0.0))
-    reports, again = [], threading.Event()
-    node = NodeProcess(configuration([*WORDS, *TOPICS]).setup().ros, print, lambda _, text: reports.append(text))
+    interpreter = tmp_path / "python"
+    interpreter.write_text(f"#!{sys.executable}\n{WORKS_ONCE}")
+    interpreter.chmod(0o755)
+    pairs, settings = count(1), replace(configuration([*WORDS, *TOPICS]).setup().ros, python=str(interpreter))
 
-    def run_once():
-        if not reports:
+    def pair(*kind, real=socket.socketpair):
+        if next(pairs) == 2:
             raise OSError(24, "Too many open files")
-        again.set()
-        node._closing.wait(10)
-        return "ended"
+        return real(*kind)
 
-    node._run_once = run_once
-    node._tried.set()  # it has worked before
-    node._thread.start()
-    assert again.wait(10)
+    monkeypatch.setattr(socket, "socketpair", pair)
+    reports, again = [], threading.Event()
+    node = NodeProcess(settings, print, lambda _, text: reports.append(text) or (len(reports) > 2 and again.set()))
+    node.start()
+    assert again.wait(60)
     node.close()
-    assert reports == ["the ROS node ended: OSError: [Errno 24] Too many open files; starting it again"]
+    assert reports[:3] == [
+        "the ROS node ended: status 3; starting it again",
+        "the ROS node ended: OSError: [Errno 24] Too many open files; starting it again",
+        "the ROS node works again",
+    ]
 
 
 def test_cameras_with_one_name_in_ros_are_refused():

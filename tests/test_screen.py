@@ -10,7 +10,6 @@ from typing import IO
 import pytest
 
 from runner.records.lines import Note
-from runner.vehicle.live import _Console
 from runner.verbs.screen import progress_bar, say
 from runner.verbs.table import LiveTable, show_summary
 
@@ -58,18 +57,3 @@ def test_progress_that_does_not_interrupt(monkeypatch: pytest.MonkeyPatch) -> No
         progress("front", 0.5)
     with pytest.raises(KeyboardInterrupt), progress_bar() as progress:
         progress("front", 0.5)
-
-
-def test_the_console_survives_a_line_that_cannot_be_written() -> None:
-    seen: list[str] = []
-
-    def write(line: str) -> None:
-        seen.append(line)
-        if len(seen) == 1:
-            raise OSError("no space left on device")
-
-    console = _Console(write)
-    console.say("first")
-    console.say("second")
-    console.close()
-    assert seen == ["first", "second"]

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 from helpers import Command
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
-from hydra._internal.utils import get_args_parser
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.plugins import Plugins
+from hydra.plugins.sweeper import Sweeper
 
 from runner.configuration.overrides import MAX_RUNS, sweep
 from runner.drive.log import FILES
@@ -31,7 +34,8 @@ SWEEPING = [name for name, verb in VERBS.items() if verb.sweeps]
 )
 def test_the_runs_are_those_of_hydras_own_sweeper(words: list[str]) -> None:
     overrides = [OverridesParser.create().parse_override(word) for word in words]
-    (batch,) = BasicSweeper.split_arguments(overrides, None)
+    (basic,) = (each for each in Plugins.instance().discover(Sweeper) if each.__name__ == "BasicSweeper")
+    (batch,) = basic.split_arguments(overrides, None)
     assert [list(run) for run in sweep(words)] == batch
 
 
@@ -106,9 +110,13 @@ def test_without_the_flag_a_comma_is_an_error(tod: Command, verb: str) -> None:
 # --- flags ------------------------------------------------------------------------------------------------------------
 
 
-def test_every_flag_of_hydra_has_an_answer(tod: Command) -> None:
+def test_every_flag_of_hydra_has_an_answer(tod: Command, tmp_path: Path) -> None:
     """One line and status 2, with and without a verb; --help and --version are supported, and -m by three verbs."""
-    known = {flag for action in get_args_parser()._actions for flag in action.option_strings}
+    app = tmp_path / "app.py"
+    app.write_text("import hydra\n\n\n@hydra.main(version_base=None, config_path=None)\ndef app(_): ...\n\n\napp()\n")
+    command = [sys.executable, app, "--hydra-help"]
+    listed = subprocess.run(command, capture_output=True, text=True, check=True).stdout.partition("== Flags ==")[2]
+    known = {flag for flags in re.findall(r"(?m)^(-\S+)", listed) for flag in flags.strip(":").split(",")}
     answered = {flag for flags in HYDRA_FLAGS for flag in flags}
     assert known - {"--help", "-h", "--version", "-m"} == answered
     for flags, instead in HYDRA_FLAGS.items():

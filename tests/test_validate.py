@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import threading
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager
-from multiprocessing import parent_process
-from pathlib import Path
+from multiprocessing import active_children
 
 import pytest
 from helpers import CONF, Command, UserConf, process
@@ -98,21 +98,22 @@ def test_without_shared_memory_one_process_checks_everything(
     assert problems(tod, conf) == ["~/experiment/many.yaml: experiment.runs.fast: control.port=-1: must be at least 1"]
 
 
-CHECK = validate._check
-
-
-def die(task: validate.ValidationTask, user: Path | None) -> validate.Result:
-    if parent_process():
-        os._exit(1)
-    return CHECK(task, user)
-
-
 @pytest.mark.slow
 def test_a_worker_process_that_dies_is_reported(tod: Command, conf: UserConf, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _pid: {0, 1})
-    monkeypatch.setattr(validate, "_check", die)
     conf.write("experiment/many.yaml", EXPERIMENT + RUNS)
+    ended = threading.Event()
+
+    def kill() -> None:
+        while not ended.wait(0.01):
+            for worker in active_children():
+                worker.kill()
+
+    killing = threading.Thread(target=kill)
+    killing.start()
     result = tod("validate", conf.word)
+    ended.set()
+    killing.join()
     assert result.status == 1
     assert "a worker process ended without a result: it may have run out of memory" in result.err
 

@@ -7,6 +7,7 @@ import json
 import os
 import queue
 import random
+import re
 import shutil
 import socket
 import subprocess
@@ -416,6 +417,11 @@ def streaming(
         yield side, setup, plans, reported
     finally:
         side.stop()
+
+
+def faults(reported: Sequence[str]) -> list[str]:
+    """The reports without those of a camera's rate, which a busy machine may not keep."""
+    return [line for line in reported if not re.fullmatch(r".*: (\d+ of )?[\d.]+ Hz( again)?", line)]
 
 
 def rejected(reported: Sequence[str]) -> list[str]:

@@ -35,6 +35,14 @@ def complete(figures):
     return figures if measured and min(received) > 20 and figures["tod_vehicle_online", ""] else None
 
 
+def test_a_vehicle_whose_state_never_arrived_is_offline():
+    """Otherwise no alert could name it."""
+    port = free_port()
+    words = (f"media.port={free_port()}", f"control.port={free_port()}", f"metrics.operator_port={port}")
+    with process("operator", *ROBOT, *words):
+        assert until(lambda: passes(port), every_s=0.2)["tod_vehicle_online", ""] == 0
+
+
 def test_both_sides_serve_figures_of_a_drive(tmp_path):
     vehicle, operator = free_port(), free_port()
     ports = (f"media.port={free_port()}", f"control.port={free_port()}", f"metrics.vehicle_port={vehicle}")

@@ -12,7 +12,7 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from rig import free_port, until
+from rig import ROBOT, free_port, until
 from runner.core.roles import Role
 from runner.mqtt.broker import private_broker
 from runner.mqtt.link import ControlLink
@@ -21,6 +21,7 @@ from runner.security import keyring
 from runner.security.authority import Authority
 from runner.security.keyring import Keyring
 from runner.settings import Endpoint
+from runner.vehicle.live import live_vehicle
 
 pytestmark = pytest.mark.gst
 
@@ -324,3 +325,17 @@ def test_certificates_that_expire_soon_are_mentioned_at_the_start(tmp_path):
         assert {whose: day(datetime.fromtimestamp(at, UTC)) for whose, at in link.certificate_ends().items()} | {
             "the authority's": ""
         } == {"own": day(own), "the broker's": day(peer), "the authority's": ""}
+
+
+def test_a_line_that_cannot_be_written_is_not_the_last():
+    lines = []
+
+    def write(line):
+        lines.append(line)
+        if len(lines) == 1:
+            raise OSError("no space left on device")
+
+    words = (*ROBOT, f"media.port={free_port()}", f"control.port={free_port()}")
+    with live_vehicle(words, say=write) as live:
+        live.start()
+        until(lambda: len(lines) > 1)

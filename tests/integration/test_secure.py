@@ -23,7 +23,7 @@ from helpers import out_of_reach
 from mcap.reader import make_reader
 from soak.signals import MARK, marked_processes
 
-from rig import LOOPBACK6, free_port, needs_root, passes, process, small_robot, until
+from rig import LOOPBACK6, WAIT_S, free_port, needs_root, passes, process, small_robot, until
 from rtsp_client import RtspClient, client_hello, tls
 from runner.core.commands import Command
 from runner.core.roles import Role
@@ -624,18 +624,16 @@ def test_an_operator_knows_its_vehicle(keys):
             time.sleep(0.2)
 
 
-def test_silent_clients_do_not_block_others(keys):
-    """Neither clients that only connect, nor those that stop in the middle of a handshake."""
+def test_silent_clients_do_not_block_others(keys, monkeypatch):
+    """Neither clients that only connect, nor those that stop in the middle of a handshake: they are too many."""
     with ExitStack() as stack, sending(keys) as (plans, _):
         port = plans[0].operator[0].properties["location"].rpartition(":")[2].partition("/")[0]
         silent = [stack.enter_context(socket.create_connection(("127.0.0.1", int(port)))) for _ in range(60)]
         for sock in silent[::2]:
             sock.sendall(client_hello(keys / "bob"))
-        began = time.monotonic()
-        with watching(plans, keys / "alice") as (seen, messages):
+        with monkeypatch.context() as patch, watching(plans, keys / "alice") as (seen, _):
+            patch.setattr("runner.gst.clients.FIRST_REQUEST_S", 10 * WAIT_S)  # as long as a few may be silent
             until(lambda: min(seen().values()) > 5, every_s=0.1)
-            assert time.monotonic() - began < 5  # 6 s where they are not dropped
-            assert not messages, messages
         for sock in silent:
             sock.settimeout(10)
             with suppress(ConnectionError):
