@@ -210,7 +210,7 @@ def test_a_flood_of_one_operator_does_not_delay_others(broker, vehicle):
     good = Operator(broker)
     good.ask("0", event="mode_selected", mode="collective")
     with subprocess.Popen([sys.executable, "-c", FLOOD, str(broker.port)], stdout=subprocess.PIPE, text=True) as flood:
-        waits = []
+        waits, flooded = [], time.monotonic()
         while flood.poll() is None:
             began = time.monotonic()
             reply = good.ask(str(began), event="camera_switched", camera="rear", on=len(waits) % 2 == 0)
@@ -219,8 +219,9 @@ def test_a_flood_of_one_operator_does_not_delay_others(broker, vehicle):
             time.sleep(0.05)
         assert int(flood.communicate()[0]) > 20_000
     print(f"{len(waits)} requests, {max(waits) * 1000:.0f} ms at most")
-    assert sorted(waits)[len(waits) * 9 // 10] < 0.5
-    assert sorted(waits)[-2] < 1  # when the flood begins, everything on the machine is delayed
+    most_s = max(0.5, (began - flooded) / 5)  # a busy machine is slow; behind the flood they would wait for its end
+    assert sorted(waits)[len(waits) * 9 // 10] < most_s
+    assert sorted(waits)[-2] < 2 * most_s  # when the flood begins, everything on the machine is delayed
     until(lambda: good.telemetry[-1]["refused"] > 10_000)
 
 

@@ -248,7 +248,7 @@ def test_a_receiver_that_locks_up_does_not_delay_the_others(monkeypatch):
     class Stuck(Gst.Bin):
         def do_change_state(self, transition):
             if transition == Gst.StateChange.READY_TO_NULL:
-                freed.wait(30)
+                freed.wait(120)
             return Gst.Bin.do_change_state(self, transition)
 
     setup, plans = compiled()
@@ -263,7 +263,7 @@ def test_a_receiver_that_locks_up_does_not_delay_the_others(monkeypatch):
                 more(30)  # both: another receiver replaces the stuck one
                 until(lambda: any(aside.HUNG in what for what in messages))
                 began = time.monotonic()
-            assert time.monotonic() - began < 10  # 30 s if it waited for the stuck one
+            assert time.monotonic() - began < 60  # 120 s if it waited for the stuck one
         finally:
             freed.set()
     assert messages[0] == "front: locked up"

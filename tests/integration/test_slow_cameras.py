@@ -136,9 +136,13 @@ def test_a_clip_that_stood_still_once_plays_at_its_rate_again(tmp_path, disturb)
         until(lambda: client.frames_with_retry() > 5)
         disturb(side)
         time.sleep(STILL_S)
-        began, before = time.monotonic(), side.read()["rear"].encoded.frames
-        time.sleep(1.5)
-        assert (side.read()["rear"].encoded.frames - before) / (time.monotonic() - began) == pytest.approx(25, rel=0.15)
+
+        def rate():
+            began, before = time.monotonic(), side.read()["rear"].encoded.frames
+            time.sleep(1.5)
+            return (side.read()["rear"].encoded.frames - before) / (time.monotonic() - began)
+
+        until(lambda: rate() == pytest.approx(25, rel=0.15))  # on a busy machine not at once
 
 
 @pytest.mark.soak
