@@ -633,7 +633,7 @@ def test_silent_clients_do_not_block_others(keys, monkeypatch):
             sock.sendall(client_hello(keys / "bob"))
         with monkeypatch.context() as patch, watching(plans, keys / "alice") as (seen, _):
             patch.setattr("runner.gst.clients.FIRST_REQUEST_S", 10 * WAIT_S)  # as long as a few may be silent
-            until(lambda: min(seen().values()) > 5, every_s=0.1)
+            until(lambda: min(seen().values()) > 5, 5 * WAIT_S, every_s=0.1)
         for sock in silent:
             sock.settimeout(10)
             with suppress(ConnectionError):
