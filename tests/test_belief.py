@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from helpers import Drive
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from runner.core import belief
@@ -203,7 +203,6 @@ def evidences(draw: st.DrawFn) -> Evidence:
 
 
 @given(st.lists(st.tuples(evidences(), st.floats(0, 3), st.one_of(st.none(), st.floats(0, 1e6))), max_size=60))
-@settings(max_examples=150, deadline=None)
 def test_no_sequence_of_reports_breaks_the_total(reports: list[tuple[Evidence, float, float | None]]) -> None:
     b, t = belief.begin(0.0, 1000, 30_000, None), 0.0
     for evidence, after_s, prediction in reports:
@@ -217,7 +216,6 @@ def test_no_sequence_of_reports_breaks_the_total(reports: list[tuple[Evidence, f
 
 
 @given(st.lists(st.tuples(evidences(), st.floats(0, 3), st.integers(0, 20_000)), max_size=20))
-@settings(max_examples=50, deadline=None)
 def test_no_report_takes_the_total_above_an_enforced_prediction(reports: list[tuple[Evidence, float, int]]) -> None:
     drive, t = Drive("vehicle=delivery_robot", "modes.automatic.follow_link.ceiling=prediction"), 0.0
     drive.accept("operator_connected")

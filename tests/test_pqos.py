@@ -15,7 +15,7 @@ from typing import Any
 import jsonschema
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 from shared_data import ROOT, shared
@@ -70,7 +70,6 @@ def brute_force(places: Any, rates: Any, radius_m: float, way: Way) -> float | N
     return best
 
 
-@settings(max_examples=300)
 @given(
     seed=st.integers(0, 2**32 - 1),
     count=st.integers(1, 200),

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from helpers import CONF, Drive, carries, vehicle
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from runner.configuration.rule_lists import OWN_RULES, call_rule, check_order
@@ -112,7 +112,6 @@ def states(draw: st.DrawFn) -> State:
     return replace(START, on=on, rois=rois, weights=weights)
 
 
-@settings(max_examples=60)
 @given(states(), st.fractions(0, 40_000, max_denominator=100), st.fractions(0, 5000, max_denominator=100))
 def test_more_bitrate_never_lowers_a_factor(state: State, total: Fraction, more: Fraction) -> None:
     less, greater = decided(total, state).settings, decided(total + more, state).settings
@@ -121,7 +120,6 @@ def test_more_bitrate_never_lowers_a_factor(state: State, total: Fraction, more:
         assert less[name].kbps <= greater[name].kbps
 
 
-@settings(max_examples=60)
 @given(states(), st.fractions(0, 40_000, max_denominator=100))
 def test_what_is_sent_never_exceeds_the_total(state: State, total: Fraction) -> None:
     decision = decided(total, state)
@@ -411,7 +409,6 @@ def reading_everything(vehicle: Vehicle) -> Vehicle:
 
 @pytest.mark.slow  # simulates many drives
 @pytest.mark.parametrize("modes", sorted(path.stem for path in (CONF / "modes").glob("*.yaml")))
-@settings(max_examples=40)
 @given(events=st.lists(PASSING, min_size=10, max_size=40))
 @example(events=OLD_MEASUREMENT)
 @example(events=NEW_OPERATOR)

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 from helpers import Drive
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from runner.core import rules
@@ -282,7 +282,6 @@ events = st.one_of(
 )
 
 
-@settings(max_examples=60)
 @given(st.sampled_from(["paper", "safe", "steady"]), st.lists(st.tuples(st.floats(0, 4), events), max_size=25))
 def test_whatever_happens_the_commands_lead_to_the_decision(modes: str, story: list[Any]) -> None:
     vehicle = Drive(f"modes={modes}").vehicle
