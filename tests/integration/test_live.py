@@ -119,13 +119,6 @@ def test_an_operator_who_falls_silent_is_gone(broker, vehicle):
     operator.state(lambda state: all(camera["sending"] for camera in state["cameras"].values()))
 
 
-def test_a_killed_vehicle_is_reported_by_its_last_will(broker, vehicle):
-    operator = Operator(broker)
-    operator.state(lambda state: state["online"])
-    vehicle.kill()
-    assert operator.state(lambda state: not state["online"]) == {"online": False}
-
-
 def test_a_drive_replays_to_exactly_the_decisions_that_were_made_live(broker, vehicle, tmp_path):
     """Every decision, with its reason and the commands, at its event; without naming the configuration again."""
     operator = Operator(broker)
@@ -152,11 +145,12 @@ def decided(lines):
     return [line for line in lines if line.get("log") == "decision"]
 
 
-def test_a_killed_vehicle_leaves_a_drive_that_can_be_read(tod, broker, vehicle, tmp_path):
+def test_a_killed_vehicle_is_reported_by_its_last_will_and_its_drive_can_be_read(tod, broker, vehicle, tmp_path):
     operator = Operator(broker)
     operator.state(lambda state: state["online"])
-    time.sleep(1)
+    until(lambda: len((tmp_path / "drive" / "drive.jsonl").read_text().splitlines()) > 12)
     vehicle.kill()
+    assert operator.state(lambda state: not state["online"]) == {"online": False}
     vehicle.wait(timeout=15)
     drive = read_drive(tmp_path / "drive")
     assert drive.warnings[-1].endswith("was not closed; the process was killed or is still running")
