@@ -275,8 +275,8 @@ def test_a_standard_output_closed_from_the_start(words: list[str]) -> None:
         (">&-", "print source=test", 0),
         ("2>&-", "print fps_max=0", 2),
         ("<&-", "replay source=test", 0),
-        ("<&- >&- 2>&-", "print source=test", 0),
-        ("<&- >&- 2>&-", "print fps_max=0", 2),
+        pytest.param("<&- >&- 2>&-", "print source=test", 0, marks=pytest.mark.soak),
+        pytest.param("<&- >&- 2>&-", "print fps_max=0", 2, marks=pytest.mark.soak),
         ("<&- >&- 2>&-", "replay source=test", 0),
     ],
 )
