@@ -41,7 +41,6 @@ def test_the_driving_test_does_what_the_paper_reports(tmp_path: Path) -> None:
     "overrides, broken",
     [
         (["pqos.file=maps/demo_loop.csv", "pqos.position.speed_mps=4"], {"Around 15", "Around 55", "Between 70"}),
-        (["cameras.rear_center.weight=3"], {"Front left and right", "Around 15", "Around 55"}),
         (["cameras.top_left.weight=1.5"], {"The bitrates of the top views", "The top views get less"}),
         (["modes=equal"], {"Front left and right", "The top views get less", "Around 15", "Around 55"}),
     ],
