@@ -37,9 +37,10 @@ def count(group: str) -> int:
 
 
 @pytest.mark.slow
-def test_what_is_packaged_is_valid() -> None:
-    """Every file, and every combination of them."""
-    result = process("validate", "all=true")
+@pytest.mark.parametrize("words", [["source=test"], pytest.param([], marks=pytest.mark.soak)])
+def test_what_is_packaged_is_valid(words: list[str]) -> None:
+    """Every file, and every combination with one source; `make soak` takes all, and tests/golden plans with all."""
+    result = process("validate", "all=true", *words)
     files = sum(map(count, (".", *GROUPS)))
     assert (result.status, result.err) == (0, "")
     first, *notes = result.out.splitlines()
@@ -50,7 +51,8 @@ def test_what_is_packaged_is_valid() -> None:
 
 # --- many runs --------------------------------------------------------------------------------------------------------
 
-RUNS = "".join(f"    run{n}: [control.port={2000 + n}]\n" for n in range(2 * validate.PER_WORKER))
+PER_WORKER = 2  # fewer than are worth the start of a worker, which makes no difference to what is found
+RUNS = "".join(f"    run{n}: [control.port={2000 + n}]\n" for n in range(2 * PER_WORKER))
 EXPERIMENT = """# @package _global_
 defaults: [driving_test, _self_]
 experiment:
@@ -62,6 +64,7 @@ experiment:
 def test_worker_processes_report_the_same_as_one_process(
     tod: Command, conf: UserConf, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(validate, "PER_WORKER", PER_WORKER)
     wrong = "    fast: [control.port=-1]\n    slow: [control.prt=1]\n"
     conf.write("experiment/many.yaml", EXPERIMENT + RUNS + wrong)
     conf.write("experiment/narrow.yaml", f"{EXPERIMENT}{RUNS}{wrong}cameras:\n  ghost: {{weight: 2}}\n")
@@ -93,6 +96,7 @@ def test_without_shared_memory_one_process_checks_everything(
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(os, "sched_getaffinity", lambda _pid: {0, 1})
+    monkeypatch.setattr(validate, "PER_WORKER", PER_WORKER)
     monkeypatch.setattr(spawned, "process_pool", refused)
     conf.write("experiment/many.yaml", f"{EXPERIMENT}{RUNS}    fast: [control.port=-1]\n")
     assert problems(tod, conf) == ["~/experiment/many.yaml: experiment.runs.fast: control.port=-1: must be at least 1"]
@@ -101,6 +105,7 @@ def test_without_shared_memory_one_process_checks_everything(
 @pytest.mark.slow
 def test_a_worker_process_that_dies_is_reported(tod: Command, conf: UserConf, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _pid: {0, 1})
+    monkeypatch.setattr(validate, "PER_WORKER", PER_WORKER)
     conf.write("experiment/many.yaml", EXPERIMENT + RUNS)
     ended = threading.Event()
 
