@@ -255,7 +255,7 @@ def run_adaptive(**how):
 
 
 @pytest.mark.slow
-@settings(max_examples=25)
+@settings(max_examples=10)
 @given(st.floats(0.3, 4.0))
 def test_the_adaptive_plan_chooses_as_the_full_one_with_a_third_of_the_encodings(hard):
     points = run_adaptive(hard=hard)

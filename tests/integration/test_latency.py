@@ -177,9 +177,9 @@ def test_latencies_are_right_or_unknown_while_the_vehicles_clock_is_set(tmp_path
     clock, path = tmp_path / "clock", tmp_path / "drive"
     env = clock_ahead(clock, 0.0)
     ports = (f"media.port={free_port()}", f"control.port={free_port()}")
-    with process("demo", *ROBOT, *ports, f"log={path}", "duration_s=10", env=env) as demo:
+    with process("demo", *ROBOT, *ports, f"log={path}", "duration_s=7", env=env) as demo:
         until(lambda: (path / "operator.jsonl").exists() or demo.poll() is not None)
-        for number in range(22):
+        for number in range(14):
             time.sleep(0.43)
             set_clock(clock, (5.0, 0.0, -5.0, 0.0)[number % 4])
         output, _ = demo.communicate(timeout=60)
