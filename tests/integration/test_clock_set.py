@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from rig import ROBOT, clock_ahead, free_port, needs_compiler, process, run, set_clock, until
+from rig import ROBOT, clock_ahead, free_port, needs_compiler, process, set_clock, until
 from runner.drive.captures import files, received
 from runner.drive.read import read_drive
 from runner.drive.series import series
@@ -36,7 +36,7 @@ def driven(tmp_path_factory):
 
 
 @needs_compiler
-def test_the_start_of_a_drive_in_1970_is_corrected(driven, tmp_path):
+def test_the_start_of_a_drive_in_1970_is_corrected(tod, driven, tmp_path):
     path, began = driven
     drive = read_drive(path)
     vehicle, operator = drive.sides["vehicle"], drive.sides["operator"]
@@ -57,7 +57,7 @@ def test_the_start_of_a_drive_in_1970_is_corrected(driven, tmp_path):
     known = [unit.captured / 1e9 for unit in received(operator, "front")]
     assert len(known) > 60
     assert all(vehicle.began_s < captured < until_s for captured in known)
-    _check_export(path, tmp_path, vehicle)
+    _check_export(tod, path, tmp_path, vehicle)
     # The operator's log alone knows the clock by the messages exchanged.
     (path / "drive.jsonl").rename(tmp_path / "drive.jsonl")
     alone = read_drive(path).sides["operator"]
@@ -65,12 +65,12 @@ def test_the_start_of_a_drive_in_1970_is_corrected(driven, tmp_path):
     assert abs(alone.began_s - operator.began.time) < 0.1
 
 
-def _check_export(path, tmp_path, vehicle):
+def _check_export(tod, path, tmp_path, vehicle):
     pytest.importorskip("mcap")
     from mcap.reader import make_reader
 
-    exported = run("export", str(path), f"output={tmp_path / 'drive.mcap'}")
-    assert exported.returncode == 0, exported.stderr
+    exported = tod("export", str(path), f"output={tmp_path / 'drive.mcap'}")
+    assert exported.status == 0, exported.err
     with (tmp_path / "drive.mcap").open("rb") as file:
         reader = make_reader(file)
         summary = reader.get_summary()

@@ -13,7 +13,7 @@ from itertools import pairwise
 
 import pytest
 
-from rig import CLIPS, ROBOT, SHARED, SMALL_ROBOT, Operator, free_port, process, run, until
+from rig import CLIPS, ROBOT, SHARED, SMALL_ROBOT, Operator, free_port, process, run, small_robot, until
 from runner.core.events import BitratePredicted, CameraSwitched
 from runner.drive.log import FILES
 from runner.drive.read import read_drive
@@ -119,7 +119,7 @@ def test_an_operator_who_falls_silent_is_gone(broker, vehicle):
     operator.state(lambda state: all(camera["sending"] for camera in state["cameras"].values()))
 
 
-def test_a_drive_replays_to_exactly_the_decisions_that_were_made_live(broker, vehicle, tmp_path):
+def test_a_drive_replays_to_exactly_the_decisions_that_were_made_live(tod, broker, vehicle, tmp_path):
     """Every decision, with its reason and the commands, at its event; without naming the configuration again."""
     operator = Operator(broker)
     operator.state(lambda state: state["online"])
@@ -132,8 +132,8 @@ def test_a_drive_replays_to_exactly_the_decisions_that_were_made_live(broker, ve
     vehicle.send_signal(signal.SIGTERM)
     vehicle.wait(timeout=15)
     live = [json.loads(line) for line in (tmp_path / "drive" / "drive.jsonl").read_text().splitlines()]
-    done = run("replay", f"input={tmp_path / 'drive'}", f"log={tmp_path / 'again'}", f"output={tmp_path / 'decisions'}")
-    assert done.returncode == 0, done.stderr
+    done = tod("replay", f"input={tmp_path / 'drive'}", f"log={tmp_path / 'again'}", f"output={tmp_path / 'decisions'}")
+    assert done.status == 0, done.err
     replayed = [json.loads(line) for line in (tmp_path / "again" / "drive.jsonl").read_text().splitlines()]
     assert len(decided(live)) > 5
     assert decided(live) == decided(replayed)
@@ -333,10 +333,10 @@ def test_the_demo_runs_a_real_clip_along_a_real_map(tmp_path):
 
 def test_missing_requirements_are_reported_in_one_line_with_status_1(broker, tmp_path):
     port = f"control.port={broker.port}"
-    device = "cameras.front_left.device=/dev/video99"
-    absent = run("vehicle", "source=v4l2", device, "strict=true", port, f"media.port={free_port()}")
+    device = ("source=v4l2", "cameras.front.device=/dev/video99")
+    absent = run("vehicle", *small_robot("front"), *device, "strict=true", port, f"media.port={free_port()}")
     assert absent.returncode == 1
-    assert "camera front_left: Cannot identify device '/dev/video99'." in absent.stderr
+    assert "camera front: Cannot identify device '/dev/video99'." in absent.stderr
     assert "Traceback" not in absent.stderr
 
     with socket.create_server(("127.0.0.1", 0)) as other:

@@ -263,13 +263,13 @@ def test_the_room_that_is_needed(tmp_path, monkeypatch, free, fits):
 # --- refused input ----------------------------------------------------------------------------------------------------
 
 
-def test_nothing_is_overwritten(tmp_path):
+def test_nothing_is_overwritten(tod, tmp_path):
     names = ["front.mkv", ".rear.mkv.part"]
     for name in names:
         (tmp_path / name).write_text("mine")
-    done = run("record", "vehicle=delivery_robot", "source=test", f"output={tmp_path}", "duration_s=1")
+    done = tod("record", "vehicle=delivery_robot", "source=test", f"output={tmp_path}", "duration_s=1")
     rule = "front.mkv, .rear.mkv.part already exist; choose another directory"
-    assert (done.returncode, done.stderr) == (2, f"command line: output: '{tmp_path}': {rule}\n")
+    assert (done.status, done.err) == (2, f"command line: output: '{tmp_path}': {rule}\n")
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(names)
     assert all((tmp_path / name).read_text() == "mine" for name in names)
 
@@ -298,10 +298,10 @@ def test_a_name_taken_during_the_recording_is_not_overwritten(tmp_path):
         ),
     ],
 )
-def test_bad_input_is_reported(words, status, expected):
-    done = run("record", *ONE, *(["source=test"] if "source=appsrc" not in words else []), *words)
-    assert (done.returncode, done.stdout) == (status, "")
-    assert done.stderr.startswith(expected)
+def test_bad_input_is_reported(tod, words, status, expected):
+    done = tod("record", *ONE, *(["source=test"] if "source=appsrc" not in words else []), *words)
+    assert (done.status, done.out) == (status, "")
+    assert done.err.startswith(expected)
 
 
 def test_an_encoder_that_is_not_installed_names_its_package(tmp_path, monkeypatch, capsys):
