@@ -192,6 +192,7 @@ render([view], 4, Path(sys.argv[1]), lambda *_: None)
 """
 
 
+@pytest.mark.soak  # starts Python and its renderer twice
 def test_a_script_without_a_guard_ends_with_the_reason(tmp_path: Path) -> None:
     """Each worker runs it again; there the call must not wait for the one that started the worker."""
     script = tmp_path / "script.py"

@@ -264,7 +264,7 @@ def received(side, plan, camera, frame):
 @pytest.mark.parametrize(
     ("roi", "size", "corners"),
     [
-        (Roi(0, 0, 1920, 1040), (480, 260), (BRIGHT, RED, BLUE, DARK)),
+        pytest.param(Roi(0, 0, 1920, 1040), (480, 260), (BRIGHT, RED, BLUE, DARK), marks=pytest.mark.soak),
         (Roi(0, 0, 960, 1040), (240, 260), (BRIGHT, BRIGHT, BLUE, BLUE)),  # left half
         (Roi(0, 0, 1920, 260), (480, 66), (BRIGHT, RED, BRIGHT, RED)),  # top strip
         (Roi(960, 520, 960, 520), (480, 260), (DARK, DARK, DARK, DARK)),

@@ -152,8 +152,8 @@ def test_the_length_is_kept_to_the_frame_and_described(tmp_path):
     [
         (signal.SIGINT, 130, ()),
         (signal.SIGTERM, 0, ()),
-        (signal.SIGHUP, 0, ()),
-        (signal.SIGINT, 130, ("duration_s=60",)),
+        pytest.param(signal.SIGHUP, 0, (), marks=pytest.mark.soak),
+        pytest.param(signal.SIGINT, 130, ("duration_s=60",), marks=pytest.mark.soak),
     ],
 )
 def test_a_signal_ends_with_complete_files(tmp_path, number, status, words):
