@@ -80,6 +80,21 @@ class Link:
     back_losses: LossModel | None = None
     tcp: TcpFlows | None = None
 
+    def back_after_s(self, t: float) -> float:
+        """Delay of a packet to the vehicle without any queue."""
+        return self.back_s + (self.back_at(t) if self.back_at else 0.0)
+
+    def back_arrival(self, t: float, size: int) -> float:
+        """When a message to the vehicle arrives; a segment that is dropped is repeated later."""
+        left: float | None = t
+        for part in segments(size) if self.back else ():
+            left = self.back.put(t, part) if self.back and left is not None else None
+        return (t + RTO_S if left is None else left) + self.back_after_s(t)
+
+    def loses_back(self) -> bool:
+        """Whether the next packet to the vehicle is lost."""
+        return bool(self.back_losses and self.back_losses.draw())
+
 
 @dataclass
 class Drive:
@@ -341,8 +356,8 @@ class Simulation:
         if loss.complete is not None or t >= loss.due or self.operator.congested:
             return
         self._at(t + max(RETRY_S, self.operator.rtt_s), self._request, what)
-        if not self._lost_back():
-            self._at(t + self._back_s(t), self._repeat, (loss, sent, t))
+        if not self.link.loses_back():
+            self._at(t + self.link.back_after_s(t), self._repeat, (loss, sent, t))
 
     def _repeat(self, t: float, what: tuple[Loss, float, float]) -> None:
         """The vehicle sends lost packets again."""
@@ -377,10 +392,10 @@ class Simulation:
         conditions, rng = self.conditions, self._rng
         if conditions.report_loss and rng.random() < conditions.report_loss:
             return
-        arrival = self._back_arrival(t, REPORT_BYTES + UNIT_BYTES * len(report.units))
+        arrival = self.link.back_arrival(t, REPORT_BYTES + UNIT_BYTES * len(report.units))
         if conditions.report_jitter_s:
             arrival += rng.expovariate(1 / conditions.report_jitter_s)
-        if self._lost_back():  # TCP repeats it one round trip after the next one has arrived (RFC 8985)
+        if self.link.loses_back():  # TCP repeats it one round trip after the next one has arrived (RFC 8985)
             arrival += REPORT_S + self.link.one_way_s + self.link.back_s
         self._back_newest = max(self._back_newest, arrival)
         self._at(self._back_newest, self._take_report, report)
@@ -389,19 +404,6 @@ class Simulation:
         self.vehicle.take_report(report, round(t, 6))
         self._send_message(t, 0)
         self._send_state(t)
-
-    def _back_arrival(self, t: float, size: int) -> float:
-        """When a message to the vehicle arrives; a segment that is dropped is repeated later."""
-        left: float | None = t
-        for part in segments(size) if self.link.back else ():
-            left = self.link.back.put(t, part) if self.link.back and left is not None else None
-        return (t + RTO_S if left is None else left) + self._back_s(t)
-
-    def _back_s(self, t: float) -> float:
-        return self.link.back_s + (self.link.back_at(t) if self.link.back_at else 0.0)
-
-    def _lost_back(self) -> bool:
-        return bool(self.link.back_losses and self.link.back_losses.draw())
 
     # --- other traffic ---
 
