@@ -7,26 +7,23 @@ from __future__ import annotations
 
 import os
 import threading
-import time
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from fractions import Fraction
 from functools import partial
+from importlib import import_module
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from runner.core.commands import Command, KnobValue
 from runner.core.decision import NOTHING
-from runner.core.model import Camera
 from runner.errors import RunError, suggest
-from runner.graph import Plan, launch, may_lack_parameter_sets
-from runner.gst import TYPELIBS, GLib, Gst, load_types
-from runner.gst.aside import settle
+from runner.graph import Plan
+from runner.gst import TYPELIBS, GLib, Gst
 from runner.gst.clocks import captured_at
-from runner.gst.credentials import Login, log_in
+from runner.gst.credentials import Login
 from runner.gst.decoders import DecoderWatch
+from runner.gst.glib_thread import GlibThread
 from runner.gst.ip_camera import follow_cameras
 from runner.gst.lost import LostCameras
 from runner.gst.opening import OnReport
@@ -38,29 +35,33 @@ from runner.gst.recorder import Recorded, Recorder, Stage
 from runner.gst.registry import (
     check_operator,
     check_plan,
+    check_recorders,
     check_vehicle,
     missing_plugins,
     missing_recorders,
+    require_plugins,
     versions,
 )
 from runner.gst.rtspsrc import limit_teardown
 from runner.gst.server import CameraServer
+from runner.gst.source import source_problem
 from runner.gst.supervised import CameraCaller
 from runner.gst.timers import Guarded, every
 from runner.gst.video_files import VideoFile, VideoFiles
 from runner.gst.watched import WatchedSource
-from runner.inputs import input_problem
 from runner.records.reception import Arrivals, SentFrame
 from runner.records.vehicle import CameraReading, SenderStages
 from runner.settings import Media
 
 if TYPE_CHECKING:
-    from runner.gst.lanes import Encoded, OnDecoded, OnFrame
-    from runner.gst.pictures import LumaPlane
+    from runner.gst.clip_writer import write_clip
+    from runner.gst.encoded_again import read_again
+    from runner.gst.lanes import run_lanes
+    from runner.gst.parameter_sets import parameter_set_notes
+    from runner.gst.pictures import decode_video
     from runner.gst.secure import StreamLogin
-    from runner.gst.sequence import Form
-    from runner.gst.video_reader import Unit
-    from runner.lanes import LaneSet
+    from runner.gst.sequence import discover
+    from runner.gst.video_reader import Unit, read_video
     from runner.ros.cameras import SharedPicture
     from runner.security.keyring import Keyring
 
@@ -92,11 +93,17 @@ __all__ = [
     "write_clip",
 ]
 
-CALL_S = 10.0  # timeout of a call into GLib's thread, which normally takes milliseconds
+OFFLINE = {  # by name, its module
+    "decode_video": "pictures",
+    "discover": "sequence",
+    "parameter_set_notes": "parameter_sets",
+    "read_again": "encoded_again",
+    "read_video": "video_reader",
+    "run_lanes": "lanes",
+    "write_clip": "clip_writer",
+}
 LOOK_MS = 20  # how often it looks which frames have left: their times are known as precisely as this
-BEAT_MS = 200  # how often GLib's thread shows that it runs
 TAILS_MS = 10  # how often receivers check for frames whose end is missing
-STOP_S = 2.0  # how long teardown waits for pipelines to stop
 
 
 def check_machine(plans: Sequence[Plan], *, strict: bool = True) -> dict[str, str]:
@@ -106,123 +113,11 @@ def check_machine(plans: Sequence[Plan], *, strict: bool = True) -> dict[str, st
     returns  by camera whose source does not open, why
     raises   RunError with the remedy, for all cameras at once
     """
-    missing = dict.fromkeys(sentence for plan in plans for sentence in missing_plugins(plan, ("vehicle",)))
-    if missing:
-        raise RunError("\n".join(missing))
-    refused = {plan.camera.name: why for plan in plans if (why := _source_problem(plan))}
+    require_plugins(plans, ("vehicle",))
+    refused = {plan.camera.name: why for plan in plans if (why := source_problem(plan))}
     if refused and strict:
         raise RunError("\n".join(f"camera {name}: {why}" for name, why in refused.items()))
     return refused
-
-
-def check_recorders(plans: Sequence[Plan]) -> None:
-    """Check that every plugin that recording needs is installed.
-
-    raises  RunError with the packages to install, for all cameras at once
-    """
-    missing = dict.fromkeys(sentence for plan in plans for sentence in missing_recorders(plan))
-    if missing:
-        raise RunError("\n".join(missing))
-
-
-def _device_problem(camera: Camera) -> str | None:
-    """Why a device cannot be the camera's; None if it can, or GStreamer says what is wrong."""
-    if camera.device is None or not (path := Path(camera.device)).is_char_device():
-        return None
-    from runner.system.v4l2 import device_problem
-
-    why = device_problem(path, camera.capture, Fraction(0))  # a slow camera is sent at its rate
-    return f"{path} {why}" if why else None
-
-
-def _source_problem(plan: Plan) -> str | None:
-    """Why a source does not open; None if it opens. GStreamer opens devices on the way to READY, and clips later."""
-    if absent := input_problem(plan.camera):
-        return str(absent)
-    if unfit := _device_problem(plan.camera):
-        return unfit
-    pipeline = Gst.parse_launch(f"{launch(plan.source)} ! fakesink")
-    try:
-        if problem := log_in(pipeline, plan):
-            return problem
-        if pipeline.set_state(Gst.State.READY) != Gst.StateChangeReturn.FAILURE:
-            return None
-        message = pipeline.get_bus().pop_filtered(Gst.MessageType.ERROR)
-        return str(message.parse_error()[0].message) if message else "its source does not start"
-    finally:
-        pipeline.set_state(Gst.State.NULL)
-
-
-class _Glib:
-    """GLib's main loop in its own thread, where the RTSP server and the buses run.
-
-    `beat` is when it last ran its timers (time.monotonic).
-    """
-
-    def __init__(self) -> None:
-        load_types()
-        self._loop = GLib.MainLoop()
-        self._calls: deque[Callable[[], None]] = deque()
-        # One watch for all calls: see runner/gst/probes.py. Its priority is that of the timers: at a lower one,
-        # calls would wait for as long as an overloaded loop always has a timer to run.
-        self._wakeup = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
-        self._watch = GLib.unix_fd_add_full(GLib.PRIORITY_DEFAULT, self._wakeup, GLib.IOCondition.IN, self._on_wakeup)
-        self.beat = time.monotonic()
-        self._beating = GLib.timeout_add(BEAT_MS, self._on_beat)
-        self._thread = threading.Thread(target=self._loop.run, name="glib", daemon=True)
-        self._thread.start()
-
-    def call(self, what: str, function: Callable[[], None]) -> None:
-        """Run a function in the loop's thread and wait for it; its exceptions are raised here.
-
-        what    description of the work, for messages
-        raises  RunError if it takes longer than CALL_S, or the loop has ended
-        """
-        if self._wakeup < 0:
-            raise RunError(f"GStreamer's thread has ended: {what}")
-        done = threading.Event()
-        raised: list[BaseException] = []
-
-        def run() -> None:
-            try:
-                function()
-            except BaseException as error:
-                raised.append(error)
-            done.set()
-
-        self._calls.append(run)
-        os.eventfd_write(self._wakeup, 1)
-        if not done.wait(CALL_S):
-            raise RunError(f"GStreamer hangs: {what} takes more than {CALL_S:g} s")
-        if raised:
-            raise raised[0]
-
-    def _on_beat(self) -> bool:
-        self.beat = time.monotonic()
-        return True
-
-    def _on_wakeup(self, *_: object) -> bool:
-        os.eventfd_read(self._wakeup)
-        while self._calls:
-            self._calls.popleft()()
-        return True
-
-    def end(self, stop: Callable[[], None]) -> None:
-        """Run the last function, let state changes finish, and end the loop. Anything that still hangs is abandoned."""
-        try:
-            self.call("stopping", stop)
-            settle(STOP_S)
-        finally:
-            self._quit()
-
-    def _quit(self) -> None:
-        self._loop.quit()
-        self._thread.join(timeout=5)
-        if not self._thread.is_alive():
-            GLib.source_remove(self._beating)
-            GLib.source_remove(self._watch)
-            wakeup, self._wakeup = self._wakeup, -1  # its number may soon be reused
-            os.close(wakeup)
 
 
 def _with_video(plans: Sequence[Plan], video: VideoFiles | None, side: str) -> Sequence[Plan]:
@@ -233,8 +128,7 @@ def _with_video(plans: Sequence[Plan], video: VideoFiles | None, side: str) -> S
     if video is None:
         return plans
     plans = [replace(plan, video=True) for plan in plans]
-    if missing := dict.fromkeys(sentence for plan in plans for sentence in missing_plugins(plan, (side,))):
-        raise RunError("\n".join(missing))
+    require_plugins(plans, (side,))
     return plans
 
 
@@ -280,7 +174,7 @@ class VehicleSide:
         self._left_out: dict[str, set[str]] = {plan.camera.name: set() for plan in plans}  # decoders
         self._wanted: dict[str, dict[str, KnobValue]] = {plan.camera.name: {} for plan in plans}
         self.on_turned: Callable[[], None] = lambda: None
-        self._glib = _Glib()
+        self._glib = GlibThread()
         self._server: CameraServer | None = None
         self._callers = {
             p.camera.name: CameraCaller(p, self._build, on_report, passphrase, self._refusal)
@@ -289,7 +183,7 @@ class VehicleSide:
         }
         self._looks = [self._guarded_look(plan.camera.name) for plan in plans]
         served = [plan for plan in plans if plan.serves]
-        self._lost = LostCameras(plans, lost, _source_problem, self._on_found)
+        self._lost = LostCameras(plans, lost, source_problem, self._on_found)
 
         def start() -> None:
             if served:
@@ -479,7 +373,7 @@ class OperatorSide:
         vehicle: str = "",
     ) -> None:
         plans = _with_video(plans, video, "operator")
-        self._glib = _Glib()
+        self._glib = GlibThread()
         self._reports = reports = ReportMerger(on_report)
 
         def login() -> StreamLogin | None:
@@ -508,15 +402,10 @@ class OperatorSide:
         sending  which cameras should send; a silent one that should is rebuilt. Unknown ones are omitted
         raises   RunError if GStreamer hangs
         """
-        samples: dict[str, Reception] = {}
-
-        def sample() -> None:
-            for name, receiver in self._receivers.items():
-                receiver.should_send = sending.get(name)
-                samples[name] = receiver.sample()
-
-        self._glib.call("reading the receivers' counters", sample)
-        return samples
+        receivers = self._receivers
+        return self._glib.call(
+            "reading the receivers' counters", lambda: {n: r.sample(sending.get(n)) for n, r in receivers.items()}
+        )
 
     def _request_tails(self) -> None:
         for receiver in self._receivers.values():
@@ -553,93 +442,36 @@ class RecordingSide:
     """
 
     def __init__(self, plans: Sequence[Plan], files: Mapping[str, Path], duration_s: float | None) -> None:
-        self._glib = _Glib()
+        self._glib = GlibThread()
         plans = _with_clip_range(plans)
         self._recorders = {p.camera.name: Recorder(p, str(files[p.camera.name]), duration_s) for p in plans}
-        self._for_each("starting the recorders", Recorder.start)
+        self._glib.call("starting the recorders", self._for_each(Recorder.start))
 
     def sample(self) -> dict[str, Recorded]:
         """Progress of each camera's recording."""
-        samples: dict[str, Recorded] = {}
-
-        def sample() -> None:
-            samples.update({name: recorder.sample() for name, recorder in self._recorders.items()})
-
-        self._glib.call("reading the recorders' counters", sample)
-        return samples
+        recorders = self._recorders
+        return self._glib.call("reading the recorders' counters", lambda: {n: r.sample() for n, r in recorders.items()})
 
     def finish(self) -> None:
         """Finish every file with all frames delivered so far; returns immediately."""
-        self._for_each("ending the files", Recorder.finish)
+        self._glib.call("ending the files", self._for_each(Recorder.finish))
 
     def stop(self) -> None:
         """Stop immediately; unfinished files stay incomplete."""
+        self._glib.end(self._for_each(Recorder.stop))
 
-        def stop() -> None:
-            for recorder in self._recorders.values():
-                recorder.stop()
-
-        self._glib.end(stop)
-
-    def _for_each(self, what: str, do: Callable[[Recorder], None]) -> None:
+    def _for_each(self, do: Callable[[Recorder], None]) -> Callable[[], None]:
         def each() -> None:
             for recorder in self._recorders.values():
                 do(recorder)
 
-        self._glib.call(what, each)
+        return each
 
 
-# --- offline: not loaded while driving --------------------------------------------------------------------------------
+if not TYPE_CHECKING:
 
-
-def discover(path: Path, where: str) -> Form:
-    """Format of a clip, see `runner.gst.sequence.discover`."""
-    from runner.gst import sequence
-
-    return sequence.discover(path, where)
-
-
-def read_video(path: Path) -> Iterator[Unit]:
-    """Access units of a video file of a drive, see `runner.gst.video_reader.read_video`."""
-    from runner.gst import video_reader
-
-    return video_reader.read_video(path)
-
-
-def read_again(path: Path, interval_s: float, on_warning: Callable[[str], None]) -> Iterator[Unit]:
-    """The same encoded again with key frames, see `runner.gst.encoded_again.read_again`."""
-    from runner.gst import encoded_again
-
-    return encoded_again.read_again(path, interval_s, on_warning)
-
-
-def decode_video(path: Path, width: int, height: int) -> Iterator[tuple[int, LumaPlane]]:
-    """Pictures of a video file, see `runner.gst.pictures.decode_video`."""
-    from runner.gst import pictures
-
-    return pictures.decode_video(path, width, height)
-
-
-def parameter_set_notes(plan: Plan) -> list[str]:
-    """What viewers who join later lack, see `runner.gst.parameter_sets.parameter_set_notes`."""
-    if not may_lack_parameter_sets(plan):
-        return []
-    from runner.gst import parameter_sets
-
-    return parameter_sets.parameter_set_notes(plan)
-
-
-def write_clip(path: Path, frames: Iterable[bytes], width: int, height: int, fps: Fraction) -> None:
-    """Write frames generated in Python as a clip, see `runner.gst.clip_writer.write_clip`."""
-    from runner.gst import clip_writer
-
-    clip_writer.write_clip(path, frames, width, height, fps)
-
-
-def run_lanes(
-    lanes: LaneSet, on_frame: OnFrame, on_picture: OnDecoded, on_progress: Callable[[int], None]
-) -> list[Encoded]:
-    """Run a sequence through many encoders, see `runner.gst.lanes.run_lanes`."""
-    from runner.gst import lanes as gst_lanes
-
-    return gst_lanes.run_lanes(lanes, on_frame, on_picture, on_progress)
+    def __getattr__(name: str) -> Any:
+        """What is used offline only, and not loaded while driving."""
+        if name not in OFFLINE:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return getattr(import_module(f"runner.gst.{OFFLINE[name]}"), name)

@@ -17,7 +17,6 @@ LIMITS = {
 }
 # What is still larger, which may only shrink.
 LARGER = {
-    "runner/apply.py: lines of a module": 645,
     "runner/core/model.py: lines of a module": 502,
     "runner/gst/receiver.py Receiver: methods": 30,
     "runner/mqtt/link.py ControlLink: methods": 29,

@@ -143,7 +143,7 @@ class Receiver:
         )  # frames at the last change of the counter, and time of the last progress
         self._last_unexpected = time.monotonic()  # when the camera was last not expected to send
         self._was_expected = False  # whether it was expected to send at the last sample
-        self.should_send: bool | None = None  # None: unknown while the vehicle is offline
+        self._should_send: bool | None = None  # as of the last sample
 
     def start(self) -> None:
         self._supervised.start()
@@ -152,8 +152,12 @@ class Receiver:
         self._supervised.stop()
         self._close_filter()
 
-    def sample(self) -> Reception:
-        """Reception so far; requests the latency of the next frame."""
+    def sample(self, should_send: bool | None) -> Reception:
+        """Reception so far; requests the latency of the next frame.
+
+        should_send  whether the camera should; None: unknown while the vehicle is offline
+        """
+        self._should_send = should_send
         waits = [buffer.adapt() for buffer in self._buffers if self._is_repaired]
         self._report_transport()
         received = self._count()
@@ -174,7 +178,7 @@ class Receiver:
         expected = self._was_expected = self._is_expected()
         if not expected:
             self._last_unexpected = now
-        if received.frames != self._progress[0] or self.should_send is False:
+        if received.frames != self._progress[0] or self._should_send is False:
             self._progress = (received.frames, now)
         elif expected and not is_excused and self._has_stalled(now):
             self._progress = (received.frames, now)
@@ -200,9 +204,9 @@ class Receiver:
         Unknown while the vehicle is offline. But a caller may disappear together with its control link, and needs a
         waiting listener when it is back: a stream that was flowing is expected until its pipeline is rebuilt.
         """
-        if self.should_send is None and self._is_dialled:
+        if self._should_send is None and self._is_dialled:
             return self._was_expected and self._begun
-        return bool(self.should_send)
+        return bool(self._should_send)
 
     @property
     def newest(self) -> Arrival | None:
@@ -300,7 +304,7 @@ class Receiver:
 
     def _on_source_gone(self, client: Gst.Element, is_bye: bool) -> None:
         """The stream has ended, or is silent, which `sample` finds sooner where the vehicle's state is known."""
-        if is_bye or self.should_send is None:
+        if is_bye or self._should_send is None:
             later(0, partial(self._on_stream_ended, client))
 
     def _on_stream_ended(self, client: Gst.Element) -> None:

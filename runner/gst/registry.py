@@ -11,7 +11,7 @@ from gi.repository import GLib, GObject, Gst
 
 from runner.core.commands import KnobValue
 from runner.core.model import Element, ModelError, Value
-from runner.errors import suggest
+from runner.errors import RunError, suggest
 from runner.graph import Plan, assignments, launch, text
 
 PACKAGES = {  # elements by Debian package; `doctor` and messages on missing plugins name the package
@@ -41,6 +41,24 @@ def missing_plugins(plan: Plan, sides: Sequence[str] = ("vehicle", "operator")) 
 def missing_recorders(plan: Plan) -> list[str]:
     """The same for recording."""
     return _missing((*plan.source, *plan.recorder))
+
+
+def require_plugins(plans: Iterable[Plan], sides: Sequence[str]) -> None:
+    """Check that every plugin that streaming needs on these sides is installed.
+
+    raises  RunError with the packages to install, for all cameras at once
+    """
+    _require(sentence for plan in plans for sentence in missing_plugins(plan, sides))
+
+
+def check_recorders(plans: Iterable[Plan]) -> None:
+    """The same for recording."""
+    _require(sentence for plan in plans for sentence in missing_recorders(plan))
+
+
+def _require(missing: Iterable[str]) -> None:
+    if found := dict.fromkeys(missing):
+        raise RunError("\n".join(found))
 
 
 def _missing(elements: Iterable[Element]) -> list[str]:

@@ -1,14 +1,19 @@
-"""Makes clips loop without a gap, with correct capture times."""
+"""Whether a source opens; makes clips loop without a gap, with correct capture times."""
 
 from __future__ import annotations
 
 import ctypes
 import threading
+from fractions import Fraction
+from pathlib import Path
 
 from gi.repository import GLib, Gst
 
-from runner.graph import Plan
+from runner.core.model import Camera
+from runner.graph import Plan, launch
+from runner.gst.credentials import log_in
 from runner.gst.probes import BufferProbe, PassingBuffer
+from runner.inputs import input_problem
 
 CHECK_MS = 1000
 BEHIND_S = 0.3  # a clip that lags by more skips the lag instead of catching up
@@ -17,6 +22,34 @@ BEHIND_S = 0.3  # a clip that lags by more skips the lag instead of catching up
 _set_latency = ctypes.CDLL("libgstreamer-1.0.so.0").gst_query_set_latency
 _set_latency.argtypes = (ctypes.c_void_p, ctypes.c_int, ctypes.c_uint64, ctypes.c_uint64)  # query, live, min, max
 _set_latency.restype = None
+
+
+def source_problem(plan: Plan) -> str | None:
+    """Why a source does not open; None if it opens. GStreamer opens devices on the way to READY, and clips later."""
+    if absent := input_problem(plan.camera):
+        return str(absent)
+    if unfit := _device_problem(plan.camera):
+        return unfit
+    pipeline = Gst.parse_launch(f"{launch(plan.source)} ! fakesink")
+    try:
+        if problem := log_in(pipeline, plan):
+            return problem
+        if pipeline.set_state(Gst.State.READY) != Gst.StateChangeReturn.FAILURE:
+            return None
+        message = pipeline.get_bus().pop_filtered(Gst.MessageType.ERROR)
+        return str(message.parse_error()[0].message) if message else "its source does not start"
+    finally:
+        pipeline.set_state(Gst.State.NULL)
+
+
+def _device_problem(camera: Camera) -> str | None:
+    """Why a device cannot be the camera's; None if it can, or GStreamer says what is wrong."""
+    if camera.device is None or not (path := Path(camera.device)).is_char_device():
+        return None
+    from runner.system.v4l2 import device_problem
+
+    why = device_problem(path, camera.capture, Fraction(0))  # a slow camera is sent at its rate
+    return f"{path} {why}" if why else None
 
 
 def loop_clip(pipeline: Gst.Bin, plan: Plan) -> None:

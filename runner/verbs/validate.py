@@ -52,7 +52,7 @@ from runner.configuration.yaml_file import label, load_file, load_node
 from runner.configuration.yaml_file import read as read_yaml
 from runner.core.model import ModelError
 from runner.errors import COMMAND_LINE, ArgumentError, ConfigError, MissingBindings, Problem, RunError, suggest
-from runner.graph import Plan
+from runner.graph import Plan, may_lack_parameter_sets
 from runner.verbs import Arguments
 
 if TYPE_CHECKING:
@@ -451,7 +451,7 @@ def _registry_check(notes: dict[str, None]) -> PlanCheck | None:
         missing = (*missing_plugins(plan), *missing_recorders(plan))
         notes.update({f"not checked: {sentence}": None for sentence in missing})
         problems = check_plan(plan)
-        if not problems:
+        if not problems and may_lack_parameter_sets(plan):
             notes.update(dict.fromkeys(parameter_set_notes(plan)))
         return problems
 

@@ -290,7 +290,7 @@ def test_work_that_hangs_in_gstreamer_s_thread_is_reported(monkeypatch):
         try:
             GLib.idle_add(lambda: freed.wait(30) and False)
             with monkeypatch.context() as patch, pytest.raises(RunError) as raised:
-                patch.setattr("runner.apply.CALL_S", 0.2)
+                patch.setattr("runner.gst.glib_thread.CALL_S", 0.2)
                 until(lambda: side.sample({}))
             what = "reading the receivers' counters"
             assert str(raised.value) == f"GStreamer hangs: {what} takes more than 0.2 s"
