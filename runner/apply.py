@@ -26,9 +26,8 @@ from runner.gst.decoders import DecoderWatch
 from runner.gst.glib_thread import GlibThread
 from runner.gst.ip_camera import follow_cameras
 from runner.gst.lost import LostCameras
-from runner.gst.opening import OnReport
 from runner.gst.outage import ReportMerger
-from runner.gst.pipeline import CameraPipeline
+from runner.gst.pipeline import CameraPipeline, OnReport, Openings
 from runner.gst.probes import PassingBuffer
 from runner.gst.receiver import OnPicture, OnUnit, Receiver, Reception
 from runner.gst.recorder import Recorded, Recorder, Stage
@@ -176,18 +175,15 @@ class VehicleSide:
         self.on_turned: Callable[[], None] = lambda: None
         self._glib = GlibThread()
         self._server: CameraServer | None = None
-        self._callers = {
-            p.camera.name: CameraCaller(p, self._build, on_report, passphrase, self._refusal)
-            for p in plans
-            if not p.serves
-        }
+        self._lost = LostCameras(plans, lost, source_problem, self._on_found)
+        openings = Openings(self._build, self._lost, on_report, self._refusal)
+        self._callers = {p.camera.name: CameraCaller(p, openings, passphrase) for p in plans if not p.serves}
         self._looks = [self._guarded_look(plan.camera.name) for plan in plans]
         served = [plan for plan in plans if plan.serves]
-        self._lost = LostCameras(plans, lost, source_problem, self._on_found)
 
         def start() -> None:
             if served:
-                self._server = CameraServer(served, media, self._build, self._lost, on_report, keyring, self._refusal)
+                self._server = CameraServer(served, media, openings, keyring)
             for name, caller in self._callers.items():
                 if name not in lost:
                     caller.start()

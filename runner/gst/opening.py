@@ -17,15 +17,12 @@ from gi.repository import GObject, Gst, GstRtsp, GstRtspServer
 from runner.graph import Plan, rtsp_url
 from runner.gst.camera_media import CameraFactory, address_pool, on_element
 from runner.gst.clients import Clients
-from runner.gst.lost import LostCameras
-from runner.gst.pipeline import Build, CameraPipeline
+from runner.gst.pipeline import CameraPipeline, Openings
 from runner.gst.video_files import concerns_file
 from runner.settings import Media
 
 if TYPE_CHECKING:
     from runner.gst.patient_media import PatientMedia
-
-OnReport = Callable[[str, str], None]  # camera, what happened to it
 
 OPEN_S = 0.9  # a request for a camera that delivers nothing within this is answered 503; the camera continues to open
 OPENING_S = 0.02  # between two looks whether an IP camera has answered
@@ -82,23 +79,20 @@ class ServedCamera:
 class ServedCameras:
     """The cameras of the server by name, each with its pipeline, if built.
 
-    stopped    set when the server stops
-    others     as for `runner.gst.server.CameraServer`
+    permissions  of viewers; None: anyone may watch, and nothing is encrypted
+    stopped      set when the server stops
     """
 
     def __init__(
         self,
         plans: Sequence[Plan],
         media: Media,
-        build: Build,
-        lost: LostCameras,
-        on_report: OnReport,
+        openings: Openings,
         permissions: GstRtspServer.RTSPPermissions | None,
-        refusal: Callable[[str], str | None],
         clients: Clients,
         stopped: threading.Event,
     ) -> None:
-        self._build, self._lost, self._on_report, self._refusal = build, lost, on_report, refusal
+        self._build, self._lost, self._on_report, self._refusal = openings
         self._clients, self._changed, self._stopped = clients, clients.changed, stopped  # notified of a new stage, too
         self.threads = GstRtspServer.RTSPThreadPool()
         self.threads.set_max_threads(-1)  # one per client

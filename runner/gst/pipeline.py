@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from gi.repository import Gst, GstRtp, GstVideo
 
@@ -14,6 +14,7 @@ from runner.graph import Plan, is_restarted_after_gaps
 from runner.gst.arriving import CAPTURE_ID
 from runner.gst.held_up import HeldUp
 from runner.gst.knobs import KnobPanel
+from runner.gst.lost import LostCameras
 from runner.gst.picture_rate import PictureRate
 from runner.gst.probes import BufferProbe, PassingBuffer, TypeProbe
 from runner.gst.rate_limit import RateLimits
@@ -29,20 +30,34 @@ if TYPE_CHECKING:
     from runner.gst.pushed import PushedPictures
     from runner.ros.cameras import SharedPicture
 
-Build = Callable[[Gst.Bin, Plan], "CameraPipeline"]
+OnReport = Callable[[str, str], None]  # camera, what happened to it
 SRT_KEY_BYTES = 32  # AES-256
 GAP_S, GAP_INTERVALS = 0.4, 3  # without a picture, after which an encoder that would make up for it begins anew
 CAPTURE_TIME = "urn:ietf:params:rtp-hdrext:ntp-64"  # RTP header extension with the capture time (RFC 6051)
 # New caps must not make the source renegotiate: its output does not change. It would query caps between two frames,
-# while the next knobs are being turned, and see only some of them.
+# while the next knobs are being turned, and see only some of them. Nor does a viewer that joins change caps. The RTSP
+# server (1.22) makes all elements negotiate again all the same, but what it adds behind the payloader may not be linked
+# yet: then they fail, and the pipeline ends for all viewers.
 _NOT_RECONFIGURED = TypeProbe(Gst.PadProbeType.EVENT_UPSTREAM, {Gst.EventType.RECONFIGURE: Gst.PadProbeReturn.DROP})
 # A camera is reported as not seekable, by answering the query unchanged. The RTSP server relies on the source's answer:
 # it would seek a clip or a test picture for every PLAY with a Range, Scale or Speed, flush the stream of all viewers,
 # and wait for a frame that a closed gate never passes.
 _NOT_SEEKABLE = TypeProbe(Gst.PadProbeType.QUERY_UPSTREAM, {Gst.QueryType.SEEKING: Gst.PadProbeReturn.HANDLED})
-# A viewer that joins changes no caps. The RTSP server (1.22) makes all elements negotiate again all the same, but what
-# it adds behind the payloader may not be linked yet: then they fail, and the pipeline ends for all viewers.
-_KEEPS_CAPS = TypeProbe(Gst.PadProbeType.EVENT_UPSTREAM, {Gst.EventType.RECONFIGURE: Gst.PadProbeReturn.DROP})
+
+
+class Openings(NamedTuple):
+    """How cameras are opened.
+
+    build      makes a `CameraPipeline` from each new pipeline
+    lost       those that do not open: each is opened again when that is due
+    on_report  called when pipelines start, stop or fail, and when viewers are disconnected
+    refusal    returns why a camera must not be opened now; None: it may
+    """
+
+    build: Callable[[Gst.Bin, Plan], CameraPipeline]
+    lost: LostCameras
+    on_report: OnReport
+    refusal: Callable[[str], str | None]
 
 
 class CameraPipeline:
@@ -101,7 +116,7 @@ class CameraPipeline:
         self.requests = RequestLimit(last, on_report)
         self._first_packet = BufferProbe(last, self._on_first_packet, in_lists=True)
         self._first_packet.arm()
-        for each in (_NOT_SEEKABLE, _KEEPS_CAPS):
+        for each in (_NOT_SEEKABLE, _NOT_RECONFIGURED):
             each.add_to(last)
 
     @property

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -22,10 +22,9 @@ from runner.gst.camera_media import describe_for, wants_feedback
 from runner.gst.clients import Clients, drop_silent
 from runner.gst.connections import RtspConnection
 from runner.gst.left import LeftCameras
-from runner.gst.lost import LostCameras
 from runner.gst.memory import give_back
-from runner.gst.opening import OnReport, ServedCameras
-from runner.gst.pipeline import Build
+from runner.gst.opening import ServedCameras
+from runner.gst.pipeline import Openings
 from runner.gst.rtsp_requests import camera_name, has_password, has_query, path
 from runner.gst.sessions import SessionPool, is_held, on_session_removed
 from runner.gst.timers import every
@@ -59,24 +58,12 @@ NO_CERTIFICATE, NO_PASSWORD, WRONG_PASSWORD = (
 class CameraServer:
     """RTSP server with one mount point per camera, and a second one with feedback, which our own receivers use.
 
-    build      makes a `CameraPipeline` from each new pipeline
-    lost       cameras that do not open: each is opened again when that is due
-    on_report  called when pipelines start and stop, and when viewers are disconnected
-    keyring    of this vehicle; None: anyone may watch, and nothing is encrypted
-    refusal    returns why a camera must not be opened now; None: it may
+    keyring  of this vehicle; None: anyone may watch, and nothing is encrypted
     """
 
-    def __init__(
-        self,
-        plans: Sequence[Plan],
-        media: Media,
-        build: Build,
-        lost: LostCameras,
-        on_report: OnReport,
-        keyring: Keyring | None = None,
-        refusal: Callable[[str], str | None] = lambda _: None,
-    ) -> None:
+    def __init__(self, plans: Sequence[Plan], media: Media, openings: Openings, keyring: Keyring | None) -> None:
         check_port_free(media)
+        on_report = openings.on_report
         self._keys: ViewerCheck | None = None
         self._keys_fault = ""  # the last one reported
         if keyring:
@@ -89,9 +76,7 @@ class CameraServer:
         self._clients = Clients(on_report)
         self._changed = self._clients.changed
         permissions = self._keys and self._keys.permissions
-        self._cameras = ServedCameras(
-            plans, media, build, lost, on_report, permissions, refusal, self._clients, self._stopped
-        )
+        self._cameras = ServedCameras(plans, media, openings, permissions, self._clients, self._stopped)
         self.pipelines = self._cameras.pipelines
         self.admission = Admission(self._cameras, self._clients, self._keys, media.max_viewers)
         self._left = LeftCameras(self._clients, self.pipelines)

@@ -13,7 +13,7 @@ from gi.repository import GLib, Gst
 from runner.graph import Plan
 from runner.gst.aside import HUNG, set_state_in_thread
 from runner.gst.outage import Outage
-from runner.gst.pipeline import Build, CameraPipeline, encrypt
+from runner.gst.pipeline import CameraPipeline, Openings, encrypt
 from runner.gst.probes import BufferProbe, PassingBuffer
 from runner.gst.rtspsrc import STREAM_ENDED
 from runner.gst.timers import Delayed, every, later
@@ -159,27 +159,18 @@ class _AcknowledgementWatch:
 class CameraCaller:
     """One camera's supervised pipeline on the vehicle.
 
-    build       makes a `CameraPipeline` from each new pipeline
     passphrase  returns what encrypts the stream, and may change; None: it is not encrypted
-    refusal     returns why the camera must not be asked now; None: it may
     """
 
-    def __init__(
-        self,
-        plan: Plan,
-        build: Build,
-        on_report: Callable[[str, str], None],
-        passphrase: Callable[[], str] | None = None,
-        refusal: Callable[[str], str | None] = lambda _: None,
-    ) -> None:
-        self._plan, self._build, self._passphrase = plan, build, passphrase
+    def __init__(self, plan: Plan, openings: Openings, passphrase: Callable[[], str] | None) -> None:
+        self._plan, self._build, self._passphrase = plan, openings.build, passphrase
         self._used = ""  # the passphrase of the current pipeline
         name = plan.camera.name
         self.pipeline: CameraPipeline | None = None
         self._watch: int | None = None  # None: it has not been started
-        self._on_fault = lambda what: on_report(name, what)
+        self._on_fault = lambda what: openings.on_report(name, what)
         self._supervised = SupervisedPipeline(plan.pipeline, self._on_built, self._on_fault)
-        self._supervised.must_wait = lambda: refusal(name) is not None
+        self._supervised.must_wait = lambda: openings.refusal(name) is not None
 
     def start(self) -> None:
         """Start it; a second call has no effect."""
