@@ -405,19 +405,19 @@ class OperatorSide:
 
     def _request_tails(self) -> None:
         for receiver in self._receivers.values():
-            receiver.request_tails()
+            receiver.rtp.request_tails()
 
     def take_arrivals(self) -> Arrivals:
         """Arrivals since the last call; to be called from one thread."""
         receivers = self._receivers
-        counted = [receiver.take_counts() for receiver in receivers.values()]
+        counted = [receiver.rtp.take_counts() for receiver in receivers.values()]
         return Arrivals(
-            frames={name: receiver.take_arrivals() for name, receiver in receivers.items()},
+            frames={name: receiver.rtp.take_arrivals() for name, receiver in receivers.items()},
             newest={name: receiver.newest for name, receiver in receivers.items() if receiver.newest},
             packets=sum(received for received, _ in counted),
             lost=sum(lost for _, lost in counted),
             damaged=[name for name, receiver in receivers.items() if receiver.is_damaged],
-            arrived=list(chain.from_iterable(receiver.take_packets() for receiver in receivers.values())),
+            arrived=list(chain.from_iterable(receiver.rtp.take_packets() for receiver in receivers.values())),
         )
 
     def stop(self) -> None:

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import chain
 from typing import TYPE_CHECKING
 
-from gi.repository import Gst, GstRtsp, GstSdp
+from gi.repository import Gst
 
 from runner.graph import Plan, video_codec
 from runner.gst.arriving import NTP_EPOCH_S
 from runner.gst.caps import structure
-from runner.gst.packet_times import state_arrivals
 from runner.gst.probes import BufferProbe, PassingBuffer
-from runner.gst.repair import RepairBuffer
+from runner.gst.repair import RtpSession
 from runner.gst.rtspsrc import STREAM_ENDED, Opening, handle_stream_end, is_rtsp_client, limit_teardown
 from runner.gst.sender_filter import SenderFilter
 from runner.gst.supervised import SupervisedPipeline
@@ -26,7 +24,7 @@ from runner.gst.video_files import VideoFile, VideoFiles
 from runner.gst.viewers import user_agent
 from runner.h264.access_unit import AccessUnit, read_unit
 from runner.h264.damage import HEAD_BYTES, Damage
-from runner.records.reception import Arrival, ArrivedPacket
+from runner.records.reception import Arrival
 from runner.system.held_up import LateCheck
 from runner.system.recent import RecentValue
 
@@ -35,7 +33,6 @@ if TYPE_CHECKING:
 
 STALL_S = 2.0  # a camera that should send but neither sends nor answers for longer is rebuilt
 DIALLED_STALL_S = 1.0  # likewise where the vehicle dials: it calls again, but a listener keeps its first caller
-OVER_TCP = "over TCP, since UDP was refused: are the vehicle's media.rtp_ports in use?"
 GRACE_S = 0.75  # time for the first frame once a camera is expected to send
 
 
@@ -89,6 +86,8 @@ PICTURES = (
 class Receiver:
     """Receives one camera. `sample` is to be called a few times a second; it also detects a silent stream.
 
+    `rtp` is how its packets arrive.
+
     on_unit     called with each access unit, from the streaming thread
     on_picture  called with each decoded picture, from the streaming thread
     arrivals    record when each access unit arrived
@@ -113,17 +112,10 @@ class Receiver:
         self._arrivals: deque[tuple[float, float | None]] | None = deque() if arrivals else None
         self._sampled = 0  # arrivals that have been read
         self._late = LateCheck()
-        self._packets = (0, 0)  # received and missing, as last read
-        self._newest: Arrival | None = None
-        settings = plan.camera.graph.settings
-        self._reorder_ms = settings.jitter_buffer_ms
-        self._repairs = bool(settings.retransmission_ms)
-        self._buffers: list[RepairBuffer] = []
-        self._over_udp = self._feedback = False  # transport and profile of the session
-        self._kernel_times = False  # whether packets state when the kernel received them
-        self._may_use_udp = False  # until it is known which the session uses
+        self.newest: Arrival | None = None  # access unit, complete or not, that has left the jitter buffer
         self._on_unit, self._on_picture = on_unit, on_picture
         self._name = name = plan.camera.name
+        self.rtp = RtpSession(plan.camera.graph.settings, lambda what: on_report(name, what))
         self._codec = video_codec(plan.camera.graph)
         self._damage, self._damaged = Damage(self._codec), 0
         self._frames = self._bytes = 0
@@ -137,10 +129,7 @@ class Receiver:
         self._foreign_reported = False
         self._filter: SenderFilter | None = None
         self._built = False
-        self._progress = (
-            0,
-            time.monotonic(),
-        )  # frames at the last change of the counter, and time of the last progress
+        self._progress = (0, time.monotonic())  # frames at their last change, and when there was progress
         self._last_unexpected = time.monotonic()  # when the camera was last not expected to send
         self._was_expected = False  # whether it was expected to send at the last sample
         self._should_send: bool | None = None  # as of the last sample
@@ -158,15 +147,12 @@ class Receiver:
         should_send  whether the camera should; None: unknown while the vehicle is offline
         """
         self._should_send = should_send
-        waits = [buffer.adapt() for buffer in self._buffers if self._is_repaired]
-        self._report_transport()
+        buffer_ms = self.rtp.adapt()
+        if self._begun:
+            self.rtp.report_transport()
         received = self._count()
-        waited = [ms for buffer in self._buffers if (ms := buffer.waited_ms()) is not None]
         received = replace(
-            received,
-            buffer_ms=max(waits, default=None),
-            waited_ms=max(waited, default=None),
-            arrivals=self._arrived(received.frames),
+            received, buffer_ms=buffer_ms, waited_ms=self.rtp.waited_ms(), arrivals=self._arrived(received.frames)
         )
         if received.foreign and not self._foreign_reported:
             self._foreign_reported = True
@@ -188,13 +174,6 @@ class Receiver:
         self._next_picture.arm()
         return received
 
-    def _report_transport(self) -> None:
-        """Say it if UDP was wanted: over TCP a late packet holds back all that follow."""
-        if self._begun and self._may_use_udp:
-            self._may_use_udp = False
-            if not self._over_udp:
-                self._on_report(self._name, OVER_TCP)
-
     def _has_stalled(self, now: float) -> bool:
         return now - self._progress[1] > self._stall_s and now - self._last_unexpected > GRACE_S
 
@@ -209,46 +188,9 @@ class Receiver:
         return bool(self._should_send)
 
     @property
-    def newest(self) -> Arrival | None:
-        """The newest access unit, complete or not, once it has left the jitter buffer."""
-        return self._newest
-
-    def take_arrivals(self) -> list[Arrival]:
-        """Frames that arrived since the last call, without waiting for missing packets. From any one thread."""
-        now = time.monotonic()
-        return [arrival for buffer in self._buffers for arrival in buffer.frames.take(now)]
-
-    def take_packets(self) -> Iterator[ArrivedPacket]:
-        """Packets that arrived since the last call. From any one thread."""
-        return chain.from_iterable(buffer.frames.take_packets() for buffer in self._buffers)
-
-    @property
     def is_damaged(self) -> bool:
         """Whether the newest picture shows unrecovered packet loss."""
         return self._begun and self._damage.is_damaged
-
-    def take_counts(self) -> tuple[int, int]:
-        """RTP packets received, and initially missing, since the last call. From any one thread."""
-        frames = [buffer.frames for buffer in self._buffers]
-        received, missing = sum(each.received for each in frames), sum(each.missing for each in frames)
-        before = self._packets if received >= self._packets[0] else (0, 0)  # a new pipeline counts from 0
-        self._packets = received, max(missing, before[1])  # it drops if packets were only reordered
-        return received - before[0], self._packets[1] - before[1]
-
-    def request_tails(self) -> None:
-        """Request missing packets at the end of a frame (tail loss); to be called a hundred times a second."""
-        if self._is_repaired:
-            for buffer in self._buffers:
-                buffer.request_tail()
-
-    @property
-    def _is_repaired(self) -> bool:
-        return self._repairs and self._over_udp and self._feedback
-
-    def _on_description(self, _client: Gst.Element, sdp: GstSdp.SDPMessage) -> None:
-        """Note whether the vehicle grants the profile with feedback."""
-        media = range(sdp.medias_len())
-        self._feedback = any(sdp.get_media(number).get_proto().endswith("AVPF") for number in media)
 
     def _on_built(self, pipeline: Gst.Pipeline) -> Gst.Pad:
         self._before = self._count() if self._built else Reception()
@@ -261,17 +203,15 @@ class Receiver:
         self._sink = pipeline.get_by_name(self._sink_name)
         self._next_picture = BufferProbe(self._sink.get_static_pad("sink"), self._on_frame)
         self._begun = False
-        self._buffers, self._over_udp, self._feedback, self._kernel_times = [], False, False, False
+        self.rtp.begin()
         self._client = pipeline.get_by_name(self._client_name)
         for element in pipeline.iterate_recurse():
             self._on_element(pipeline, pipeline, element)
         pipeline.connect("deep-element-added", self._on_element)
         if self._login and (problem := self._login.prepare(pipeline, self._client)):
             self._on_report(self._name, problem)
-        self._may_use_udp = False
         if is_rtsp_client(self._client):
-            self._may_use_udp = bool(self._client.get_property("protocols") & GstRtsp.RTSPLowerTrans.UDP)
-            self._client.connect("on-sdp", self._on_description)
+            self.rtp.follow(self._client)
             handle_stream_end(self._client, self._on_source_gone)
             limit_teardown(pipeline)
             opening = Opening()
@@ -293,12 +233,7 @@ class Receiver:
         self._progress = (self._progress[0], time.monotonic())
 
     def _on_element(self, _pipeline: Gst.Pipeline, _parent: Gst.Bin, element: Gst.Element) -> None:
-        factory = element.get_factory().get_name() if element.get_factory() else ""
-        if factory == "rtpjitterbuffer":
-            self._buffers.append(RepairBuffer(element, self._reorder_ms, kernel_times=self._kernel_times))
-        if factory == "udpsrc":
-            self._over_udp = True
-            self._time_packets(element)
+        self.rtp.add(element)
         if element.find_property("used-socket") and element.get_static_pad("src"):
             self._filter_senders(element)
 
@@ -310,12 +245,6 @@ class Receiver:
     def _on_stream_ended(self, client: Gst.Element) -> None:
         if client is self._client:
             self._supervised.restart(STREAM_ENDED)
-
-    def _time_packets(self, source: Gst.Element) -> None:
-        try:
-            self._kernel_times = state_arrivals(source)
-        except OSError as error:
-            self._on_report(self._name, f"the kernel does not state when packets arrive: {error}")
 
     def _filter_senders(self, source: Gst.Element) -> None:
         """Make a socket of the client accept packets from the vehicle only. From the client's thread."""
@@ -345,7 +274,7 @@ class Receiver:
             damaged=self._damaged,
             decoded=before.decoded + self._sink.get_property("stats").get_value("rendered"),
             foreign=before.foreign + (self._filter.dropped() if self._filter else 0),
-            lost=before.lost + sum(buffer.lost for buffer in self._buffers),
+            lost=before.lost + self.rtp.lost,
             width=picture.get_int("width")[1] if picture else 0,
             height=picture.get_int("height")[1] if picture else 0,
             latency_ms=latency_ms,
@@ -367,7 +296,7 @@ class Receiver:
         arrived, monotonic, size, captured = time.time(), time.monotonic(), buffer.size, _captured(pad, buffer)
         self._entered = (buffer.pts, monotonic)
         if captured is not None:
-            self._newest = Arrival(monotonic, captured, size)
+            self.newest = Arrival(monotonic, captured, size)
         if self._arrivals is not None:
             self._arrivals.append((arrived, captured))
         self._bytes += size

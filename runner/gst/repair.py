@@ -1,14 +1,19 @@
-"""Retransmission of lost packets on the operator's side: requested early, awaited as long as round trips take."""
+"""How packets arrive at the operator's side. Lost ones are requested early, and awaited as long as round trips take."""
 
 from __future__ import annotations
 
 import time
 from collections import deque
+from collections.abc import Callable, Iterator
+from itertools import chain
 
-from gi.repository import GObject, Gst
+from gi.repository import GObject, Gst, GstRtsp, GstSdp
 
+from runner.core.model import GraphSettings
 from runner.gst.arriving import HEADER_BYTES, ArrivingFrames, Lateness, Packet, read_packet
+from runner.gst.packet_times import state_arrivals
 from runner.gst.probes import BufferProbe, PassingBuffer
+from runner.records.reception import Arrival, ArrivedPacket
 from runner.system.recent import RecentValue
 
 REORDER_MS = 5  # a packet that is missing for longer was lost, not reordered
@@ -24,6 +29,7 @@ RETRANSMITTED = Gst.BufferFlags.LAST  # GST_RTP_BUFFER_FLAG_RETRANSMISSION, whic
 # by more than the second, has another clock's time.
 UNREAD_S, FUTURE_S = 2.0, 0.1
 FRAMES = 64  # whose end is remembered
+OVER_TCP = "over TCP, since UDP was refused: are the vehicle's media.rtp_ports in use?"
 
 
 class RepairBuffer:
@@ -149,3 +155,89 @@ class RepairBuffer:
             self._ends.append((packet.stamp, now))
         self._tail_requested = False
         return False
+
+
+class RtpSession:
+    """The session of a receiver, with the jitter buffers of its current pipeline.
+
+    Where the vehicle grants feedback over UDP, they repair: otherwise they reorder at most.
+    """
+
+    def __init__(self, graph: GraphSettings, on_report: Callable[[str], None]) -> None:
+        self._graph, self._on_report = graph, on_report
+        self._counted = (0, 0)  # packets received and missing, as last read
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin anew, with another pipeline."""
+        self._buffers: list[RepairBuffer] = []
+        self._over_udp = self._feedback = False  # transport and profile
+        self._kernel_times = False  # whether packets state when the kernel received them
+        self._may_use_udp = False  # until it is known whether it does
+
+    def follow(self, client: Gst.Element) -> None:
+        """Note what an RTSP client and the vehicle agree on."""
+        self._may_use_udp = bool(client.get_property("protocols") & GstRtsp.RTSPLowerTrans.UDP)
+        client.connect("on-sdp", self._on_description)
+
+    def add(self, element: Gst.Element) -> None:
+        """Use an element of the pipeline, if it is of the session. From any thread."""
+        factory = element.get_factory().get_name() if element.get_factory() else ""
+        if factory == "rtpjitterbuffer":
+            reorder_ms = self._graph.jitter_buffer_ms
+            self._buffers.append(RepairBuffer(element, reorder_ms, kernel_times=self._kernel_times))
+        if factory == "udpsrc":
+            self._over_udp = True
+            try:
+                self._kernel_times = state_arrivals(element)
+            except OSError as error:
+                self._on_report(f"the kernel does not state when packets arrive: {error}")
+
+    @property
+    def lost(self) -> int:
+        """Packets of this pipeline that were never recovered."""
+        return sum(buffer.lost for buffer in self._buffers)
+
+    def adapt(self) -> int | None:
+        """Adapt the wait for missing packets; returns it, ms, or None without repair. A few times a second."""
+        return max((buffer.adapt() for buffer in self._repairing()), default=None)
+
+    def waited_ms(self) -> float | None:
+        """How long the end of a recent frame waited; None: unknown. A few times a second."""
+        return max((ms for buffer in self._buffers if (ms := buffer.waited_ms()) is not None), default=None)
+
+    def request_tails(self) -> None:
+        """Request missing packets at the end of a frame (tail loss); to be called a hundred times a second."""
+        for buffer in self._repairing():
+            buffer.request_tail()
+
+    def report_transport(self) -> None:
+        """Once packets arrive: say it if UDP was wanted. Over TCP a late packet holds back all that follow."""
+        if self._may_use_udp and not self._over_udp:
+            self._on_report(OVER_TCP)
+        self._may_use_udp = False
+
+    def take_arrivals(self) -> list[Arrival]:
+        """Frames that arrived since the last call, without waiting for missing packets. From any one thread."""
+        now = time.monotonic()
+        return [arrival for buffer in self._buffers for arrival in buffer.frames.take(now)]
+
+    def take_packets(self) -> Iterator[ArrivedPacket]:
+        """Packets that arrived since the last call. From any one thread."""
+        return chain.from_iterable(buffer.frames.take_packets() for buffer in self._buffers)
+
+    def take_counts(self) -> tuple[int, int]:
+        """Packets received, and initially missing, since the last call. From any one thread."""
+        frames = [buffer.frames for buffer in self._buffers]
+        received, missing = sum(each.received for each in frames), sum(each.missing for each in frames)
+        before = self._counted if received >= self._counted[0] else (0, 0)  # a new pipeline counts from 0
+        self._counted = received, max(missing, before[1])  # it drops if packets were only reordered
+        return received - before[0], self._counted[1] - before[1]
+
+    def _repairing(self) -> list[RepairBuffer]:
+        return self._buffers if self._graph.retransmission_ms and self._over_udp and self._feedback else []
+
+    def _on_description(self, _client: Gst.Element, sdp: GstSdp.SDPMessage) -> None:
+        """Note whether the vehicle grants the profile with feedback."""
+        media = range(sdp.medias_len())
+        self._feedback = any(sdp.get_media(number).get_proto().endswith("AVPF") for number in media)

@@ -12,7 +12,7 @@ import pytest
 from rig import free_port, needs_root, over_tcp, streaming, until
 from rtsp_client import RtspClient
 from runner.core.commands import Command
-from runner.gst.receiver import OVER_TCP
+from runner.gst.repair import OVER_TCP
 
 pytestmark = pytest.mark.gst
 CAMERA = "rear"
