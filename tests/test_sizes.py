@@ -18,7 +18,6 @@ LIMITS = {
 # What is still larger, which may only shrink.
 LARGER = {
     "runner/core/model.py: lines of a module": 502,
-    "runner/mqtt/link.py ControlLink: methods": 29,
 }
 METHOD = re.compile(r"^  (?:static )?(?:async )?(?:get |set )?#?\w+\(.*\) \{", re.MULTILINE)
 CLASS = re.compile(r"^(?:export )?class (\w+)(.*?)^}", re.MULTILINE | re.DOTALL)

@@ -18,12 +18,14 @@ FILES = {"own": CERTIFICATE, "the authority's": AUTHORITY}
 class Login:
     """User name, password and TLS settings of a holder of keys. Each connection uses the files as they are then.
 
-    on_report  called with the problem of new files: the previous ones then stay in force
+    on_report  called with the problem of new files: the previous ones then stay in force; and with certificates that
+               expire soon
     raises     UserError if files cannot be used at first
     """
 
     def __init__(self, keyring: Keyring, on_report: Callable[[str], None]) -> None:
-        self._keyring = keyring
+        self._keyring, self._on_report = keyring, on_report
+        self._expiring: set[str] = set()  # what was reported of certificates
         self._revoked = keyring.watched_revoked(on_report)
         self._own, self._secret = keyring.watched_certificate(on_report), keyring.watched_secret(on_report)
         self._broker, self._used = 0, b""  # in use: serial number of the broker's certificate, own certificate
@@ -62,6 +64,16 @@ class Login:
         self._broker_ends = ssl.cert_time_to_seconds(certificate["notAfter"])
         if self._broker in self._revoked.get():
             raise RunError("the certificate of the broker is revoked")
+        self.report_expiring()
+
+    def report_expiring(self) -> None:
+        """Report, once each, which certificates expire soon."""
+        from runner.security.validity import expiring
+
+        for line in expiring(self.ends(), time.time()):
+            if line not in self._expiring:
+                self._expiring.add(line)
+                self._on_report(f"{line}: `tod-runner keys output=DIR rotate=NAME` renews it")
 
     def has_changed(self) -> bool:
         """Whether to reconnect: the broker's certificate is revoked, or there are new keys."""

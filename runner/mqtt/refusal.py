@@ -5,6 +5,8 @@ from __future__ import annotations
 import ssl
 
 from runner.schema import shortened
+from runner.security.exposure import is_loopback
+from runner.settings import Endpoint
 
 SILENT = "accepts connections but does not answer"
 NO_TLS = "does not speak TLS: a broker without keys, or another program"
@@ -68,6 +70,15 @@ def of_end(heard: bytes, error: OSError | None, silent: bool, tls: bool) -> str:
         return SILENT
     hint = "the broker refuses this side's keys" if tls else "no MQTT broker, or one that expects TLS and keys"
     return f"the connection was closed without an answer: {hint}"
+
+
+def remedy(error: BaseException | None, broker: Endpoint) -> str:
+    """What to do about it, in parentheses; "" if the reason says it."""
+    if not isinstance(error, ConnectionRefusedError):
+        return ""
+    if is_loopback(broker.host):
+        return f" (start one on this machine: mosquitto -p {broker.port})"
+    return " (does one run there, reachable from other machines? See docs/deployment.md)"
 
 
 def _of_alert(error: ssl.SSLError) -> str | None:
