@@ -16,9 +16,7 @@ LIMITS = {
     "longest line in JS": 140,
 }
 # What is still larger, which may only shrink.
-LARGER = {
-    "runner/core/model.py: lines of a module": 502,
-}
+LARGER: dict[str, int] = {}
 METHOD = re.compile(r"^  (?:static )?(?:async )?(?:get |set )?#?\w+\(.*\) \{", re.MULTILINE)
 CLASS = re.compile(r"^(?:export )?class (\w+)(.*?)^}", re.MULTILINE | re.DOTALL)
 

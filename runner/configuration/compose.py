@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Any, cast
 
 from runner import schema
 from runner.configuration.files import GROUPS, bases_of, chosen_by, conf_directories, defaults, find_file, options
-from runner.configuration.interpolation import value_at
+from runner.configuration.interpolation import expands_within, spliced, value_at
 from runner.configuration.origin import PICKED, Composed, Part, nested
 from runner.configuration.overrides import Override, choice_problems, parse_overrides, rule_problems
-from runner.configuration.resolve import resolved
 from runner.configuration.yaml_file import label, load_file, read
 from runner.core.model import Mode
 from runner.errors import COMMAND_LINE, ConfigError, Problem, suggest
@@ -30,6 +29,7 @@ RESTATED = (
     "write out all modes in one file, without the other in defaults; a single number: modes.MODE.RULE.NUMBER=VALUE"
 )
 WHOLE = ("vehicle", "experiment")  # groups whose files apply to the whole document
+MAX_RESOLVED = 50_000  # values of a configuration with its interpolations expanded
 PACKAGE_HEADER = "# @package _global_"  # a vehicle's file applies to the whole document
 
 
@@ -56,7 +56,7 @@ def compose(overrides: Sequence[str], user: Path | None = None) -> Composed:
     parts += reversed(files)
     with open_dict(config):
         del config["hydra"]
-    return resolved(config, parts)
+    return _resolved(config, parts)
 
 
 def _check_headers(choices: Mapping[str, str], directories: Sequence[Path]) -> None:
@@ -280,3 +280,26 @@ def _with_bases(path: Path, group: str, package: schema.Path, directories: Seque
     for base in bases_of(path):
         yield from _with_bases(find_file(directories, group, base), group, package, directories)
     yield Part(label(path), package, load_file(path), path)
+
+
+def _resolved(config: DictConfig, parts: Sequence[Part]) -> Composed:
+    """The composed tree as plain data, interpolations resolved.
+
+    raises  ConfigError
+    """
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    written = OmegaConf.to_container(config)
+    if not expands_within(written, MAX_RESOLVED):
+        file = next(part.file for part in parts if "${" in str(part.content))
+        rule = f"interpolations, ${{...}}, are nested too deeply or expand to more than {MAX_RESOLVED} values"
+        raise ConfigError([Problem(file, "", None, rule)])
+    try:
+        document = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    except OmegaConfBaseException as error:
+        origin = Composed({}, list(parts))
+        path = tuple(int(p) if p.isdigit() else p for p in re.split(r"[.\[\]]+", str(error.full_key or "")) if p)
+        raise ConfigError([origin.problem(path, None, str(error).splitlines()[0])]) from None
+    document, moved = spliced(written, document)
+    return Composed(cast("dict[str, Any]", document), list(parts), moved).without_graph_parts()

@@ -8,7 +8,8 @@ from fractions import Fraction
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from runner.core.model import Count, Kbps, Mode, NonNegative, Roi, Share
+from runner.core.limits import Count, NonNegative, Share
+from runner.core.model import Kbps, Mode, Roi
 
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 

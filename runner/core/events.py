@@ -13,7 +13,8 @@ from enum import StrEnum
 from fractions import Fraction
 from typing import Annotated, Any, NamedTuple, get_args
 
-from runner.core.model import Count, Kbps, Limits, Mode, NonNegative, Roi, Share, exact, plain
+from runner.core.limits import Count, Limits, NonNegative, Share
+from runner.core.model import Kbps, Mode, Roi, exact, plain
 
 LEAST_ERROR = 0.01  # of a prediction's deviation
 Rate = Annotated[Kbps, Limits(0)]

@@ -14,8 +14,9 @@ from fractions import Fraction
 from functools import lru_cache
 from itertools import islice, pairwise
 from math import inf, nextafter
-from typing import Annotated, Any, Protocol
+from typing import Any, Protocol
 
+from runner.core.limits import Count
 from runner.errors import suggest
 
 Kbps = Fraction
@@ -25,28 +26,6 @@ PLACEHOLDER = re.compile(r"\{(\w+)\}")  # in the properties of elements: "{clip}
 DEPTH_M = 20.0  # distance that is shown white, unless a source states another
 SMALLEST_SIDE_PX = 16  # one H.264 macroblock; encoders refuse less
 MOST_BUFFER_MS = 10_000  # of the encoder's rate control, as x264enc allows
-
-
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """Part of a type, for the schemas: limits of a number, or of the length of a text, list or mapping; None: no limit.
-
-    least, most  inclusive
-    above        exclusive
-    among        the only texts
-    unique       whether no entry of a list may occur twice
-    """
-
-    least: float | None = None
-    most: float | None = None
-    above: float | None = None
-    among: tuple[str, ...] = ()
-    unique: bool = False
-
-
-NonNegative = Annotated[float, Limits(0)]
-Count = Annotated[int, Limits(0)]
-Share = Annotated[float, Limits(0, 1)]
 
 
 class ModelError(ValueError):

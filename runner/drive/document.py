@@ -10,7 +10,7 @@ from typing import Annotated, Literal, TypedDict
 
 import numpy as np
 
-from runner.core.model import Count, Limits, NonNegative, Share
+from runner.core.limits import Count, Limits, NonNegative, Share
 from runner.drive.checks import ClaimCheck
 from runner.drive.latency import Latency
 from runner.drive.predictions import Worth

@@ -11,7 +11,8 @@ from pathlib import Path
 from statistics import fmean
 from typing import Annotated, Any, Literal, NotRequired, TypedDict, cast
 
-from runner.core.model import Camera, Limits, NonNegative, plain
+from runner.core.limits import Limits, NonNegative
+from runner.core.model import Camera, plain
 from runner.errors import UserError, reason
 from runner.rate_quality.cache import digest
 from runner.rate_quality.choice import Choice

@@ -14,7 +14,7 @@ from typing import Annotated, Any, TypeVar
 
 import msgspec
 
-from runner.core.model import Limits
+from runner.core.limits import Limits
 
 Number = int | float
 Amount = Annotated[Number, Limits(0)]

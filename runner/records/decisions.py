@@ -10,7 +10,8 @@ from msgspec import UNSET, UnsetType
 
 from runner.core.commands import Command, KnobValues
 from runner.core.decision import Believed, Decision, Setting
-from runner.core.model import Count, Limits, Mode, Roi, plain
+from runner.core.limits import Count, Limits
+from runner.core.model import Mode, Roi, plain
 from runner.records import Amount, CameraName, Json, Number, Time, to_json
 
 Applied = Annotated[Mapping[str, Any], "by knob, the value read back; empty for a camera without a pipeline"]

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import UNSET, UnsetType
 
-from runner.core.model import Count, Limits, NonNegative
+from runner.core.limits import Count, Limits, NonNegative
 from runner.records import CameraName, Json, Time, from_json, to_json
 from runner.records.decisions import DecisionMade
 from runner.records.operator import Sample

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
-from runner.core.model import Count, NonNegative, Share
+from runner.core.limits import Count, NonNegative, Share
 from runner.records import Amount, Number, Time
 from runner.records.vehicle import EncoderCounts, Position
 

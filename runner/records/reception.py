@@ -8,7 +8,7 @@ from typing import Annotated, NamedTuple
 
 from msgspec import UNSET, UnsetType
 
-from runner.core.model import Limits, NonNegative
+from runner.core.limits import Limits, NonNegative
 from runner.records import Clock, Time
 
 Size = Annotated[int, Limits(0, 10**8)]  # bytes or packets of a report

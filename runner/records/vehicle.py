@@ -11,7 +11,8 @@ from msgspec import UNSET, UnsetType
 from runner.core.commands import KnobValues
 from runner.core.decision import NOTHING, Believed, Setting
 from runner.core.events import Attention, Latitude, Longitude, PositionReported, Steering
-from runner.core.model import Count, Limits, Mode, NonNegative, Share
+from runner.core.limits import Count, Limits, NonNegative, Share
+from runner.core.model import Mode
 from runner.records import Amount, Clock, Json, Number, Time, to_json
 from runner.records.decisions import Applied, CameraDecision, applied_to_json, decided
 
