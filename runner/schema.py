@@ -12,7 +12,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
-from itertools import groupby, islice
+from itertools import chain, groupby, islice
 from typing import TYPE_CHECKING, Any
 
 from runner.errors import suggest
@@ -72,8 +72,8 @@ def findings(document: Any, schema: str) -> list[Finding]:
     odd = list(_unrepresentable(document, ()))
     seen = {f.path for f in odd}
     errors = _errors_in_order(f"{schema}.schema.json", document, may_fail=bool(odd))
-    found = [f for f in _explained(errors) if not any(f.path[: len(path)] == path for path in seen)]
-    return odd + found
+    found = _without_misspelt(chain.from_iterable(map(_explain, errors)))
+    return odd + [f for f in found if not any(f.path[: len(path)] == path for path in seen)]
 
 
 def dotted(path: Path) -> str:
@@ -323,7 +323,7 @@ def _is_whole(path: Path) -> bool:
 
 def _in_one_line(reference: str, document: Any) -> str | None:
     """The problems of a document, of limited number and length since it may be hostile; None if it is valid."""
-    findings = (finding for error in _errors(reference, document) for finding in _explain(error))
+    findings = chain.from_iterable(map(_explain, _errors(reference, document)))
     found = _without_misspelt(islice(findings, MAX_ERRORS))
     texts = []
     for (rule, _), group in groupby(found, key=lambda f: (f.rule, f.found and f.path)):  # unknown keys share a sentence
@@ -331,10 +331,6 @@ def _in_one_line(reference: str, document: Any) -> str | None:
         paths = ", ".join(shortened(dotted(f.path)) for f in alike)
         texts.append(": ".join(filter(None, (paths, alike[0].found, rule))))
     return "; ".join(texts) if found else None
-
-
-def _explained(errors: Iterable[Any]) -> list[Finding]:
-    return _without_misspelt(finding for error in errors for finding in _explain(error))
 
 
 def _without_misspelt(findings: Iterable[Finding]) -> list[Finding]:

@@ -157,7 +157,7 @@ def test_an_empty_secret_is_none_and_the_last_one_stays_in_force(authority, monk
     """A file that is copied in place is empty for a moment; anybody could compute what is derived from nothing."""
     monkeypatch.setattr(keyring, "CHECK_S", 0)
     ring, notes = Keyring.of(authority.directory / "a-controller"), []
-    token, known = ring.watched_token(notes.append), ring.read(keyring.TOKEN)
+    token, known = ring.watched(keyring.TOKEN, notes.append), ring.read(keyring.TOKEN)
     (ring.directory / keyring.TOKEN).write_bytes(b"")
     with pytest.raises(UserError, match=f"{keyring.TOKEN}: .*: is empty"):
         ring.read(keyring.TOKEN)
@@ -169,7 +169,7 @@ def test_files_out_of_reach_are_read_again_when_they_are_back(authority, monkeyp
     """As while root copies a directory and then hands it to the user of the side."""
     monkeypatch.setattr(keyring, "CHECK_S", 0)
     ring, notes = Keyring.of(authority.directory / "a-controller"), []
-    token, known = ring.watched_token(notes.append), ring.read(keyring.TOKEN)
+    token, known = ring.watched(keyring.TOKEN, notes.append), ring.read(keyring.TOKEN)
     with out_of_reach(ring.directory):
         assert [token.get(), token.get()] == [known, known]
         with pytest.raises(UserError, match="permission denied"):

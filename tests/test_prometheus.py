@@ -20,7 +20,7 @@ from rig import CHECKOUT, free_port
 from runner.core.decision import Believed
 from runner.core.model import Mode
 from runner.errors import RunError
-from runner.metrics.side import metrics_of
+from runner.metrics.side import SideMetrics
 from runner.mqtt.link import ControlLink
 from runner.records.vehicle import CameraTelemetry, Telemetry, VehicleState
 from runner.settings import Endpoint
@@ -43,7 +43,7 @@ def fetch(port: int, path: str, host: str = "") -> tuple[int, str]:
 
 def test_a_side_serves_its_figures_and_its_health() -> None:
     port, problems = free_port(), list[str]()
-    figures = metrics_of("car", port)
+    figures = SideMetrics("car", port)
     figures.serve(lambda: problems[-1] if problems else None)
     try:
         figures.take(TELEMETRY)
@@ -73,7 +73,7 @@ def test_a_side_serves_its_figures_and_its_health() -> None:
 def test_another_host_name_is_refused() -> None:
     """A website that resolves its own name to this machine could otherwise read them in a browser."""
     port = free_port()
-    figures = metrics_of("car", port)
+    figures = SideMetrics("car", port)
     figures.serve(lambda: None)
     try:
         for path in ("/metrics", "/health"):
@@ -87,7 +87,7 @@ def test_another_host_name_is_refused() -> None:
 
 def test_a_client_that_is_silent_or_breaks_off_leaves_no_traceback(capfd: pytest.CaptureFixture[str]) -> None:
     port = free_port()
-    figures = metrics_of("car", port)
+    figures = SideMetrics("car", port)
     figures.serve(lambda: None)
     try:
         with socket.create_connection(("127.0.0.1", port), 60) as silent:
@@ -102,7 +102,7 @@ def test_a_client_that_is_silent_or_breaks_off_leaves_no_traceback(capfd: pytest
 
 
 def test_without_a_port_nothing_is_served_and_nothing_is_loaded() -> None:
-    figures = metrics_of("car", None)
+    figures = SideMetrics("car", None)
     figures.take(TELEMETRY)
     figures.show_online(False)
     figures.serve(lambda: None)
@@ -111,7 +111,7 @@ def test_without_a_port_nothing_is_served_and_nothing_is_loaded() -> None:
 
 def test_a_port_in_use_is_named() -> None:
     port = free_port()
-    first, second = metrics_of("car", port), metrics_of("car", port)
+    first, second = SideMetrics("car", port), SideMetrics("car", port)
     first.serve(lambda: None)
     try:
         with pytest.raises(RunError, match=rf"cannot listen on {Endpoint('127.0.0.1', port)}"):

@@ -86,21 +86,10 @@ class Builder:
     check: PlanCheck | None
     problems: list[Problem] = field(default_factory=list)
     bad: set[schema.Path] = field(default_factory=set)
-    setup: Setup | None = None
+    setup: Setup | None = field(init=False)
 
-    @classmethod
-    def of(
-        cls,
-        composed: Composed,
-        runnable: bool,
-        files: bool,
-        bags: bool,
-        check: PlanCheck | None,
-    ) -> Builder:
-        """The builder of a configuration, with its vehicle and settings built."""
-        builder = cls(composed, runnable, files, bags, check)
-        builder.setup = builder._setup()
-        return builder
+    def __post_init__(self) -> None:
+        self.setup = self._setup()
 
     def _setup(self) -> Setup | None:
         document = self.composed.document

@@ -122,7 +122,7 @@ class Configuration:
 
     @cached_property
     def _builder(self) -> Builder:
-        return Builder.of(self._composed, self._runnable, self._files, self._bags, self._check)
+        return Builder(self._composed, self._runnable, self._files, self._bags, self._check)
 
 
 def _directory(overrides: Sequence[str], user: Path | str | None) -> tuple[Sequence[str], Path | None]:

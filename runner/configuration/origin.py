@@ -105,7 +105,7 @@ class Composed:
             holders = [part for part in above if _holds(part.content, path[len(part.package) : length])]
             if length < len(path):  # the key is missing: the part that defines its surroundings, the most local first
                 writers = [part for part in holders if isinstance(_value_in(part, path[:length]), dict | list)]
-                holders = sorted(writers or holders, key=_locality)
+                holders = sorted(writers or holders, key=lambda part: -len(part.package))
             candidates = [*holders, *makers] if length == len(path) else [*makers, *holders]
             if candidates:
                 return candidates[0]
@@ -130,10 +130,6 @@ def _states(part: Part, path: schema.Path, value: Any) -> bool:
     if any(isinstance(each, str) and "${" in each for each in above):
         return True
     return _holds(part.content, inner) and value_at(part.content, inner) == value
-
-
-def _locality(part: Part) -> int:
-    return -len(part.package)
 
 
 def _value_in(part: Part, path: schema.Path) -> Any:

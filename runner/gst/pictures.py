@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from runner.errors import RunError
 from runner.gst.caps import structure
+from runner.gst.video_reader import pulled
 from runner.system.files import file_problem
 
 LumaPlane = NDArray[np.uint8]  # height x width
-WAIT_NS = 100 * Gst.MSECOND
-SILENT = 100  # consecutive waits without a picture, EOS or error before the file is given up
 
 
 def luma_of(buffer: Gst.Buffer, caps: Gst.Caps) -> LumaPlane:
@@ -48,7 +47,10 @@ def decode_video(path: Path, width: int, height: int) -> Iterator[tuple[int, Lum
     units.add_probe(Gst.PadProbeType.BUFFER, _on_first_unit, first)
     try:
         pipeline.set_state(Gst.State.PLAYING)  # a failure is reported on the bus, with its reason
-        yield from _pulled(pipeline, path, first)
+        for sample in pulled(pipeline, path, "contains no picture that can be decoded"):
+            buffer = sample.get_buffer()
+            if first and buffer.pts != Gst.CLOCK_TIME_NONE:
+                yield buffer.pts - first[0], luma_of(buffer, sample.get_caps())
     finally:
         pipeline.set_state(Gst.State.NULL)
 
@@ -58,22 +60,3 @@ def _on_first_unit(_pad: Gst.Pad, info: Gst.PadProbeInfo, first: list[int]) -> G
         return Gst.PadProbeReturn.OK
     first.append(info.get_buffer().pts)
     return Gst.PadProbeReturn.REMOVE
-
-
-def _pulled(pipeline: Gst.Pipeline, path: Path, first: list[int]) -> Iterator[tuple[int, LumaPlane]]:
-    out, bus = pipeline.get_by_name("out"), pipeline.get_bus()
-    silent, decoded = 0, False
-    while silent < SILENT:
-        sample = out.emit("try-pull-sample", WAIT_NS)
-        if sample is not None:
-            silent, decoded = 0, True
-            if not first or sample.get_buffer().pts == Gst.CLOCK_TIME_NONE:
-                continue
-            yield sample.get_buffer().pts - first[0], luma_of(sample.get_buffer(), sample.get_caps())
-            continue
-        if out.get_property("eos") and decoded:
-            return
-        if out.get_property("eos") or bus.pop_filtered(Gst.MessageType.ERROR) is not None:
-            break
-        silent += 1
-    raise RunError(f"{path}: {'is damaged' if decoded else 'contains no picture that can be decoded'}")

@@ -17,7 +17,7 @@ from runner.core.roles import Role
 from runner.errors import RunError, UserError
 from runner.gst.pipeline import encrypt
 from runner.gst.srtp import provide_rtcp_key
-from runner.security.keyring import Holder, Keyring, Watched, rtsp_password, srt_passphrase
+from runner.security.keyring import MEDIA_SECRET, Holder, Keyring, Watched, rtsp_password, srt_passphrase
 
 USER = "user"  # field of a token of the server library: whose password it stands for
 VIEWER = "viewer"  # role in the server library that may open and watch a camera
@@ -104,7 +104,7 @@ class StreamLogin:
             if is_rtsp:
                 self._prepare_rtsp(client)
             else:
-                self._media_secret = self._media_secret or self._keyring.watched_media_secret(self._on_report)
+                self._media_secret = self._media_secret or self._keyring.watched(MEDIA_SECRET, self._on_report)
                 self._used = self._media_secret.get()
                 encrypt(pipeline, srt_passphrase(self._used, self._vehicle))
         except (RunError, UserError, GLib.Error) as error:

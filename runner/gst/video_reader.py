@@ -14,7 +14,7 @@ from runner.gst.stream_times import RestoredTimes, stream_times
 from runner.system.files import file_problem
 
 WAIT_NS = 100 * Gst.MSECOND
-SILENT = 100  # consecutive waits without a unit, EOS or error before the file is given up
+SILENT = 100  # consecutive waits without a sample, EOS or error before the file is given up
 PARSED = {  # by codec, the parser: whole pictures as Annex B, parameter sets with each keyframe
     codec: f"{codec}parse config-interval=-1 ! capsfilter caps=video/x-{codec},stream-format=byte-stream,alignment=au"
     for codec in ("h264", "h265")
@@ -50,7 +50,7 @@ def read_video(path: Path) -> Iterator[Unit]:
     pipeline.get_by_name("demux").connect("pad-added", _on_stream, pipeline.get_by_name("out"))
     try:
         pipeline.set_state(Gst.State.PLAYING)  # a failure is reported on the bus, with its reason
-        yield from _pulled(pipeline, path, times)
+        yield from _units(pipeline, path, times)
     finally:
         pipeline.set_state(Gst.State.NULL)
 
@@ -67,25 +67,33 @@ def _on_stream(_demux: Gst.Element, pad: Gst.Pad, out: Gst.Element) -> None:
     parse.sync_state_with_parent()
 
 
-def _pulled(pipeline: Gst.Pipeline, path: Path, times: RestoredTimes) -> Iterator[Unit]:
-    out, bus = pipeline.get_by_name("out"), pipeline.get_bus()
-    first, silent = 0, 0
-    codec = ""
-    while silent < SILENT:
-        sample = out.emit("try-pull-sample", WAIT_NS)
-        if sample is None:
-            if out.get_property("eos") and codec:
-                return
-            message = bus.pop_filtered(Gst.MessageType.ERROR)
-            if message is not None or out.get_property("eos"):
-                break
-            silent += 1
-            continue
-        silent, buffer = 0, sample.get_buffer()
+def _units(pipeline: Gst.Pipeline, path: Path, times: RestoredTimes) -> Iterator[Unit]:
+    first, codec = 0, ""
+    for sample in pulled(pipeline, path, "contains no readable video"):
+        buffer = sample.get_buffer()
         if not codec:
             codec, first = structure(sample.get_caps()).get_name().removeprefix("video/x-"), buffer.pts
         if buffer.pts == Gst.CLOCK_TIME_NONE:
             continue  # a unit whose beginning is damaged
         demuxed_ns = buffer.pts - first
         yield Unit(times.next(demuxed_ns), codec, buffer.extract_dup(0, buffer.get_size()), demuxed_ns)
-    raise RunError(f"{path}: is damaged" if codec else f"{path}: contains no readable video")
+
+
+def pulled(pipeline: Gst.Pipeline, path: Path, empty: str) -> Iterator[Gst.Sample]:
+    """The samples of a playing pipeline's sink `out`, up to their end.
+
+    empty   what to say about the file if there are none
+    raises  RunError if they do not end properly
+    """
+    out, silent, any_came = pipeline.get_by_name("out"), 0, False
+    while silent < SILENT:
+        if sample := out.emit("try-pull-sample", WAIT_NS):
+            silent, any_came = 0, True
+            yield sample
+            continue
+        if (is_over := out.get_property("eos")) and any_came:
+            return
+        if is_over or pipeline.get_bus().pop_filtered(Gst.MessageType.ERROR) is not None:
+            break
+        silent += 1
+    raise RunError(f"{path}: {'is damaged' if any_came else empty}")

@@ -65,11 +65,7 @@ METRICS: dict[type, tuple[tuple[_Metric, ...], tuple[_Metric, ...]]] = {
     VehicleState: (
         (
             _Metric("decided_kbps", "Total bitrate of all cameras", lambda s: s.total_kbps),
-            _Metric(
-                "asked_kbps",
-                "Total given by prediction or operator",
-                lambda s: s.asked_kbps,
-            ),
+            _Metric("asked_kbps", "Total given by prediction or operator", lambda s: s.asked_kbps),
             _Metric("rules_failing", "1 while the rules cannot decide", lambda s: s.fault is not None),
             _Metric("believed_kbps", "Capacity that the uplink is believed to have", _believed("kbps")),
             _Metric("believed_margin", "By how much less is sent, as a difference of ln", _believed("margin")),

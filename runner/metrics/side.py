@@ -13,12 +13,18 @@ if TYPE_CHECKING:
 class SideMetrics:
     """Takes a side's records and serves their metrics. May be used from any thread.
 
-    metrics, port  None: nothing is served, and records are ignored
+    vehicle  name of the vehicle
+    port     TCP port on 127.0.0.1; None: nothing is served, and records are ignored
+    log      directory that the drive is logged to; None: it is not logged
     """
 
-    def __init__(self, metrics: Metrics | None, port: int | None) -> None:
-        self._metrics, self._port = metrics, port
-        self._open = ExitStack()
+    def __init__(self, vehicle: str, port: int | None, log: Path | None = None) -> None:
+        self._port, self._open = port, ExitStack()
+        self._metrics: Metrics | None = None
+        if port is not None:
+            from runner.metrics.prometheus import Metrics
+
+            self._metrics = Metrics(vehicle, log)
 
     def take(self, record: Any) -> None:
         if self._metrics:
@@ -37,17 +43,3 @@ class SideMetrics:
 
     def close(self) -> None:
         self._open.close()
-
-
-def metrics_of(vehicle: str, port: int | None, log: Path | None = None) -> SideMetrics:
-    """The metrics of a side.
-
-    vehicle  name of the vehicle
-    port     TCP port on 127.0.0.1; None: nothing is served
-    log      directory that the drive is logged to; None: it is not logged
-    """
-    if port is None:
-        return SideMetrics(None, None)
-    from runner.metrics.prometheus import Metrics
-
-    return SideMetrics(Metrics(vehicle, log), port)

@@ -10,7 +10,7 @@ from typing import Any
 
 from runner.core.roles import Role
 from runner.errors import RunError
-from runner.security.keyring import AUTHORITY, CERTIFICATE, Keyring, mqtt_password
+from runner.security.keyring import AUTHORITY, CERTIFICATE, SECRET, Keyring, mqtt_password
 
 FILES = {"own": CERTIFICATE, "the authority's": AUTHORITY}
 
@@ -27,7 +27,7 @@ class Login:
         self._keyring, self._on_report = keyring, on_report
         self._expiring: set[str] = set()  # what was reported of certificates
         self._revoked = keyring.watched_revoked(on_report)
-        self._own, self._secret = keyring.watched_certificate(on_report), keyring.watched_secret(on_report)
+        self._own, self._secret = keyring.watched_certificate(on_report), keyring.watched(SECRET, on_report)
         self._broker, self._used = 0, b""  # in use: serial number of the broker's certificate, own certificate
         self._validity = {whose: keyring.validity(name) for whose, name in FILES.items()}
         self._broker_ends: float | None = None  # s since 1970; None: its certificate was not seen yet

@@ -23,7 +23,7 @@ from runner.configuration.config import configuration
 from runner.core.evidence import REPORT_S
 from runner.drive.log import Log
 from runner.errors import RunError
-from runner.metrics.side import SideMetrics, metrics_of
+from runner.metrics.side import SideMetrics
 from runner.operator.log import DriveLog
 from runner.operator.station import Listener, Station
 from runner.plans import compile_plans
@@ -265,7 +265,7 @@ def live_operator(
     operator = LiveOperator(setup, station, drive, build, requests)
     with ExitStack() as ending:  # in reverse order
         ending.callback(drive.close)
-        metrics = metrics_of(setup.vehicle.name, setup.metrics.operator_port, log)
+        metrics = SideMetrics(setup.vehicle.name, setup.metrics.operator_port, log)
         station.listeners.append(_MetricsListener(metrics))
         ending.callback(metrics.close)
         if pictures:

@@ -37,7 +37,7 @@ from runner.records import to_json
 from runner.records.lines import Note
 from runner.records.operator import Sample
 from runner.records.vehicle import Outcome, VehicleState, state_to_json
-from runner.security.keyring import Keyring
+from runner.security.keyring import TOKEN, Keyring
 from runner.settings import Setup
 from runner.system.files import plotly_script
 from runner.system.ports import check_port_free
@@ -82,7 +82,7 @@ class PageServer(Listener):
         report = LimitedReports(station.note)  # of what browsers and others on the network can cause
         self._connections = Connections(PageTls(keyring, station.note) if keyring else None, report)
         self._holder = keyring.watched_holder(station.note) if keyring else None
-        login = PageLogin(keyring.watched_token(station.note).get) if keyring else None
+        login = PageLogin(keyring.watched(TOKEN, station.note).get) if keyring else None
         self._access = Access(login, lambda: self._names, self._connections, report)
         self._windows = Windows(self._on_attention)
         self._layouts = layouts or Layouts()

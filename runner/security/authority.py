@@ -238,7 +238,7 @@ class Authority:
             keyring.KEY: pair.key,
             keyring.SECRET: _secret(),
             keyring.HOLDER: msgspec.json.encode(keyring.Holder(name, role, hosts)),
-            **self._files_of(role),
+            **({keyring.TOKEN: _secret()} if role in VIEWERS else {}),
         }
         self._replace(name, files)
         self._distribute()
@@ -247,10 +247,6 @@ class Authority:
         """Withdraw what the keys of a role reveal about SRT streams: SRT has no certificates that could be revoked."""
         if role is Role.VEHICLE or role in VIEWERS:
             _write(self._own / keyring.MEDIA_SECRET, _secret())
-
-    def _files_of(self, role: Role) -> dict[str, bytes]:
-        """Files that holders of a role have in addition to those that all have and those that `_distribute` writes."""
-        return {keyring.TOKEN: _secret()} if role in VIEWERS else {}
 
     def _replace(self, name: str, files: Mapping[str, bytes]) -> None:
         """Replace a holder's directory as a whole."""

@@ -182,11 +182,9 @@ class Keyring:
     def secret(self) -> bytes:
         return self.read(SECRET)
 
-    def watched_secret(self, on_report: Callable[[str], None]) -> Watched[bytes]:
-        return Watched(self.directory / SECRET, lambda: self.secret, on_report)
-
-    def watched_token(self, on_report: Callable[[str], None]) -> Watched[bytes]:
-        return Watched(self.directory / TOKEN, lambda: self.read(TOKEN), on_report)
+    def watched(self, name: str, on_report: Callable[[str], None]) -> Watched[bytes]:
+        """The content of a file."""
+        return Watched(self.directory / name, lambda: self.read(name), on_report)
 
     def watched_passphrase(self, on_report: Callable[[str], None]) -> Watched[str]:
         """The passphrase that encrypts this vehicle's SRT streams."""
@@ -197,10 +195,6 @@ class Keyring:
             return self.read(PASSPHRASE).decode()
         except UnicodeDecodeError as error:
             raise self._error(PASSPHRASE, error) from None
-
-    def watched_media_secret(self, on_report: Callable[[str], None]) -> Watched[bytes]:
-        """The secret from which viewers derive each vehicle's passphrase."""
-        return Watched(self.directory / MEDIA_SECRET, lambda: self.read(MEDIA_SECRET), on_report)
 
     def read(self, name: str) -> bytes:
         """Content of a file, without a trailing newline that an editor may have added.

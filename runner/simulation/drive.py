@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from runner.configuration.experiment import TimedRequest
 from runner.core.budget import payload_bytes
-from runner.core.events import BitratePredicted, Event, parse
+from runner.core.events import BitratePredicted, ClockAdvanced, Event, parse
 from runner.core.step import Run
 from runner.link.limit import TcpFlows
 from runner.link.losses import LossModel
@@ -189,7 +189,7 @@ class Simulation:
     def run(self) -> Drive:
         """The whole drive."""
         vehicle, end = self.vehicle, self.done.duration_s
-        vehicle.take_start()
+        vehicle.take(ClockAdvanced(t=0.0))
         self._messages = ControlMessages(vehicle.setup, vehicle.run)
         vehicle.connect(0.0)
         for name, encoder in self.encoders.items():  # real cameras start by chance

@@ -47,10 +47,6 @@ class Number(NamedTuple):
         """raises ModelError if the rule does not take the value"""
         call_rule(self.rule, {**self.given, self.key: value})
 
-    def is_named(self, words: Sequence[str]) -> bool:
-        """Whether it is what the words name, or part of that."""
-        return tuple(words) == (self.mode, self.entry, self.key)[: len(words)]
-
 
 class Trial(NamedTuple):
     """Another value of a number."""
@@ -132,7 +128,7 @@ def _is_allowed(number: Number, value: int | float) -> bool:
 def _of_word(word: str, known: Sequence[Number], modes: Modes, driven: Sequence[str]) -> tuple[list[Trial], list[str]]:
     name, equals, _ = word.partition("=")
     named = name.removeprefix("modes.").split(".")
-    some = [number for number in known if number.is_named(named)]
+    some = [one for one in known if (one.mode, one.entry, one.key)[: len(named)] == tuple(named)]
     if not some:
         raise ConfigError([_problem(name, None, _why_unknown(named, known, modes, driven))])
     if not equals:

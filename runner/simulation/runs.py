@@ -305,14 +305,10 @@ def _link(common: Common, job: Job, limit: Limit, capacity: Steps) -> Link:
         delay_at=_in_seconds(limit),
         back_at=_in_seconds(back) if back else None,
         losses=LossModel(limit.loss, limit.burst, seed) if limit.loss else None,
-        back=RateQueue(_back_rates(back, job), back.queue_ms) if back else None,
+        back=RateQueue(Steps.of(back.kbps_at, job.duration_s), back.queue_ms) if back else None,
         back_losses=LossModel(back.loss, back.burst, seed) if back and back.loss else None,
         tcp=limit.tcp,
     )
-
-
-def _back_rates(back: OneWay, job: Job) -> Steps:
-    return Steps.of(back.kbps_at, job.duration_s)
 
 
 def _queue(common: Common, job: Job, limit: Limit, capacity: Steps) -> Queue:

@@ -50,10 +50,6 @@ class SimulatedVehicle:
         if prediction := self.pqos.observe(event):
             self._step(prediction)
 
-    def take_start(self) -> None:
-        """The loop begins."""
-        self.take(ClockAdvanced(t=0.0))
-
     def connect(self, t: float) -> None:
         """The operator's side connects."""
         self._operators.connected(OPERATOR, t)

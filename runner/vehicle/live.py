@@ -26,7 +26,7 @@ from runner.core.model import Progress
 from runner.drive.log import Log, check_free
 from runner.errors import RunError
 from runner.graph import rtsp_url
-from runner.metrics.side import metrics_of
+from runner.metrics.side import SideMetrics
 from runner.mqtt.link import ControlLink
 from runner.mqtt.login import Login
 from runner.mqtt.messages import (
@@ -387,7 +387,7 @@ def live_vehicle(
         ending.callback(side.stop)
         control = _VehicleControl(setup, document, report, keyring)
         ending.callback(control.close)
-        metrics = metrics_of(setup.vehicle.name, setup.metrics.vehicle_port, log)
+        metrics = SideMetrics(setup.vehicle.name, setup.metrics.vehicle_port, log)
         ending.callback(metrics.close)
 
         def publish(record: VehicleState | Telemetry | SpeedAdvice | SteeringAngle) -> bool:

@@ -54,7 +54,7 @@ def run(arguments: Arguments) -> int:
                 changed.append(name)
         for issued in authority.holders():
             print(_described(issued, authority.now()))
-        to_copy = sorted({*changed, *(each.name for each in authority.holders() if changed)} & set(_active(authority)))
+        to_copy = sorted(each.name for each in authority.holders() if not each.revoked)
     if changed:
         print(f"copy to their machines: {', '.join(f'{output}/{name}' for name in to_copy)}")
     return 0
@@ -63,10 +63,6 @@ def run(arguments: Arguments) -> int:
 def _hosts_of(role: Role, named: list[Role], hosts: tuple[str, ...]) -> tuple[str, ...]:
     """Hosts belong to the vehicle if one is named, otherwise to the operator."""
     return hosts if role is Role.VEHICLE or Role.VEHICLE not in named else ()
-
-
-def _active(authority: Authority) -> list[str]:
-    return [issued.name for issued in authority.holders() if not issued.revoked]
 
 
 def _described(issued: Issued, now: datetime) -> str:

@@ -68,7 +68,7 @@ def progress_bar(*, interrupts: bool = True) -> Iterator[Progress]:
 
     interrupts  whether a signal interrupts work in the main thread when it reports its progress
     """
-    check = signals.check if interrupts else _no_check
+    check = signals.check if interrupts else lambda: None
     if not sys.stderr.isatty():
         yield _progress_lines(check)
         return
@@ -87,10 +87,6 @@ def progress_bar(*, interrupts: bool = True) -> Iterator[Progress]:
             bars.update(tasks[what], completed=done)  # type: ignore[arg-type]
 
         yield progress
-
-
-def _no_check() -> None:
-    pass
 
 
 def _progress_lines(check: Callable[[], None]) -> Progress:

@@ -54,7 +54,7 @@ def run(arguments: Arguments) -> int:
     check(common, drives)
     tried = _trials(arguments, common, drives)
     say(f"{len(tried)} value{'s' if len(tried) > 1 else ''} and those in force, on {len(drives)} drives each")
-    wanted = [*drives, *(_under(trial, job) for trial in tried for job in drives)]
+    wanted = [*drives, *(job._replace(words=(*job.words, trial.override)) for trial in tried for job in drives)]
     results = list(simulated.run_all(common, wanted, [None] * len(wanted), workers, keep=False))
     base, *others = (_of_sets(results[at : at + len(drives)], sets) for at in range(0, len(results), len(drives)))
     in_force = [means(some) for some in base]
@@ -97,11 +97,6 @@ def _trials(arguments: Arguments, common: Common, drives: Sequence[Job]) -> list
     for what in skipped:
         say(what)
     return tried
-
-
-def _under(trial: Trial, job: Job) -> Job:
-    """The same drive with another value."""
-    return job._replace(words=(*job.words, trial.override))
 
 
 def _of_sets(results: Sequence[Result], sets: Sets) -> tuple[Sequence[Result], Sequence[Result]]:

@@ -168,7 +168,7 @@ def _directories(arguments: Arguments) -> dict[Path | None, list[Path] | None]:
         if not file.is_file():
             raise ArgumentError("", word, "no such file")
         inside = [arguments.conf] if arguments.conf else [*file.parents, *file.absolute().parents]
-        above = [conf for conf in inside if _inside(conf, file) and _has_groups(conf)]
+        above = [conf for conf in inside if _inside(conf, file) and any((conf / folder).is_dir() for folder in FOLDERS)]
         if not above:
             rule = "is in no configuration directory: none above it has vehicle/, cameras/, ..."
             raise ArgumentError("", word, f"is not in {arguments.conf}" if arguments.conf else rule)
@@ -183,10 +183,6 @@ def _inside(conf: Path, file: Path) -> Path | None:
         if path.is_relative_to(top):
             return conf / path.relative_to(top)
     return None
-
-
-def _has_groups(directory: Path) -> bool:
-    return any((directory / folder).is_dir() for folder in FOLDERS)
 
 
 def check_files(directories: Sequence[Path], named: Collection[Path] | None) -> tuple[list[Problem], int]:
