@@ -62,25 +62,9 @@ globalThis.tod = {
       resolvers.set(id, resolve);
       send({ id, ...event });
     }),
-  get state() {
-    return store.state;
-  },
-  get sample() {
-    return store.sample;
-  },
-  get history() {
-    return store.series;
-  },
-  get view() {
-    return store.view;
-  },
-  get control() {
-    return store.holder;
-  },
-  get selected() {
-    return store.selected;
-  },
   get requests() {
     return { pending: [...requests.pending.values()].map(({ timer, ...kept }) => kept), answered: requests.answered };
   },
 };
+const SHOWN = { state: "state", sample: "sample", history: "series", view: "view", control: "holder", selected: "selected" };
+for (const [name, key] of Object.entries(SHOWN)) Object.defineProperty(globalThis.tod, name, { get: () => store[key] });
