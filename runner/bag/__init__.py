@@ -236,11 +236,8 @@ def _readable(key: str, found: str) -> Iterator[None]:
     except OSError as error:
         raise ModelError(key, found, f"cannot be read: {reason(error)}") from None
     except Exception as error:
-        raise ModelError(key, found, f"cannot be read, damaged or cut off: {_first_line(error)}") from None
-
-
-def _first_line(error: Exception) -> str:
-    return " ".join(str(error).split()).rstrip(".") or type(error).__name__
+        why = " ".join(str(error).split()).rstrip(".") or type(error).__name__
+        raise ModelError(key, found, f"cannot be read, damaged or cut off: {why}") from None
 
 
 def _rate(measured: float) -> Fraction:

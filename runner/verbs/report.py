@@ -157,9 +157,6 @@ def labels(drives: Sequence[Drive]) -> list[str]:
             depth += 1
         again = paths[:number].count(path)
         name = "/".join(path.parts[-depth:]) + (f" ({again + 1})" if again else "")
-        found.append(name if drive.replayed is None else f"{name} (replay: {_shortened(drive.replayed)})")
+        words = shorten(" ".join(drive.replayed or ()) or "unchanged", WORDS_SHOWN, placeholder=" ...")
+        found.append(name if drive.replayed is None else f"{name} (replay: {words})")
     return found
-
-
-def _shortened(words: Sequence[str]) -> str:
-    return shorten(" ".join(words) or "unchanged", WORDS_SHOWN, placeholder=" ...")
