@@ -42,7 +42,7 @@ def loaded(*words: str) -> tuple[int, set[str]]:
 RUNNING = {  # modules of the project and heavy packages; `validate` reads maps and queries GStreamer's registry
     "print": (50, COMPOSING),
     "replay": (57, COMPOSING),
-    "validate": (118, COMPOSING | {"numpy", "gi"}),
+    "validate": (119, COMPOSING | {"numpy", "gi"}),
 }
 HELP = {
     "vehicle": {"paho"},

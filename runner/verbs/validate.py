@@ -438,7 +438,7 @@ def _problems(config: Configuration, readers: Iterable[ConfigReader]) -> list[Pr
 def _registry_check(notes: dict[str, None]) -> PlanCheck | None:
     """The check against GStreamer's registry; anything it could not check goes to the notes."""
     try:
-        from runner.apply import check_plan, missing_plugins, missing_recorders, parameter_set_notes
+        from runner.apply import check_plan, missing_plugins, missing_recorders
     except MissingBindings as error:
         notes[f"nothing was checked against the GStreamer registry: {error}"] = None
         return None
@@ -448,6 +448,8 @@ def _registry_check(notes: dict[str, None]) -> PlanCheck | None:
         notes.update({f"not checked: {sentence}": None for sentence in missing})
         problems = check_plan(plan)
         if not problems and may_lack_parameter_sets(plan):
+            from runner.apply import parameter_set_notes
+
             notes.update(dict.fromkeys(parameter_set_notes(plan)))
         return problems
 
