@@ -51,7 +51,7 @@ def rows(source: Sequence[str] = ("source=synthetic",), rounds: int = 60) -> lis
 def command_latency(source: Sequence[str], rounds: int) -> Iterator[Row]:
     """From a decision for all cameras to the last encoder that applies it; eight cameras as the demo runs them."""
     setup = _setup([*source, "fps_max=15"])
-    with _streaming(setup) as side, _operator([*source, "fps_max=15"]):
+    with _recorded() as applied, _streaming(setup) as side, _operator([*source, "fps_max=15"]):
         _until(lambda: all(camera.encoded.frames > 30 for camera in side.read().values()))
         for what, sizes in (("bitrate", []), ("bitrate and size", [(960, 520), (480, 260)])):
             last, each = [], []
@@ -59,10 +59,10 @@ def command_latency(source: Sequence[str], rounds: int) -> Iterator[Row]:
                 commands = [Command(name, "bitrate", 500 + n % 7 * 40) for name in setup.vehicle.cameras]
                 if sizes:
                     commands += [Command(name, "size", sizes[n % 2]) for name in setup.vehicle.cameras]
+                applied.clear()
                 began = time.perf_counter()
-                with _recorded() as applied:
-                    side.turn(commands)
-                    _until(lambda seen=applied: len(seen) >= len(setup.vehicle.cameras), 2)
+                side.turn(commands)
+                _until(lambda: len(applied) >= len(setup.vehicle.cameras), 2)
                 waits = sorted(1000 * (at - began) for at in applied)
                 last.append(waits[-1])
                 each += waits
@@ -200,7 +200,7 @@ def _client(setup: Setup, transport: str = "udp+tcp") -> Iterator[tuple[list[Sam
 
 @contextmanager
 def _recorded() -> Iterator[list[float]]:
-    """Times at which knobs are set in the meantime."""
+    """Times at which knobs are set, of the pipelines that are built in the meantime."""
     times: list[float] = []
     original = knobs.KnobPanel._apply_pending
 
@@ -217,7 +217,7 @@ def _recorded() -> Iterator[list[float]]:
         knobs.KnobPanel._apply_pending = original
 
 
-def _until(done: Any, seconds: float = 10) -> None:
+def _until(done: Any, seconds: float = 60) -> None:
     end = time.monotonic() + seconds
     while not done():
         if time.monotonic() > end:
