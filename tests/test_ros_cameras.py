@@ -252,18 +252,22 @@ def test_pictures_that_the_middleware_does_not_number_are_lost_as_far_as_it_know
     assert losses(monkeypatch, [], lost_in_transport=1, counted=counted).startswith(lost)
 
 
-WORKS_ONCE = """
-import socket, sys
+FAILS_ONCE = """
+import pathlib, socket, sys
 process = socket.socket(fileno=int(sys.argv[-1]))
 process.send(b'{"kind": "ready"}')
-sys.exit(3)
+failed = pathlib.Path(__file__).with_suffix(".failed")
+if not failed.exists():
+    failed.touch()
+    sys.exit(3)
+process.recv(1)  # until it is closed
 """
 
 
 def test_a_node_is_started_again_after_any_error(monkeypatch, tmp_path):
     monkeypatch.setattr("runner.ros.process.RETRY_S", (0.0, 0.0))
     interpreter = tmp_path / "python"
-    interpreter.write_text(f"#!{sys.executable}\n{WORKS_ONCE}")
+    interpreter.write_text(f"#!{sys.executable}\n{FAILS_ONCE}")
     interpreter.chmod(0o755)
     pairs, settings = count(1), replace(configuration([*WORDS, *TOPICS]).setup().ros, python=str(interpreter))
 
