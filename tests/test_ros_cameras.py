@@ -253,11 +253,14 @@ def test_pictures_that_the_middleware_does_not_number_are_lost_as_far_as_it_know
 
 
 FAILS_ONCE = """
-import pathlib, socket, sys
+import pathlib, socket, sys, time
 process = socket.socket(fileno=int(sys.argv[-1]))
 process.send(b'{"kind": "ready"}')
-failed = pathlib.Path(__file__).with_suffix(".failed")
+failing = pathlib.Path(__file__).with_suffix(".failing")
+failed = failing.with_suffix(".failed")
 if not failed.exists():
+    while not failing.exists():
+        time.sleep(0.01)
     failed.touch()
     sys.exit(3)
 process.recv(1)  # until it is closed
@@ -280,6 +283,7 @@ def test_a_node_is_started_again_after_any_error(monkeypatch, tmp_path):
     reports, again = [], threading.Event()
     node = NodeProcess(settings, print, lambda _, text: reports.append(text) or (len(reports) > 2 and again.set()))
     node.start()
+    interpreter.with_suffix(".failing").touch()
     assert again.wait(60)
     node.close()
     assert reports[:3] == [
