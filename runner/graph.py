@@ -8,9 +8,22 @@ import shlex
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from functools import lru_cache
 
 from runner.core.commands import KnobValue
-from runner.core.model import PLACEHOLDER, BagTopic, Camera, Capture, Element, Graph, ModelError, Roi, Source, Value
+from runner.core.model import (
+    PLACEHOLDER,
+    BagTopic,
+    Camera,
+    Capture,
+    Element,
+    Graph,
+    GraphSettings,
+    ModelError,
+    Roi,
+    Source,
+    Value,
+)
 from runner.errors import suggest
 from runner.settings import Endpoint, Media, Recording
 
@@ -333,13 +346,13 @@ def _buffer(camera: Camera, kbps: int) -> dict[str, Value]:
 
     At least 1 kbit: x264 rounds down to whole kbit, and treats 0 as unlimited.
     """
-    values = _per_frame_rate(camera)
+    values = _per_frame_rate(camera.graph.settings, camera.fps)
     return {"vbv_ms": max(values["vbv_ms"], math.ceil(1000 / kbps))} if "vbv_ms" in values else {}
 
 
-def _per_frame_rate(camera: Camera) -> dict[str, int]:
-    """The placeholders that settings of the graph fill at the camera's frame rate."""
-    settings, fps = camera.graph.settings, float(camera.fps)
+@lru_cache  # needed several times for each new bitrate
+def _per_frame_rate(settings: GraphSettings, fps: Fraction) -> Mapping[str, int]:
+    """The placeholders that settings of a graph fill at a frame rate."""
     seconds, frames = settings.key_interval_s, settings.vbv_frames
     values = {} if seconds is None else {"key_interval_frames": seconds * fps}
     values |= {} if frames is None else {"vbv_ms": 1000 * frames / fps}
@@ -403,7 +416,7 @@ def _values(camera: Camera, media: Media, index: int, clip: str | None) -> dict[
         "port": port,
         "endpoint": str(Endpoint(media.host, port)),
         "iptos": 4 * settings.dscp if settings.dscp >= 0 else -1,  # the byte of the IP header
-        **_per_frame_rate(camera),
+        **_per_frame_rate(settings, camera.fps),
     }
     return values if clip is None else values | {"clip": clip}
 
