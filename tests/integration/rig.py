@@ -212,6 +212,8 @@ def free_port(count: int = 1) -> int:
 
 
 def _is_free(port: int) -> bool:
+    if port == 10080:  # the one in this range that browsers refuse (Fetch, bad port)
+        return False
     with socket.socket() as tcp, socket.socket(type=socket.SOCK_DGRAM) as udp:
         try:
             tcp.bind(("127.0.0.1", port))
