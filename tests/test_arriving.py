@@ -225,6 +225,22 @@ def test_one_stray_packet_is_no_restart() -> None:
     assert stream.counted == (4, 0)
 
 
+@pytest.mark.parametrize("held_s", [1, 10])
+def test_packets_that_a_way_has_held_are_no_new_stream(held_s: int) -> None:
+    """Nor are they missing once they have come; at 8 Mbit/s that many numbers are thousands."""
+    frames, count = ArrivingFrames(), held_s * 833
+
+    def add(number: int, at: float) -> bool:
+        packet = Packet(number % 65_536, round(number / 833 * RTP_HZ) % 2**32, last=True, bytes=1000, captured=None)
+        return frames.add(packet, at)
+
+    assert add(65_000, 0)
+    assert add(65_000 + count, held_s)
+    assert not any(add(65_000 + number, held_s + 0.1) for number in range(1, count))
+    assert (frames.received, frames.missing) == (count + 1, 0)
+    assert add(65_001 + count, held_s + 0.2)
+
+
 def test_a_duplicate_packet_hides_no_loss() -> None:
     stream = Stream()
     stream.send(0)

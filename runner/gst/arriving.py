@@ -19,8 +19,11 @@ RTP_HZ = 90_000  # of video (RFC 6184)
 HEADER_BYTES = 32  # of a packet: enough for the header without contributing sources, and the capture time
 CAPTURE_ID = 1  # of the header extension with the capture time
 EXTENDED, SOURCES, MARKER, NUMBERS = 0x10, 0x0F, 0x80, 0x10000  # RFC 3550, section 5.1; so many sequence numbers
-# Jump of the sequence number, ahead or back, that marks a restarted stream if the next packet follows (RFC 3550, A.1).
+# Jump of the sequence number, ahead or back, that marks a restarted stream if the next packet follows (RFC 3550, A.1):
+# more than a stream sends in the time between both packets, but never less than these. A way that has held packets for
+# OLDEST_S still delivers them.
 DROPOUT, MISORDER = 3000, 100
+FASTEST, OLDEST_S = 5000, 15.0  # packets/s: 48 Mbit/s
 WINDOW_S = 5.0  # the usual transit time is the shortest one in this window and the window before it
 RESTART_S = 10.0  # more than this is not delay: the sender's clock was reset
 ONE_BYTE, FIXED_BYTES, WORD_BYTES, NTP_BYTES = b"\xbe\xde", 12, 4, 8  # RFC 8285, section 4.2; RFC 6051
@@ -90,7 +93,7 @@ class ArrivingFrames:
         self._open = self._emitted = False  # the frame has not ended; its arrival is in `_frames`
         self._gap = 0.0
         self._began, self._interval = 0.0, inf  # of the current frame; s between two frames
-        self._missing: deque[int] = deque(maxlen=MISORDER)  # sequence numbers
+        self._missing: dict[int, int] = {}  # sequence numbers, with the timestamp of the packet that followed
         self._restarted: int | None = None  # the sequence number that confirms a restart
         self.received = self.missing = 0  # packets received, and packets missing when a later one arrived
 
@@ -103,12 +106,13 @@ class ArrivingFrames:
         with self._lock:
             self._packets.append((now if arrived is None else arrived, packet.bytes))
             ahead = 0 if self._newest is None else (packet.number - self._newest.number - 1) % NUMBERS
-            if ahead >= (NUMBERS // 2 if retransmitted else NUMBERS - MISORDER):
+            media_s = 0.0 if self._newest is None else signed(packet.stamp - self._newest.stamp) / RTP_HZ
+            if ahead >= NUMBERS - max(MISORDER, _sent_in(-media_s)) or (retransmitted and ahead >= NUMBERS // 2):
                 self._add_older(packet, retransmitted)
                 return False
-            if ahead < DROPOUT:
+            if ahead < max(DROPOUT, _sent_in(media_s)):
                 self._add_newer(packet, now, arrived, retransmitted, whole=not ahead)
-                self._note_missing(packet.number, ahead)
+                self._note_missing(packet, ahead)
                 return True
             expected, self._restarted = self._restarted, (packet.number + 1) % NUMBERS
             if packet.number != expected:
@@ -116,6 +120,11 @@ class ArrivingFrames:
             self._ahead = None
             self._add_newer(packet, now, arrived, retransmitted, whole=False)
             return True
+
+    def resume(self) -> None:
+        """Nothing is missing before the next packet, whatever its number: what was sent meanwhile went elsewhere."""
+        with self._lock:
+            self._newest = None
 
     def is_late(self, now: float) -> bool:
         """Whether the rest of the current frame, or all of the next one, is overdue, so that packets are missing."""
@@ -149,8 +158,7 @@ class ArrivingFrames:
         """Add a packet that was reordered, retransmitted or duplicated."""
         if retransmitted:
             self._bytes += packet.bytes
-        elif packet.number in self._missing:
-            self._missing.remove(packet.number)
+        elif self._was_missing(packet):
             self._bytes += packet.bytes
             self.received, self.missing = self.received + 1, self.missing - 1
 
@@ -171,10 +179,22 @@ class ArrivingFrames:
         if packet.last:
             self._emit()
 
-    def _note_missing(self, number: int, count: int) -> None:
-        """`count` packets before the one with this number are missing."""
+    def _note_missing(self, packet: Packet, count: int) -> None:
+        """`count` packets before this one are missing."""
         self.missing += count
-        self._missing.extend(each % NUMBERS for each in range(number - min(count, MISORDER), number))
+        for each in range(packet.number - min(count, MAX_PACKETS), packet.number):
+            self._missing.pop(each % NUMBERS, None)  # noted before the numbers wrapped around
+            self._missing[each % NUMBERS] = packet.stamp
+        while len(self._missing) > MAX_PACKETS:
+            del self._missing[next(iter(self._missing))]
+
+    def _was_missing(self, packet: Packet) -> bool:
+        """Whether this packet was noted as missing; it is no longer."""
+        followed = self._missing.get(packet.number)
+        if followed is None or not 0 <= signed(followed - packet.stamp) <= OLDEST_S * RTP_HZ:
+            return False
+        del self._missing[packet.number]
+        return True
 
     def _begin(self, packet: Packet, now: float, *, regular: bool) -> None:
         """Begin a frame. regular: no packet is missing since the previous one, and it arrives as first sent."""
@@ -201,6 +221,30 @@ class ArrivingFrames:
         self._bytes, self._emitted = 0, True
 
 
+def _sent_in(media_s: float) -> int:
+    """How many packets a stream may have sent in this time; none in one that has not passed or is too long."""
+    return round(FASTEST * media_s) if 0 < media_s <= OLDEST_S else 0
+
+
+class ShortestTransit:
+    """The shortest transit time of the last 5 to 10 s, s. Silence does not age it."""
+
+    def __init__(self) -> None:
+        self._began, self._before, self._shortest = -inf, inf, inf
+
+    def add(self, transit: float, arrived: float) -> None:
+        if arrived - self._began > WINDOW_S:
+            self._began, self._before, self._shortest = arrived, self._shortest, inf
+        self._shortest = min(self._shortest, transit)
+
+    def restart(self, transit: float) -> None:
+        self._before = self._shortest = transit
+
+    @property
+    def seconds(self) -> float:
+        return min(self._before, self._shortest)
+
+
 class Lateness:
     """How much later than usual the packets of one camera arrive.
 
@@ -209,19 +253,16 @@ class Lateness:
     """
 
     def __init__(self) -> None:
-        self._clock = MediaClock(1 / RTP_HZ)
-        self._began, self._before, self._shortest = -inf, inf, inf
+        self._clock, self._usual = MediaClock(1 / RTP_HZ), ShortestTransit()
 
     def of(self, stamp: int, arrived: float) -> float:
         """How late a packet is, s, given its RTP timestamp and its arrival, s; never negative."""
         self._clock.tick(stamp)
         transit = arrived - self._clock.seconds
-        if arrived - self._began > WINDOW_S:
-            self._began, self._before, self._shortest = arrived, self._shortest, inf
-        self._shortest = min(self._shortest, transit)
-        late = transit - min(self._before, self._shortest)
+        self._usual.add(transit, arrived)
+        late = transit - self._usual.seconds
         if late > RESTART_S:
-            self._before = self._shortest = transit
+            self._usual.restart(transit)
             return 0.0
         return late
 
@@ -237,6 +278,11 @@ class MediaClock:
         return self._ticks * self._tick_s
 
     def tick(self, counter: int) -> None:
-        ahead = (counter - self._last) & 0xFFFFFFFF
-        self._ticks += ahead - (ahead >> 31 << 32)  # the shorter of both directions
+        self._ticks += signed(counter - self._last)
         self._last = counter
+
+
+def signed(ticks: int) -> int:
+    """The difference of two 32-bit counters that wrap around, by the shorter of both directions."""
+    ticks &= 0xFFFFFFFF
+    return ticks - (ticks >> 31 << 32)
