@@ -5,6 +5,7 @@ from __future__ import annotations
 import ipaddress
 import socket
 import struct
+from contextlib import ExitStack
 
 import pytest
 
@@ -50,6 +51,21 @@ def test_only_one_sender_is_received_and_the_others_are_counted(family, everywhe
         assert senders.dropped() == 5
         senders.close()
         assert senders.dropped() == 5
+
+
+def test_the_senders_may_change_and_be_several():
+    with ExitStack() as stack:
+        ours, *senders = (stack.enter_context(bound(socket.AF_INET, f"127.0.0.{number}")) for number in (1, 2, 3, 4))
+        there = ("127.0.0.1", ours.getsockname()[1])
+        admitted = SenderFilter("127.0.0.2", "127.0.0.3")
+        admitted.attach(ours.fileno())
+        for number, hosts in enumerate((("127.0.0.2", "127.0.0.3"), ("127.0.0.3", "127.0.0.4"), ("127.0.0.4",))):
+            admitted.admit(*hosts)
+            for name, sender in zip("abc", senders, strict=True):
+                sender.sendto(f"{name}{number}".encode(), there)
+        assert waiting(ours) == [b"a0", b"b0", b"b1", b"c1", b"c2"]
+        assert admitted.dropped() == 4
+        admitted.close()
 
 
 def test_packets_of_the_vehicle_dropped_at_a_full_buffer_are_not_counted():

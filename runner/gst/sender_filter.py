@@ -1,4 +1,4 @@
-"""UDP sockets that accept packets from one sender only: a kernel filter, which also counts the packets it drops.
+"""UDP sockets that accept packets from the vehicle only: a kernel filter, which also counts the packets it drops.
 
 An RTSP client binds its RTP and RTCP sockets to all addresses, so any host that reaches the machine could inject
 packets. No Python runs per packet.
@@ -32,13 +32,12 @@ Instruction = tuple[int, int, int, int]  # code, jump if true, jump if false, op
 class SenderFilter:
     """The filter on all sockets of one client, for the client's lifetime.
 
-    host    the only accepted sender, name or address
-    raises  OSError if the name cannot be resolved
+    hosts   the only accepted senders, names or addresses
+    raises  OSError if a name cannot be resolved
     """
 
-    def __init__(self, host: str) -> None:
-        found = {str(entry[4][0]).partition("%")[0] for entry in socket.getaddrinfo(host, None)}
-        self._program = program(sorted(map(ipaddress.ip_address, found), key=str))
+    def __init__(self, *hosts: str) -> None:
+        self._program = _program_for(hosts)
         self._sockets: dict[int, socket.socket] = {}  # by inode: duplicates, which outlive an element's own
         self._dropped = self._seen = 0
         self._overflows, self._checked = _overflows(), time.monotonic()
@@ -57,6 +56,15 @@ class SenderFilter:
         for _ in range(MAX_WAITING):
             if not _discard_packet(duplicate):
                 break
+
+    def admit(self, *hosts: str) -> None:
+        """Accept these senders and no others from now on.
+
+        raises  OSError
+        """
+        self._program = _program_for(hosts)
+        for sock in tuple(self._sockets.values()):
+            _attach(sock, self._program)
 
     def dropped(self) -> int:
         """Packets from other senders dropped so far; to be called a few times a second.
@@ -80,6 +88,11 @@ class SenderFilter:
             sock.close()
         self._sockets.clear()
         self._seen = 0
+
+
+def _program_for(hosts: Iterable[str]) -> list[Instruction]:
+    found = {str(entry[4][0]).partition("%")[0] for host in hosts for entry in socket.getaddrinfo(host, None)}
+    return program(sorted(map(ipaddress.ip_address, found), key=str))
 
 
 def program(senders: Iterable[IpAddress]) -> list[Instruction]:
