@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
@@ -48,9 +48,9 @@ from runner.gst.supervised import CameraCaller
 from runner.gst.timers import Guarded, every
 from runner.gst.video_files import VideoFile, VideoFiles
 from runner.gst.watched import WatchedSource
-from runner.records.reception import Arrivals, SentFrame
+from runner.records.reception import Arrivals, SentFrame, UplinkReceived, UplinkSent
 from runner.records.vehicle import CameraReading, SenderStages
-from runner.settings import Media
+from runner.settings import Media, Uplink
 
 if TYPE_CHECKING:
     from runner.gst.clip_writer import write_clip
@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from runner.gst.lanes import run_lanes
     from runner.gst.parameter_sets import parameter_set_notes
     from runner.gst.pictures import decode_video
+    from runner.gst.received_uplinks import Addresses
     from runner.gst.secure import StreamLogin
     from runner.gst.sequence import discover
     from runner.gst.video_reader import Unit, read_video
@@ -151,6 +152,7 @@ class VehicleSide:
     video      where to store the sent streams; None: nowhere
     keyring    of this vehicle: viewers authenticate, and everything is encrypted; None: neither
     lost       by camera whose source does not open, why: it is tried again, and started once it does
+    uplinks    by name, see `runner.gst.uplinks`; none: the system's routes decide
     raises     RunError if the port is in use, or a plugin that `video` needs is not installed
 
     `on_turned` is called, from any thread, after knobs were set and read back: `applied` may have changed.
@@ -164,8 +166,10 @@ class VehicleSide:
         video: VideoFiles | None = None,
         keyring: Keyring | None = None,
         lost: Mapping[str, str] = NOTHING,
+        uplinks: Mapping[str, Uplink] = NOTHING,
     ) -> None:
         self._on_report, self._video = on_report, video
+        self._uplinks = import_module("runner.gst.uplinks").VehicleUplinks(uplinks, on_report) if uplinks else None
         passphrase = keyring.watched_passphrase(lambda what: on_report("keys", what)).get if keyring else None
         plans = _with_clip_range(_with_video(plans, video, "vehicle"))
         self._lock = threading.Lock()
@@ -176,9 +180,11 @@ class VehicleSide:
         self._glib = GlibThread()
         self._server: CameraServer | None = None
         self._lost = LostCameras(plans, lost, source_problem, self._on_found)
-        openings = Openings(self._build, self._lost, on_report, self._refusal)
+        openings = Openings(self._build, self._lost, on_report, self._refusal, self._uplinks)
         self._callers = {p.camera.name: CameraCaller(p, openings, passphrase) for p in plans if not p.serves}
         self._looks = [self._guarded_look(plan.camera.name) for plan in plans]
+        if self._uplinks:
+            self._looks.append(Guarded(self._uplinks.look, lambda what: on_report("uplinks", what)))
         served = [plan for plan in plans if plan.serves]
 
         def start() -> None:
@@ -207,6 +213,15 @@ class VehicleSide:
             pipeline = self._pipeline(name)
             if pipeline:
                 pipeline.turn(values)
+
+    def carry(self, placed: Mapping[str, Collection[str]]) -> None:
+        """Set which uplinks carry these cameras; all do until then. Returns immediately."""
+        if self._uplinks:
+            self._uplinks.carry(placed)
+
+    def sent(self) -> dict[str, dict[str, UplinkSent]]:
+        """By camera and uplink, what was sent, see `runner.gst.uplinks`."""
+        return self._uplinks.counts() if self._uplinks else {}
 
     def give_control(self, operator: str) -> None:
         """Set which operator is in control, "" for none: its viewers are always admitted, see `runner.gst.viewers`."""
@@ -298,6 +313,7 @@ class VehicleSide:
             self._on_knobs_turned,
             report,
             source,
+            self._uplinks.of(name) if self._uplinks and plan.serves else None,
         )
 
     def _prepare(self, pipeline: Gst.Bin, plan: Plan, report: Callable[[str], None]) -> None:
@@ -353,6 +369,7 @@ class OperatorSide:
     operator    id of the operator on the control link, which the vehicle admits first; "" for another viewer
     keyring     of this operator; None: no authentication
     vehicle     its name, which its certificate must state
+    uplinks     addresses of the vehicle by uplink, as far as known; None: it has one way
     raises      RunError if a plugin that `video` needs is not installed
     """
 
@@ -367,6 +384,7 @@ class OperatorSide:
         operator: str = "",
         keyring: Keyring | None = None,
         vehicle: str = "",
+        uplinks: Addresses | None = None,
     ) -> None:
         plans = _with_video(plans, video, "operator")
         self._glib = GlibThread()
@@ -381,7 +399,7 @@ class OperatorSide:
             return StreamLogin(keyring, vehicle, lambda what: reports("keys", what))
 
         self._receivers = {
-            plan.camera.name: Receiver(plan, reports, on_unit, on_picture, arrivals, video, operator, login())
+            plan.camera.name: Receiver(plan, reports, on_unit, on_picture, arrivals, video, operator, login(), uplinks)
             for plan in plans
         }
 
@@ -402,6 +420,15 @@ class OperatorSide:
         return self._glib.call(
             "reading the receivers' counters", lambda: {n: r.sample(sending.get(n)) for n, r in receivers.items()}
         )
+
+    def admit(self, uplinks: Addresses) -> None:
+        """Receive from these addresses of the vehicle, by uplink, and from no others. From any thread."""
+        for receiver in self._receivers.values():
+            receiver.admit(uplinks)
+
+    def received(self) -> dict[str, dict[str, UplinkReceived]]:
+        """By camera and uplink, what was received since the camera's pipeline was built; none without uplinks."""
+        return {name: each.rtp.uplinks.counts() for name, each in self._receivers.items() if each.rtp.uplinks}
 
     def _request_tails(self) -> None:
         for receiver in self._receivers.values():

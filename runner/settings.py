@@ -46,6 +46,22 @@ class Media(Endpoint):
 
 
 @dataclass(frozen=True, slots=True)
+class Uplink:
+    """A way from the vehicle to its operators: all that leaves by one network device, or from one address.
+
+    interface  name of the device, such as wwan0
+    address    of the device, where routes decide by it which device a packet leaves by
+    """
+
+    interface: str | None = None
+    address: str | None = None
+
+    def __post_init__(self) -> None:
+        if not (self.interface or self.address):
+            raise ModelError("interface", None, "an uplink needs an interface or an address")
+
+
+@dataclass(frozen=True, slots=True)
 class PageSettings:
     """The operator's page.
 

@@ -116,6 +116,8 @@ def on_element(pipeline: Gst.Bin, parent: Gst.Bin, element: Gst.Element, built: 
         camera.requests.add_store(element)
     if camera and factory == "rtpsession":
         camera.requests.add_session(element)
+    if camera and camera.uplinks and factory == "multiudpsink":
+        camera.uplinks.take_over(element)
     if element.find_property("processing-deadline"):
         # Sinks of a live pipeline hold packets until their time: pure latency, and retransmissions wait behind them.
         # For viewers over TCP the library turns this on again with each PLAY.

@@ -26,7 +26,8 @@ LEAST_BUFFER_BYTES = 16_384
 class RtspConnection:
     """One client of the RTSP server, seen through its TCP connection.
 
-    silent_s     how long the peer may be silent before the kernel probes it
+    silent_s     how long the peer may be silent before the kernel probes it; None: it does not. The way of this
+                 connection may be cut while the video comes by another one, whose session ends when RTCP is missing
 
     viewer       its address and its operator
     cameras      those it watches, with the library's transport once it is set up
@@ -41,13 +42,12 @@ class RtspConnection:
     certificate  of its peer, from its first request on, over TLS
     """
 
-    def __init__(self, client: GstRtspServer.RTSPClient, silent_s: int) -> None:
+    def __init__(self, client: GstRtspServer.RTSPClient, silent_s: int | None) -> None:
         connection = client.get_connection()
         # Our own descriptor: the library closes its own from another thread, and the number is then reused.
         self._socket = socket.socket(fileno=os.dup(connection.get_write_socket().get_fd()))
-        for option, value in (("KEEPIDLE", silent_s), ("KEEPINTVL", KEEPALIVE_S), ("KEEPCNT", KEEPALIVES)):
-            self._socket.setsockopt(socket.IPPROTO_TCP, getattr(socket, f"TCP_{option}"), value)
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        if silent_s is not None:
+            self._probe_after(silent_s)
         self.peer = self._socket.getpeername()[:2]
         self.refusal, self.closed = "", False
         self.certificate: Gio.TlsCertificate | None = None
@@ -62,6 +62,11 @@ class RtspConnection:
 
     def __str__(self) -> str:
         return f"{self.viewer.address} ({self.viewer.operator})" if self.viewer.operator else self.viewer.address
+
+    def _probe_after(self, silent_s: int) -> None:
+        for option, value in (("KEEPIDLE", silent_s), ("KEEPINTVL", KEEPALIVE_S), ("KEEPCNT", KEEPALIVES)):
+            self._socket.setsockopt(socket.IPPROTO_TCP, getattr(socket, f"TCP_{option}"), value)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
 
     def unused_s(self, now: float) -> float:
         """How long it has waited for a first request, s; 0 afterwards. Over TLS it may be in the handshake."""

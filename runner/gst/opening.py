@@ -23,6 +23,7 @@ from runner.settings import Media
 
 if TYPE_CHECKING:
     from runner.gst.patient_media import PatientMedia
+    from runner.gst.uplinks import CameraUplinks
 
 OPEN_S = 0.9  # a request for a camera that delivers nothing within this is answered 503; the camera continues to open
 OPENING_S = 0.02  # between two looks whether an IP camera has answered
@@ -92,7 +93,7 @@ class ServedCameras:
         clients: Clients,
         stopped: threading.Event,
     ) -> None:
-        self._build, self._lost, self._on_report, self._refusal = openings
+        self._build, self._lost, self._on_report, self._refusal, _ = openings
         self._clients, self._changed, self._stopped = clients, clients.changed, stopped  # notified of a new stage, too
         self.threads = GstRtspServer.RTSPThreadPool()
         self.threads.set_max_threads(-1)  # one per client
@@ -119,6 +120,8 @@ class ServedCameras:
         bus.enable_sync_message_emission()  # the library watches the bus itself and reports nothing
         bus.connect("sync-message::error", self._on_error, camera)
         built = self._build(element, camera.plan)
+        if built.uplinks:
+            bus.connect("sync-message::warning", _on_warning, weakref.ref(built.uplinks))
         pipeline.connect("deep-element-added", on_element, weakref.ref(built))
         with self._changed:
             camera.media, camera.bus, camera.stage, camera.prepared = media, bus, _Stage.BUILT, False
@@ -154,6 +157,8 @@ class ServedCameras:
                 del self.pipelines[camera.name]
                 camera.stage = _Stage.NONE
                 self._changed.notify_all()
+        if pipeline.uplinks:
+            pipeline.uplinks.end()
         self._on_report(camera.name, "pipeline stopped")
 
     def _on_error(self, bus: Gst.Bus, message: Gst.Message, camera: ServedCamera) -> None:
@@ -277,6 +282,11 @@ class ServedCameras:
         if opened:
             self._on_prepared(media, camera)
         return opened
+
+
+def _on_warning(_bus: Gst.Bus, message: Gst.Message, uplinks: weakref.ref[CameraUplinks]) -> None:
+    if own := uplinks():
+        own.note_error(message.src)
 
 
 def _on_media_error(media: GstRtspServer.RTSPMedia, message: Gst.Message, camera: ServedCamera) -> bool:

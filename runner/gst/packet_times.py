@@ -9,6 +9,9 @@ from gi.repository import Gst
 
 SO_TIMESTAMPNS = 35  # asm-generic/socket.h
 REALTIME = 1  # GstSocketTimestampMode, GStreamer 1.20
+# A packet waits for less than the first in the kernel; one that seems to have waited longer, or to arrive in the future
+# by more than the second, has another clock's time.
+UNREAD_S, FUTURE_S = 2.0, 0.1
 
 
 def state_arrivals(source: Gst.Element) -> bool:
@@ -25,3 +28,9 @@ def state_arrivals(source: Gst.Element) -> bool:
         duplicate.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
     source.set_property("socket-timestamp", REALTIME)
     return True
+
+
+def received_at(dts: int, base_time: int, now: float) -> float | None:
+    """When the kernel received a packet, s, by DTS and base time of its element, ns; None if that cannot be right."""
+    arrived = (base_time + dts) / Gst.SECOND  # a pipeline's clock is the monotonic one
+    return min(arrived, now) if now - UNREAD_S < arrived < now + FUTURE_S else None

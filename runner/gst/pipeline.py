@@ -28,6 +28,7 @@ from runner.records.vehicle import NOTHING_ENCODED, EncoderCounts, SenderStages
 
 if TYPE_CHECKING:
     from runner.gst.pushed import PushedPictures
+    from runner.gst.uplinks import CameraUplinks, VehicleUplinks
     from runner.ros.cameras import SharedPicture
 
 OnReport = Callable[[str, str], None]  # camera, what happened to it
@@ -52,12 +53,14 @@ class Openings(NamedTuple):
     lost       those that do not open: each is opened again when that is due
     on_report  called when pipelines start, stop or fail, and when viewers are disconnected
     refusal    returns why a camera must not be opened now; None: it may
+    uplinks    of the vehicle; None: the system's routes decide by which way streams leave it
     """
 
     build: Callable[[Gst.Bin, Plan], CameraPipeline]
     lost: LostCameras
     on_report: OnReport
     refusal: Callable[[str], str | None]
+    uplinks: VehicleUplinks | None = None
 
 
 class CameraPipeline:
@@ -69,6 +72,7 @@ class CameraPipeline:
     source     the source, if it is watched
 
     untimed      whether the source does not know when the last picture was captured
+    uplinks      None: the system's routes decide
     requests     limits what viewers request
     sent_frames  when frames left; None without RTP
     """
@@ -81,8 +85,9 @@ class CameraPipeline:
         on_turned: Callable[[], None],
         on_report: Callable[[str], None],
         source: WatchedSource | None = None,
+        uplinks: CameraUplinks | None = None,
     ) -> None:
-        self._pipeline, self._plan, self._source = pipeline, plan, source
+        self._pipeline, self._plan, self._source, self.uplinks = pipeline, plan, source, uplinks
         self._wanted, self._first = wanted, wanted()
         self.untimed = False
         self.knobs = KnobPanel(pipeline, plan.camera, on_turned, on_report)

@@ -111,6 +111,11 @@ class PassingBuffer:
         meta = _get_reference(self._address, None)
         return (int(meta.contents.timestamp) or None) if meta else None
 
+    @property
+    def address(self) -> int:
+        """Of the GstBuffer."""
+        return self._address
+
     def extract(self, offset: int, count: int) -> bytes:
         """Up to `count` bytes from an offset."""
         data = ctypes.create_string_buffer(count)
@@ -167,6 +172,25 @@ class BufferProbe(_Probe):
             return Gst.PadProbeReturn.OK
         self.armed = False
         return Gst.PadProbeReturn.REMOVE
+
+
+class PassProbe(_Probe):
+    """Asks a method of its owner, which it does not keep alive, whether a buffer passes a pad; all do without it.
+
+    passes  called in the streaming thread with the pad and each buffer
+    """
+
+    def __init__(self, pad: Gst.Pad, passes: Callable[[Gst.Pad, PassingBuffer], bool]) -> None:
+        super().__init__(Gst.PadProbeType.BUFFER)
+        self._pad, self._passes = pad, WeakMethod(passes)
+        self.add_to(pad)
+
+    def handle(self, address: int | None) -> Gst.PadProbeReturn:
+        passes = self._passes()
+        assert address
+        if passes is None:
+            return Gst.PadProbeReturn.REMOVE
+        return Gst.PadProbeReturn.OK if passes(self._pad, PassingBuffer(address)) else Gst.PadProbeReturn.DROP
 
 
 class IdleProbe(_Probe):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -29,6 +30,7 @@ from runner.system.held_up import LateCheck
 from runner.system.recent import RecentValue
 
 if TYPE_CHECKING:
+    from runner.gst.received_uplinks import Addresses, ReceivedUplinks
     from runner.gst.secure import StreamLogin
 
 STALL_S = 2.0  # a camera that should send but neither sends nor answers for longer is rebuilt
@@ -94,6 +96,7 @@ class Receiver:
     video       where to store the received stream; the plan must have `video`
     operator    id of the operator on the control link, which the vehicle admits first; "" for another viewer
     login       credentials for the vehicle; None: the vehicle does not authenticate
+    uplinks     addresses of the vehicle by uplink, as far as known; None: it has one way
     """
 
     def __init__(
@@ -106,6 +109,7 @@ class Receiver:
         video: VideoFiles | None = None,
         operator: str = "",
         login: StreamLogin | None = None,
+        uplinks: Addresses | None = None,
     ) -> None:
         self._on_report, self._video, self._operator, self._login = on_report, video, operator, login
         self._client_name, self._sink_name = plan.operator[0].name, plan.operator[-1].name
@@ -115,7 +119,8 @@ class Receiver:
         self.newest: Arrival | None = None  # access unit, complete or not, that has left the jitter buffer
         self._on_unit, self._on_picture = on_unit, on_picture
         self._name = name = plan.camera.name
-        self.rtp = RtpSession(plan.camera.graph.settings, lambda what: on_report(name, what))
+        received = None if uplinks is None else _received_uplinks(uplinks, has_keys=login is not None)
+        self.rtp = RtpSession(plan.camera.graph.settings, lambda what: on_report(name, what), received)
         self._codec = video_codec(plan.camera.graph)
         self._damage, self._damaged = Damage(self._codec), 0
         self._frames = self._bytes = 0
@@ -211,6 +216,8 @@ class Receiver:
         if self._login and (problem := self._login.prepare(pipeline, self._client)):
             self._on_report(self._name, problem)
         if is_rtsp_client(self._client):
+            if self.rtp.uplinks:
+                self.rtp.uplinks.direct(self._client)
             self.rtp.follow(self._client)
             handle_stream_end(self._client, self._on_source_gone)
             limit_teardown(pipeline)
@@ -253,10 +260,19 @@ class Receiver:
             return
         try:
             if self._filter is None:
-                self._filter = SenderFilter(Gst.Uri.from_string(self._client.get_property("location")).get_host())
+                host = Gst.Uri.from_string(self._client.get_property("location")).get_host()
+                self._filter = SenderFilter(*((self.rtp.uplinks and self.rtp.uplinks.hosts) or [host]))
             self._filter.attach(used_socket.get_fd())
         except OSError as error:
             self._on_report(self._name, f"packets from hosts other than the vehicle are not dropped: {error}")
+
+    def admit(self, addresses: Addresses) -> None:
+        """The addresses of the vehicle's uplinks are these from now on; none: they are unknown. From any thread."""
+        if self.rtp.uplinks:
+            self.rtp.uplinks.admit(addresses)
+            if (current := self._filter) and (hosts := self.rtp.uplinks.hosts):
+                with suppress(OSError):  # it has just been closed
+                    current.admit(*hosts)
 
     def _close_filter(self) -> None:
         if self._filter:
@@ -326,6 +342,12 @@ class Receiver:
         data = buffer.extract_dup(0, buffer.get_size())  # a copy: the decoder reuses its memory
         self._on_picture(self._name, capture_time(buffer), width, height, data)  # type: ignore[misc]
         return Gst.FlowReturn.OK
+
+
+def _received_uplinks(addresses: Addresses, *, has_keys: bool) -> ReceivedUplinks:
+    from runner.gst.received_uplinks import ReceivedUplinks
+
+    return ReceivedUplinks(addresses, has_keys=has_keys)
 
 
 def _captured(_pad: Gst.Pad, unit: PassingBuffer) -> float | None:

@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from itertools import chain
+from typing import TYPE_CHECKING
 
 from gi.repository import GObject, Gst, GstRtsp, GstSdp
 
 from runner.core.model import GraphSettings
 from runner.gst.arriving import HEADER_BYTES, ArrivingFrames, Lateness, Packet, read_packet
-from runner.gst.packet_times import state_arrivals
+from runner.gst.packet_times import received_at, state_arrivals
 from runner.gst.probes import BufferProbe, PassingBuffer
 from runner.records.reception import Arrival, ArrivedPacket
 from runner.system.recent import RecentValue
 
+if TYPE_CHECKING:
+    from runner.gst.merge import Merge
+    from runner.gst.received_uplinks import ReceivedUplinks
+
 REORDER_MS = 5  # a packet that is missing for longer was lost, not reordered
+MOST_OTHERS_MS, STEP_MS = 100, 10  # how long a request waits for slower uplinks, in steps
+AUTOMATIC = -1  # of the buffer's properties
 ATTEMPTS = 3  # retransmissions that the buffer waits for
 # Retransmission stops above the first share of missing packets and resumes below the second: a link that drops so many
 # is congested, and retransmissions would make it worse.
@@ -25,9 +33,6 @@ DECAY = 0.75  # of both counts, from one update to the next
 INITIAL_RTT_MS = 100  # round trip assumed until the first retransmission
 LONGEST_MS = 300  # a picture that is later is useless for driving
 RETRANSMITTED = Gst.BufferFlags.LAST  # GST_RTP_BUFFER_FLAG_RETRANSMISSION, which has the same value
-# A packet waits for less than the first in the kernel; one that seems to have waited longer, or to arrive in the future
-# by more than the second, has another clock's time.
-UNREAD_S, FUTURE_S = 2.0, 0.1
 FRAMES = 64  # whose end is remembered
 OVER_TCP = "over TCP, since UDP was refused: are the vehicle's media.rtp_ports in use?"
 
@@ -45,10 +50,14 @@ class RepairBuffer:
 
     reorder_ms    minimum wait
     kernel_times  whether the DTS of packets state when the kernel received them, see `runner.gst.packet_times`
+    merge         of the uplinks by which packets come; None: they come one way
     """
 
-    def __init__(self, buffer: Gst.Element, reorder_ms: int, *, kernel_times: bool) -> None:
+    def __init__(self, buffer: Gst.Element, reorder_ms: int, *, kernel_times: bool, merge: Merge | None = None) -> None:
         self._buffer, self._reorder_ms, self._kernel_times = buffer, reorder_ms, kernel_times
+        self._merge, self._others_ms = merge, 0  # so long a packet may still come by another uplink
+        if merge:
+            buffer.set_property("rtx-delay-reorder", 0)  # packets of a faster uplink say nothing of a slower one's
         # Frames arrive in bursts: the next expected packet belongs to the next frame and is not missing.
         buffer.set_property("rtx-next-seqnum", False)
         buffer.set_property("rtx-delay", REORDER_MS)
@@ -69,13 +78,17 @@ class RepairBuffer:
     def lost(self) -> int:
         """Packets that were never recovered."""
         lost: int = self._buffer.get_property("stats").get_value("num-lost")
-        return lost
+        # The buffer counts those, too, that come by a slower uplink after it has given them up, and before their turn.
+        return min(lost, self.frames.missing) if self._merge else lost
 
     def adapt(self) -> int:
         """Adapt the wait for missing packets to the round trip; returns it, ms. A few times a second."""
         round_trip_ms = self._buffer.get_property("stats").get_value("rtx-rtt") / Gst.MSECOND or INITIAL_RTT_MS
         self._update_congestion()
-        wait_ms = self._reorder_ms + (0 if self._congested else round(ATTEMPTS * round_trip_ms))
+        if self._merge:
+            self._merge.look(time.monotonic())
+            self._await_others(self._merge)
+        wait_ms = self._reorder_ms + max(self._others_ms, 0 if self._congested else round(ATTEMPTS * round_trip_ms))
         wait_ms = max(self._reorder_ms, min(LONGEST_MS, wait_ms))
         if self._buffer.get_property("latency") != wait_ms:
             self._buffer.set_property("latency", wait_ms)
@@ -111,12 +124,21 @@ class RepairBuffer:
 
     def request_tail(self) -> None:
         """Request the next packet if a frame is overdue; to be called a hundred times a second."""
-        if self._tail_requested or self._congested or not self.frames.is_late(time.monotonic()):
+        others_s = min(MOST_OTHERS_MS, self._others_ms) / 1000
+        if self._tail_requested or self._congested or not self.frames.is_late(time.monotonic() - others_s):
             return
         self._tail_requested = True
         request = Gst.Structure.new_empty("GstRTPRetransmissionRequest")
         request.set_value("seqnum", GObject.Value(GObject.TYPE_UINT, self.frames.next_number()))
         self._pad.push_event(Gst.Event.new_custom(Gst.EventType.CUSTOM_UPSTREAM, request))
+
+    def _await_others(self, merge: Merge) -> None:
+        """Request nothing that may still come by a slower uplink."""
+        others_ms = STEP_MS * math.ceil(1000 * merge.difference_s / STEP_MS)
+        if others_ms != self._others_ms:
+            self._others_ms = others_ms
+            self._buffer.set_property("rtx-delay", REORDER_MS + min(MOST_OTHERS_MS, others_ms))
+            self._buffer.set_property("rtx-min-retry-timeout", others_ms or AUTOMATIC)
 
     def _arrived(self, buffer: PassingBuffer, now: float) -> float | None:
         """When the kernel received a packet, s; None: unknown.
@@ -126,12 +148,11 @@ class RepairBuffer:
         dts = buffer.dts
         if dts is None or not self._kernel_times:
             return None
-        base_time = self._buffer.get_base_time()  # a pipeline's clock is the monotonic one
-        arrived: float = (base_time + dts) / Gst.SECOND
-        if now - UNREAD_S < arrived < now + FUTURE_S:
-            return min(arrived, now)
-        buffer.dts = max(0, round(now * Gst.SECOND) - base_time)
-        return None
+        base_time = self._buffer.get_base_time()
+        arrived = received_at(dts, base_time, now)
+        if arrived is None:
+            buffer.dts = max(0, round(now * Gst.SECOND) - base_time)
+        return arrived
 
     def _limit_lateness(self, packet: Packet, buffer: PassingBuffer) -> None:
         if (dts := buffer.dts) is None:
@@ -149,6 +170,9 @@ class RepairBuffer:
             self._limit_lateness(packet, buffer)
         if not self.frames.add(packet, now, arrived, retransmitted=retransmitted):
             return False
+        if self._merge:
+            self._merge.note_passed(packet.stamp, now)
+            self._await_others(self._merge)
         if self._tail_requested and retransmitted:
             buffer.unset_flags(RETRANSMITTED)  # the buffer drops retransmissions that it has not requested itself
         if packet.last:
@@ -161,10 +185,14 @@ class RtpSession:
     """The session of a receiver, with the jitter buffers of its current pipeline.
 
     Where the vehicle grants feedback over UDP, they repair: otherwise they reorder at most.
+
+    uplinks  by which packets come; None: they come one way
     """
 
-    def __init__(self, graph: GraphSettings, on_report: Callable[[str], None]) -> None:
-        self._graph, self._on_report = graph, on_report
+    def __init__(
+        self, graph: GraphSettings, on_report: Callable[[str], None], uplinks: ReceivedUplinks | None = None
+    ) -> None:
+        self._graph, self._on_report, self.uplinks = graph, on_report, uplinks
         self._counted = (0, 0)  # packets received and missing, as last read
         self.begin()
 
@@ -174,6 +202,8 @@ class RtpSession:
         self._over_udp = self._feedback = False  # transport and profile
         self._kernel_times = False  # whether packets state when the kernel received them
         self._may_use_udp = False  # until it is known whether it does
+        if self.uplinks:
+            self.uplinks.begin()
 
     def follow(self, client: Gst.Element) -> None:
         """Note what an RTSP client and the vehicle agree on."""
@@ -185,13 +215,16 @@ class RtpSession:
         factory = element.get_factory().get_name() if element.get_factory() else ""
         if factory == "rtpjitterbuffer":
             reorder_ms = self._graph.jitter_buffer_ms
-            self._buffers.append(RepairBuffer(element, reorder_ms, kernel_times=self._kernel_times))
+            merge = self.uplinks.merge if self.uplinks else None
+            self._buffers.append(RepairBuffer(element, reorder_ms, kernel_times=self._kernel_times, merge=merge))
         if factory == "udpsrc":
             self._over_udp = True
             try:
                 self._kernel_times = state_arrivals(element)
             except OSError as error:
                 self._on_report(f"the kernel does not state when packets arrive: {error}")
+        if self.uplinks:
+            self.uplinks.add(factory, element, kernel_times=self._kernel_times)
 
     @property
     def lost(self) -> int:
@@ -200,6 +233,8 @@ class RtpSession:
 
     def adapt(self) -> int | None:
         """Adapt the wait for missing packets; returns it, ms, or None without repair. A few times a second."""
+        if self.uplinks:
+            self.uplinks.look()
         return max((buffer.adapt() for buffer in self._repairing()), default=None)
 
     def waited_ms(self) -> float | None:
@@ -241,3 +276,5 @@ class RtpSession:
         """Note whether the vehicle grants the profile with feedback."""
         media = range(sdp.medias_len())
         self._feedback = any(sdp.get_media(number).get_proto().endswith("AVPF") for number in media)
+        if self.uplinks and media:
+            self.uplinks.merge.payload_type = int(sdp.get_media(0).get_format(0))

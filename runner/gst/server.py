@@ -72,6 +72,7 @@ class CameraServer:
             self._keys = ViewerCheck(keyring, lambda what: on_report("keys", what), self._on_refused)
         self._report_refusal = LimitedReports(lambda what: on_report("keys", what))
         self._media, self._on_report = media, on_report
+        self._silent_s = None if openings.uplinks else media.session_timeout_s
         self._stopped = threading.Event()
         self._clients = Clients(on_report)
         self._changed = self._clients.changed
@@ -116,7 +117,7 @@ class CameraServer:
 
     def _on_connected(self, _server: object, client: GstRtspServer.RTSPClient) -> None:
         with suppress(OSError):  # it has already disconnected, or no descriptor is left: SETUP will be refused
-            connection = RtspConnection(client, self._media.session_timeout_s)
+            connection = RtspConnection(client, self._silent_s)
             connection.refusal = NO_CERTIFICATE if self._keys else ""
             self._clients.add(client, connection)
         client.connect("closed", self._on_closed)

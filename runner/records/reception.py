@@ -47,6 +47,36 @@ class SentFrame(NamedTuple):
     sent: float
 
 
+class UplinkSent(NamedTuple):
+    """RTP packets of a camera that an uplink was to send, to each viewer, and bytes that the system has taken.
+
+    errors  how often the system has refused to send some of them, or RTCP
+    """
+
+    packets: int = 0
+    bytes: int = 0
+    errors: int = 0
+
+    def plus(self, other: UplinkSent) -> UplinkSent:
+        return UplinkSent(self.packets + other.packets, self.bytes + other.bytes, self.errors + other.errors)
+
+
+class UplinkReceived(NamedTuple):
+    """RTP packets of a camera that have come by an uplink.
+
+    packets  all of them, also those that were requested again
+    lost     missing among them: what this uplink alone would have lost. A gap of more than 1 s is none: by then the
+             camera was carried by others alone, or nothing arrived
+    twins    came after their copies by other uplinks
+    late     came more than 1 s after newer ones, and were dropped
+    """
+
+    packets: int = 0
+    lost: int = 0
+    twins: int = 0
+    late: int = 0
+
+
 class Arrivals(NamedTuple):
     """What the operator's side has received since the last call.
 

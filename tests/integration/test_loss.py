@@ -172,14 +172,14 @@ def jitter_buffer():
 
 def test_an_outage_does_not_shift_the_time_base_of_the_jitter_buffer(monkeypatch):
     """By more than the longest wait: lost packets, and pictures behind them, are awaited longer by as much."""
-    from runner.gst import repair
+    from runner.gst import packet_times, repair
 
     transit_ms, outage_ms = 50, (3000, 5000)
     # The link then carries three times what is sent, so that the delay falls slowly.
     sent_ms = range(0, 9000, 20)
     arrivals_ms = [max(at, outage_ms[1] + (at - outage_ms[0]) / 3) if at >= outage_ms[0] else at for at in sent_ms]
     for limit in ("UNREAD_S", "FUTURE_S"):  # they are pushed at once
-        monkeypatch.setattr(repair, limit, float("inf"))
+        monkeypatch.setattr(packet_times, limit, float("inf"))
     with jitter_buffer() as (push, left):
         for number, (sent, arrived) in enumerate(zip(sent_ms, arrivals_ms, strict=True)):
             push(number, sent, arrived + transit_ms)

@@ -1,0 +1,126 @@
+"""Packets of one stream that come by several uplinks: each goes on once, and counts for the uplink that it came by.
+
+Before the RTP session: twins of equal delay would never get through it, others would be taken for losses and jitter.
+"""
+
+from __future__ import annotations
+
+from array import array
+from dataclasses import dataclass, field
+
+from runner.gst.arriving import NUMBERS, RTP_HZ, ArrivingFrames, MediaClock, Packet, ShortestTransit, signed
+from runner.records.reception import UplinkReceived
+
+# A packet that is later than the newest one by more than the first is of no use: the jitter buffer waits for less. One
+# that a way has held for long would make it start anew. Once nothing newer has come for the second, the stream has
+# started anew.
+LATE_S, RESTART_S = 1.0, 2.0
+PAUSE_S = 1.0  # of media time
+CURRENT_S = 1.0  # an uplink carries a stream this long after its last packet
+LOOK_S = 0.02  # between two looks at how far the uplinks differ
+MOST_STREAMS = 4  # whose numbers are remembered; a camera has two, that of repeated packets included
+
+
+@dataclass(slots=True)
+class _Uplink:
+    """What has come by one uplink.
+
+    at     when its last packet of the camera came, s
+    stamp  timestamp of the newest one
+    """
+
+    frames: ArrivingFrames = field(default_factory=ArrivingFrames)
+    transit: ShortestTransit = field(default_factory=ShortestTransit)
+    packets: int = 0
+    twins: int = 0
+    late: int = 0
+    at: float = 0.0
+    stamp: int = 0
+
+    def add(self, packet: Packet, now: float, arrived: float | None) -> None:
+        """Add a packet of the camera that was not requested again."""
+        ahead = signed(packet.stamp - self.stamp)
+        if ahead > PAUSE_S * RTP_HZ:
+            self.frames.resume()
+        if ahead > 0 or not self.at:
+            self.stamp = packet.stamp
+        self.at = now
+        self.frames.add(packet, now, arrived)
+
+
+class Merge:
+    """Decides which packets of a camera go on. The thread in which packets arrive uses it; any other one reads counts.
+
+    is_authentic  whether whoever sends a packet is the vehicle. If that is decided behind it, a forged packet must not
+                  replace the true one with its number: twins are only counted, and dropped there
+
+    payload_type  of the camera's packets; others are repeated on request. None: not known yet
+    difference_s  how much longer packets take by the slowest uplink that carries the stream than by the fastest one
+    """
+
+    def __init__(self, *, is_authentic: bool) -> None:
+        self._is_authentic = is_authentic
+        self.payload_type: int | None = None
+        self._uplinks: dict[str, _Uplink] = {}
+        self._seen: dict[int, array[int]] = {}  # by stream (SSRC), and by number, the timestamp of the last packet
+        self._clock = MediaClock(1 / RTP_HZ)
+        self._newest: tuple[int, float] | None = None  # timestamp, and when it came
+        self._looked = self.difference_s = 0.0
+
+    def passes(self, header: bytes, packet: Packet, uplink: str | None, now: float, arrived: float | None) -> bool:
+        """Count a packet; returns whether it goes on.
+
+        header   its first 12 bytes or more
+        uplink   None: unknown
+        arrived  when the kernel received it, s; None: unknown
+        """
+        is_late = self._is_late(packet, now)
+        is_twin = self._is_twin(int.from_bytes(header[8:12], "big"), packet)
+        if uplink is not None:
+            own = self._uplinks.get(uplink) or self._uplinks.setdefault(uplink, _Uplink())
+            own.packets += 1
+            own.twins, own.late = own.twins + is_twin, own.late + is_late
+            if header[1] & 0x7F == self.payload_type:
+                self._add(own, packet, now, arrived, is_late=is_late)
+        return not (is_late or (is_twin and self._is_authentic))
+
+    def _add(self, own: _Uplink, packet: Packet, now: float, arrived: float | None, *, is_late: bool) -> None:
+        is_new = now - own.at > CURRENT_S
+        own.add(packet, now, arrived)
+        if not is_late:
+            self._clock.tick(packet.stamp)
+            own.transit.add((arrived or now) - self._clock.seconds, now)
+        if is_new or now - self._looked > LOOK_S:
+            self.look(now)
+
+    def note_passed(self, stamp: int, now: float) -> None:
+        """A packet has passed, authentic and newer than all earlier ones."""
+        self._newest = stamp, now
+
+    def look(self, now: float) -> None:
+        """Find out how far the uplinks differ that carry the stream now."""
+        self._looked = now
+        transits = [each.transit.seconds for each in tuple(self._uplinks.values()) if now - each.at < CURRENT_S]
+        self.difference_s = max(transits) - min(transits) if len(transits) > 1 else 0.0
+
+    def counts(self) -> dict[str, UplinkReceived]:
+        return {
+            name: UplinkReceived(each.packets, each.frames.missing, each.twins, each.late)
+            for name, each in tuple(self._uplinks.items())
+        }
+
+    def _is_late(self, packet: Packet, now: float) -> bool:
+        if self._newest is None:
+            return False
+        stamp, at = self._newest
+        return signed(stamp - packet.stamp) > LATE_S * RTP_HZ and now - at < RESTART_S
+
+    def _is_twin(self, stream: int, packet: Packet) -> bool:
+        """Number and timestamp together name a packet, for hours."""
+        seen = self._seen.get(stream)
+        if seen is None:
+            if len(self._seen) == MOST_STREAMS:
+                del self._seen[next(iter(self._seen))]
+            seen = self._seen[stream] = array("q", [-1]) * NUMBERS
+        is_twin, seen[packet.number] = seen[packet.number] == packet.stamp, packet.stamp
+        return is_twin
