@@ -47,9 +47,9 @@ class Machine:
         self._holder = subprocess.Popen(children.bound(enter), stdout=subprocess.PIPE, text=True)
         assert self._holder.stdout
         assert self._holder.stdout.readline() == "\n"
-        pid = self._holder.pid
-        self.namespace = f"/proc/{pid}/ns/net"
-        self._enter = ("nsenter", f"--target={pid}", "--net", "--mount")
+        self.pid = self._holder.pid
+        self.namespace = f"/proc/{self.pid}/ns/net"
+        self._enter = ("nsenter", f"--target={self.pid}", "--net", "--mount")
         self.command = self.inside(CHECKOUT)
         self.run("ip link set dev lo up")
 

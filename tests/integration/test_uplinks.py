@@ -1,0 +1,312 @@
+"""One camera's stream over two uplinks: a vehicle and an operator in network namespaces, with two ways between them."""
+
+from __future__ import annotations
+
+import json
+import socket
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+from ways import ADDRESSES, OPERATOR, Way, Ways, two_ways
+
+from keyed import CONTROLLER, VEHICLE, issue
+from rig import free_port, needs_root, repeating, small_robot, until
+from runner.system import children
+
+CAMERA, FPS = "front", 30
+VIDEO, REPEATED = 96, 97  # payload types
+WRAPS_SOON = 65_536 - 700  # packets of a few seconds
+FAST_S, SLOW_S = 0.02, 0.2
+SAMPLES_S = 0.1
+
+
+class Vehicle:
+    """The vehicle's side in its namespace; see `vehicle_on_ways.py`."""
+
+    def __init__(self, ways: Ways, words: list[str]) -> None:
+        uplinks = {name: {"interface": way.device} for name, way in ways.named.items()}
+        given = json.dumps({"words": words, "uplinks": uplinks, "number": WRAPS_SOON})
+        script = Path(__file__).with_name("vehicle_on_ways.py")
+        self._process = subprocess.Popen(
+            [*ways.vehicle.command, sys.executable, str(script), given],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=children.environment(),
+        )
+        self._answer()
+
+    def _answer(self) -> Any:
+        assert self._process.stdout
+        return json.loads(self._process.stdout.readline())
+
+    def carry(self, *uplinks: str) -> Any:
+        return self._ask(carry={CAMERA: uplinks})
+
+    def _ask(self, **what: Any) -> Any:
+        assert self._process.stdin
+        print(json.dumps(what), file=self._process.stdin, flush=True)
+        return self._answer()
+
+    @property
+    def sent(self) -> dict[str, int]:
+        """Packets by uplink."""
+        return {name: each["packets"] for name, each in self._ask()["sent"][CAMERA].items()}
+
+    @property
+    def reported(self) -> list[str]:
+        return list(self._ask()["reported"])
+
+    def end(self) -> None:
+        assert self._process.stdin
+        self._process.stdin.close()
+        self._process.wait(20)
+
+
+class Operator:
+    """The operator's side.
+
+    units     capture time of each access unit, whether it is a key picture, and when it came
+    reported  what it reported
+    """
+
+    def __init__(self, words: list[str], host: str) -> None:
+        from runner.apply import OperatorSide, check_plan
+        from runner.configuration.config import configuration
+        from runner.plans import compile_plans
+        from runner.security.exposure import viewer_keyring
+
+        setup = configuration([*words, f"media.host={host}"], check=check_plan).setup()
+        self.units: list[tuple[float, bool, float]] = []
+        self.reported: list[str] = []
+        self.side = OperatorSide(
+            compile_plans(setup),
+            lambda camera, what: self.reported.append(f"{camera}: {what}"),
+            on_unit=self._on_unit,
+            keyring=viewer_keyring(setup),
+            vehicle=setup.vehicle.name,
+            uplinks={name: [address] for name, address in ADDRESSES.items()},
+        )
+
+    def _on_unit(self, _camera: str, unit: Any) -> None:
+        self.units.append((unit.captured, unit.key, time.monotonic()))
+
+    def sample(self) -> Any:
+        return self.side.sample({CAMERA: True})[CAMERA]
+
+    def watch(self, seconds: float) -> None:
+        """Until so many seconds of pictures have arrived."""
+        wanted = self.units[-1][0] + seconds
+        until(lambda: self.units[-1][0] > wanted)
+
+
+@contextmanager
+def drive(tmp_path: Path, keys: bool) -> Iterator[tuple[Ways, Vehicle, Operator]]:
+    port = free_port()
+    words = [*small_robot(CAMERA), "source=test", "media.host=0.0.0.0", f"media.port={port}", "page.serve=false"]
+    holders = [issue(tmp_path / "keys") / name for name in (VEHICLE, CONTROLLER)] if keys else []
+    own = [[f"keys={holder}"] for holder in holders] or [["insecure=true"]] * 2
+    with two_ways() as ways:
+        ways["a"].delay_s, ways["b"].delay_s = FAST_S, SLOW_S
+        vehicle = Vehicle(ways, [*words, *own[0]])
+        operator = Operator([*words, *own[1]], ADDRESSES["a"])
+        try:
+            with repeating(operator.sample, SAMPLES_S):
+                until(lambda: len(operator.units) > FPS)
+                yield ways, vehicle, operator
+        finally:
+            operator.side.stop()
+            vehicle.end()
+
+
+def check_every_picture(operator: Operator) -> None:
+    """Every picture has come, whole, and none was a key picture but the first."""
+    captured = [each for each, _, _ in operator.units]
+    gaps = [round(FPS * (new - old)) for old, new in pairwise(captured)]
+    sample = operator.sample()
+    assert (set(gaps), sample.damaged, sample.lost, operator.reported) == ({1}, 0, 0, [])
+    assert not any(key for _, key, _ in operator.units[1:])
+
+
+def with_and_without_keys(*, by_soak: bool) -> pytest.MarkDecorator:
+    """by_soak: with keys or without them, whichever `make soak` alone runs."""
+    kinds = ((False, "plain"), (True, "keys"))
+    marked = [pytest.param(keys, id=name, marks=[pytest.mark.soak] * (keys is by_soak)) for keys, name in kinds]
+    return pytest.mark.parametrize("keys", marked)
+
+
+@needs_root
+@with_and_without_keys(by_soak=False)
+def test_a_camera_changes_its_uplink_and_no_picture_is_lost(tmp_path: Path, keys: bool) -> None:
+    """In both directions, 180 ms slower and faster, while the sequence numbers wrap around."""
+    with drive(tmp_path, keys) as (ways, vehicle, operator):
+        for carried in ("a", "b", "a", "ab", "b"):
+            vehicle.carry(*carried)
+            before = {name: way.passed for name, way in ways.named.items()}
+            operator.watch(1.2)  # a shorter absence would count as a loss
+            used = {name for name, way in ways.named.items() if way.passed - before[name] > FPS}
+            assert used == set(carried)
+        check_every_picture(operator)
+        counted = operator.side.received()[CAMERA]
+        assert {name: each.lost for name, each in counted.items()} == {"a": 0, "b": 0}
+        assert counted["a"].twins == 0 < counted["b"].twins
+        assert sum(vehicle.sent.values()) > 65_536 - WRAPS_SOON
+
+
+@needs_root
+@with_and_without_keys(by_soak=True)
+def test_an_uplink_is_cut_and_a_camera_that_both_carry_loses_no_picture(tmp_path: Path, keys: bool) -> None:
+    with drive(tmp_path, keys) as (ways, _vehicle, operator):
+        for name in ("a", "b"):
+            ways[name].is_cut = True
+            operator.watch(1.5)
+            ways[name].is_cut = False
+            operator.watch(0.5)
+        check_every_picture(operator)
+
+
+@needs_root
+@with_and_without_keys(by_soak=False)
+def test_packets_that_an_uplink_has_held_change_nothing(tmp_path: Path, keys: bool) -> None:
+    with drive(tmp_path, keys) as (ways, _vehicle, operator):
+        for name in ("b", "a"):
+            ways[name].is_held = True
+            operator.watch(3)
+            ways[name].is_held = False
+            operator.watch(1)
+        check_every_picture(operator)
+        assert all(each.late > FPS for each in operator.side.received()[CAMERA].values())
+
+
+@pytest.mark.soak
+@needs_root
+@with_and_without_keys(by_soak=True)
+def test_long_faults_of_an_uplink(tmp_path: Path, keys: bool) -> None:
+    """The one by which the operator is connected is cut for longer than sessions and connections may be silent."""
+    with drive(tmp_path, keys) as (ways, vehicle, operator):
+        for seconds in (10, 40):
+            vehicle.carry("b")
+            ways["a"].is_cut = True
+            operator.watch(seconds)
+            ways["a"].is_cut = False
+            vehicle.carry("a", "b")
+            operator.watch(3)
+        for name in ("a", "b"):
+            ways[name].is_held = True
+            operator.watch(10)
+            ways[name].is_held = False
+            operator.watch(3)
+        check_every_picture(operator)
+        assert vehicle.reported == [f"{CAMERA}: pipeline built"]
+
+
+def datagram(way: Way, source: str, target: tuple[str, int], data: bytes) -> bytes:
+    """An IPv4 packet; UDP needs no checksum."""
+    addresses = socket.inet_aton(source) + socket.inet_aton(target[0])
+    head = struct.pack("!BBHHHBBH", 0x45, 0, 28 + len(data), 0, 0, 64, 17, 0) + addresses
+    total = sum(struct.unpack("!10H", head))
+    total = (total & 0xFFFF) + (total >> 16)
+    head = head[:10] + struct.pack("!H", 0xFFFF ^ ((total & 0xFFFF) + (total >> 16))) + head[12:]
+    return head + struct.pack("!HHHH", 16_000, target[1], 8 + len(data), 0) + data
+
+
+@needs_root
+@with_and_without_keys(by_soak=False)
+def test_packets_of_an_intruder_change_nothing(tmp_path: Path, keys: bool) -> None:
+    """Copies of the vehicle's packets that come before these, with its numbers and another content.
+
+    Without keys they come from an address that is not the vehicle's, with keys from one that is.
+    """
+    with drive(tmp_path, keys) as (ways, vehicle, operator):
+        vehicle.carry("b")
+        sender, forged = ADDRESSES["b"] if keys else "10.78.3.2", [0]
+
+        def forge(packet: bytes) -> bool:
+            port = int.from_bytes(packet[22:24], "big")
+            if port % 2 == 0 and len(packet) > 40:  # RTP
+                data = packet[28:40] + bytes(len(packet) - 40)
+                ways["b"].to_operator(datagram(ways["b"], sender, (OPERATOR, port), data))
+                forged[0] += 1
+            return True
+
+        ways["b"].seen = forge
+        operator.watch(2)
+        ways["b"].seen = lambda packet: True
+        operator.watch(1)
+        assert forged[0] > 2 * FPS
+        reported, operator.reported[:] = list(operator.reported), []
+        check_every_picture(operator)
+        foreign = [f"{CAMERA}: packets from hosts other than the vehicle are dropped"]
+        assert (reported, operator.sample().foreign > 2 * FPS) == (([], False) if keys else (foreign, True))
+
+
+@needs_root
+def test_an_uplink_whose_device_comes_back_with_another_address_is_used_again(tmp_path: Path) -> None:
+    with drive(tmp_path, keys=False) as (ways, vehicle, operator):
+        ways["b"].remove()
+        operator.watch(1.5)
+        assert vehicle.reported[1:] == ["uplink b: way-b: No such device"]
+        ways["b"].create("10.78.4.2")
+        operator.side.admit({"a": [ADDRESSES["a"]], "b": ["10.78.4.2"]})
+        before = ways["b"].passed
+        until(lambda: ways["b"].passed > before + FPS)
+        vehicle.carry("b")
+        operator.watch(1)
+        check_every_picture(operator)
+        assert operator.side.received()[CAMERA]["b"].packets > FPS
+        assert vehicle.reported[2:] == ["uplink b: works again"]
+
+
+def payload_type(packet: bytes) -> int:
+    """Of an RTP packet; 0 of another one."""
+    return packet[29] & 0x7F if packet[23] % 2 == 0 and packet[9] == socket.IPPROTO_UDP and len(packet) > 100 else 0
+
+
+@needs_root
+def test_what_is_lost_is_sent_again_although_the_other_uplink_is_cut(tmp_path: Path) -> None:
+    """That by which the operator is connected. By both, a request is sent twice, and granted once."""
+    with drive(tmp_path, keys=False) as (ways, vehicle, operator):
+        ways["a"].delay_s = ways["b"].delay_s = 0.005  # answered before the first request is repeated
+        vehicle.carry("b")
+        operator.watch(0.5)
+        kinds: list[int] = []
+
+        def lose(packet: bytes) -> bool:
+            kinds.append(payload_type(packet))
+            return kinds[-1] != VIDEO or kinds.count(VIDEO) % 60 != 0
+
+        for is_cut in (True, False):
+            ways["a"].is_cut = is_cut
+            kinds.clear()
+            ways["b"].seen = lose
+            operator.watch(3)
+            ways["b"].seen = lambda packet: True
+            operator.watch(1)
+            lost, repeated = kinds.count(VIDEO) // 60, kinds.count(REPEATED)
+            assert lost <= repeated < 2 * lost
+        check_every_picture(operator)
+
+
+def test_feedback_that_comes_by_both_uplinks_passes_once() -> None:
+    from runner.gst import Gst
+    from runner.gst.uplinks import Feedback
+
+    pipeline = Gst.parse_launch("appsrc name=a ! funnel name=all ! appsink name=sink sync=false  appsrc name=b ! all.")
+    feedback, sources = Feedback(), [pipeline.get_by_name(name) for name in "ab"]
+    probes = [feedback.merge(source.get_static_pad("src")) for source in sources]
+    pipeline.set_state(Gst.State.PLAYING)
+    passed = []
+    for source, data in ((0, b"1"), (1, b"1"), (1, b"2"), (0, b"2"), (0, b"3"), (0, b"3"), (1, b"4")):
+        sources[source].emit("push-buffer", Gst.Buffer.new_wrapped(data))
+        if sample := pipeline.get_by_name("sink").emit("try-pull-sample", 100 * Gst.MSECOND):
+            passed.append(sample.get_buffer().extract_dup(0, 1))
+    pipeline.set_state(Gst.State.NULL)
+    assert (passed, len(probes)) == ([b"1", b"2", b"3", b"3", b"4"], 2)

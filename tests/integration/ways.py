@@ -1,0 +1,156 @@
+"""Two ways between two machines: a vehicle with a device for each, and an operator with one address for both.
+
+    vehicle's namespace   way-a, way-b ---- a thread that delays, holds or drops packets ---- op-a, op-b   this one
+
+The operator's devices are in the namespace of the test.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import os
+import select
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+
+from machines import Machine
+
+from rig import WAIT_S
+from runner.link.tunnel import create
+
+OPERATOR = "10.78.0.1"
+ADDRESSES = {"a": "10.78.1.2", "b": "10.78.2.2"}  # of the vehicle
+FLOOD_S = 0.0004  # between two packets of a flood: 24 Mbit/s
+TURN = 64  # packets read before the other devices get their turn
+
+
+def ip(words: str) -> None:
+    subprocess.run(["ip", *words.split()], check=True, timeout=WAIT_S)
+
+
+class Way:
+    """One way.
+
+    delay_s   of each packet, from the vehicle and towards it
+    is_cut    whether packets are dropped, silently
+    is_held   whether packets wait; the end of it lets them go as fast as a link carries them
+    passed    packets from the vehicle that arrived
+    seen      called with each packet from the vehicle; returns whether it passes
+    """
+
+    def __init__(self, name: str, vehicle: Machine) -> None:
+        self.name, self.device, self._vehicle, self._near = name, f"way-{name}", vehicle, f"op-{name}"
+        self.delay_s, self.is_cut, self.passed = 0.0, False, 0
+        self.seen: Callable[[bytes], bool] = lambda packet: True
+        self.is_held = False
+        self.free_at = 0.0  # when the last packet that was held will be gone
+        self.waiting: list[tuple[int, bytes]] = []
+        self.near = self.far = -1
+        self.create(ADDRESSES[name])
+
+    def create(self, address: str) -> None:
+        """Create both devices."""
+        near, self.far = create(self._near), create(self.device)
+        metric = 1 + list(ADDRESSES).index(self.name)
+        ip(f"link set dev {self.device} netns {self._vehicle.pid}")
+        ip(f"link set dev {self._near} up")
+        ip(f"route add {address} dev {self._near} src {OPERATOR}")
+        self._vehicle.run(f"ip addr add {address}/32 dev {self.device}")
+        self._vehicle.run(f"ip link set dev {self.device} up")
+        self._vehicle.run(f"ip route add default dev {self.device} metric {metric}")
+        self.near = near
+
+    def remove(self) -> None:
+        """Remove both devices, as when a modem is pulled out."""
+        near, far, self.near, self.far = self.near, self.far, -1, -1
+        time.sleep(0.2)  # the thread that forwards waits for them
+        os.close(near)
+        os.close(far)
+
+    def to_operator(self, packet: bytes) -> None:
+        """Let a packet arrive at once."""
+        write(self.near, packet)
+
+    def passes(self, packet: bytes, sink: int) -> bool:
+        """Whether a packet goes on now."""
+        if self.is_cut or (sink == self.near and not self.seen(packet)):
+            return False
+        if self.is_held:
+            self.waiting.append((sink, packet))
+            return False
+        self.passed += sink == self.near
+        return True
+
+
+class Ways:
+    """The ways by name; `vehicle` is the machine of the vehicle."""
+
+    def __init__(self, vehicle: Machine) -> None:
+        self.vehicle = vehicle
+        ip("link set dev lo up")
+        ip(f"addr add {OPERATOR}/32 dev lo")
+        self.named = {name: Way(name, vehicle) for name in ADDRESSES}
+        self._ended = False
+        self._thread = threading.Thread(target=self._forward, daemon=True)
+        self._thread.start()
+
+    def __getitem__(self, name: str) -> Way:
+        return self.named[name]
+
+    def _forward(self) -> None:
+        due: list[tuple[float, int, int, bytes]] = []
+        order = itertools.count()
+        while not self._ended:
+            present = [way for way in self.named.values() if way.near >= 0]
+            ends = {way.far: (way, way.near) for way in present} | {way.near: (way, way.far) for way in present}
+            wait = max(0.0, due[0][0] - time.monotonic()) if due else 0.1
+            for source in select.select(list(ends), [], [], min(wait, 0.1))[0]:
+                way, sink = ends[source]
+                for packet in read(source):
+                    if way.passes(packet, sink):
+                        at = max(way.free_at, time.monotonic()) + way.delay_s
+                        heapq.heappush(due, (at, next(order), sink, packet))
+            now = time.monotonic()
+            for way in self.named.values():
+                while way.waiting and not way.is_held:
+                    way.free_at = max(way.free_at, now) + FLOOD_S
+                    heapq.heappush(due, (way.free_at, next(order), *way.waiting.pop(0)))
+            while due and due[0][0] <= now:
+                write(*heapq.heappop(due)[2:])
+
+    def end(self) -> None:
+        self._ended = True
+        self._thread.join()
+        for way in self.named.values():
+            way.remove()
+        ip(f"addr del {OPERATOR}/32 dev lo")
+
+
+def read(source: int) -> Iterator[bytes]:
+    for _ in range(TURN):
+        try:
+            yield os.read(source, 65_536)
+        except OSError:  # none is waiting, or the device is down
+            return
+
+
+def write(sink: int, packet: bytes) -> None:
+    with suppress(OSError):  # the device is down, or gone
+        os.write(sink, packet)
+
+
+@contextmanager
+def two_ways() -> Iterator[Ways]:
+    vehicle = Machine("vehicle")
+    try:
+        ways = Ways(vehicle)
+        try:
+            yield ways
+        finally:
+            ways.end()
+    finally:
+        vehicle.end()
