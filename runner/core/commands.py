@@ -10,14 +10,15 @@ from runner.core.decision import Decision, Setting
 from runner.core.model import Roi
 
 Size = tuple[int, int]
-KnobValue = bool | int | Roi | Size
+KnobValue = bool | int | Roi | Size | tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Command:
     """Turn one knob of one camera. Commands of a camera that arrive together take effect between the same two frames.
 
-    value  sending: bool; roi: Roi in px of the full image; size: (width, height) in px; bitrate: whole kbit/s, >= 1
+    value  sending: bool; roi: Roi in px of the full image; size: (width, height) in px; bitrate: whole kbit/s, >= 1;
+           uplinks: names of those that carry it
     """
 
     camera: str
@@ -28,7 +29,7 @@ class Command:
         value: Any = self.value
         if isinstance(value, Roi):
             value = value.to_json()
-        elif isinstance(value, tuple):
+        elif self.knob == "size":
             value = {"width": value[0], "height": value[1]}
         return {"camera": self.camera, "knob": self.knob, "value": value}
 
@@ -40,7 +41,9 @@ def wanted(setting: Setting) -> KnobValues:
     """Knob values of a camera for a setting. While nothing is sent, the other knobs keep their values."""
     if not setting.sending:
         return {"sending": False}
-    return {"sending": True, "roi": setting.roi, "size": (setting.width, setting.height), "bitrate": setting.kbps}
+    size = (setting.width, setting.height)
+    values: KnobValues = {"sending": True, "roi": setting.roi, "size": size, "bitrate": setting.kbps}
+    return {**values, "uplinks": setting.uplinks} if setting.uplinks else values
 
 
 def difference(decision: Decision, commanded: Mapping[str, KnobValues]) -> list[Command]:

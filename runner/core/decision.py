@@ -24,6 +24,7 @@ class Setting:
     given          the same, but kept while a rule stops all sending: the value with which the camera resumes
     scaling        selected factor; None when off, or when its source cannot be opened
     width, height  px of the encoded picture, 0 when off
+    uplinks        that carry it, its own first, if the vehicle's have names and a rule places cameras on them
     reason         for the operator; ignored in comparisons
     """
 
@@ -37,6 +38,7 @@ class Setting:
     width: int
     height: int
     reason: str = field(compare=False)
+    uplinks: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,12 +63,27 @@ class Believed:
 
 
 @dataclass(frozen=True, slots=True)
+class UplinkShare:
+    """What one of several uplinks is to carry.
+
+    total     kbit/s of all cameras and copies on it
+    stalled   whether nothing arrives over it
+    believed  as in `Decision`
+    """
+
+    total: Kbps
+    stalled: bool = False
+    believed: Believed | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class Decision:
     """What is in force: the mode, its total before the cap at demand, and a setting for each camera.
 
     asked     kbit/s of the prediction or the operator, before later rules lowered it; ignored in comparisons
     uncapped  kbit/s, the total without the limit of the measured link; ignored in comparisons
     believed  of the uplink; None: no rule believes anything, or no operator measures it; ignored in comparisons
+    uplinks   of those that have names; empty: no rule shares the total among them; ignored in comparisons
     """
 
     mode: Mode
@@ -75,10 +92,11 @@ class Decision:
     asked: Kbps = field(default=Fraction(0), compare=False)
     uncapped: Kbps = field(default=Fraction(0), compare=False)
     believed: Believed | None = field(default=None, compare=False)
+    uplinks: Mapping[str, UplinkShare] = field(default_factory=lambda: NOTHING, compare=False)
 
     def equals_with_reasons(self, other: Decision) -> bool:
         """Whether it is equal and for the same reasons."""
-        is_same = self == other and self.believed == other.believed
+        is_same = self == other and (self.believed, self.uplinks) == (other.believed, other.uplinks)
         return is_same and all(s.reason == other.settings[name].reason for name, s in self.settings.items())
 
 
@@ -94,6 +112,8 @@ class Draft(NamedTuple):
     sized_for  total for which picture sizes are chosen, kbit/s; None: the actual total
     sending    False stops all cameras, whatever their bitrate
     believed   of the uplink; None: nothing
+    uplinks    what each uplink that has a name is to carry; their sum is the total
+    placed     by camera that is on, the uplinks that carry it, its own first; empty: all go over the first uplink
     notes      reasons that concern all cameras
     reasons    reason by camera
     """
@@ -107,6 +127,8 @@ class Draft(NamedTuple):
     sized_for: Kbps | None = None
     sending: bool = True
     believed: Believed | None = None
+    uplinks: Mapping[str, UplinkShare] = NOTHING
+    placed: Mapping[str, tuple[str, ...]] = NOTHING
     notes: tuple[str, ...] = ()
     reasons: Mapping[str, str] = NOTHING
 

@@ -45,6 +45,7 @@ class BitratePredicted(_Event):
     Modes that go beyond the paper use the other values, follow_link bias and error until it knows better.
     """
 
+    uplink: Annotated[str, "the one that it is for; empty: all together"] = ""
     kbps: Annotated[Rate, "the prediction, kbit/s"]
     lower_kbps: Annotated[Rate | None, "likely lower bound, kbit/s"] = None
     valid_s: Annotated[NonNegative | None, "how long it may be used, s"] = None
@@ -167,6 +168,7 @@ class Evidence(NamedTuple):
 class LinkMeasured(_Event):
     """The uplink, by what the operator's side received of all cameras, see `runner.core.evidence`."""
 
+    uplink: Annotated[str, "its name; empty: the vehicle has one, without a name"] = ""
     kbps: Annotated[Rate, "received in the last 0.5 s, kbit/s"]
     queue_ms: Annotated[NonNegative, "standing queue in front of the link, ms"]
     loss: Annotated[Share, "share of the packets of the last second that was lost, 0 to 1"]

@@ -397,6 +397,7 @@ class Camera:
     credentials     file with user name and password for its address; None: not required
     framing         in the page's Drive view. fit: the whole picture is shown; fill: it fills its box; None: by place
     calibrated      whether pose, fov_deg and lens were measured, not estimated
+    redundant       whether every uplink carries it
     """
 
     name: str
@@ -420,6 +421,7 @@ class Camera:
     lens: str = "pinhole"
     framing: str | None = None
     calibrated: bool = False
+    redundant: bool = False
     full_roi: Roi = field(init=False)
 
     def __post_init__(self) -> None:
@@ -468,14 +470,16 @@ class Camera:
 class Vehicle:
     """What the rules know of a vehicle, valid once built.
 
-    mode   at the start
-    modes  the rules of each mode, in order
+    mode     at the start
+    modes    the rules of each mode, in order
+    uplinks  by name, kbit/s that are left to other traffic; empty: there is one, without a name
     """
 
     name: str
     cameras: Mapping[str, Camera]
     mode: Mode
     modes: Mapping[Mode, tuple[ModeRule, ...]]
+    uplinks: Mapping[str, Kbps] = field(default_factory=dict)
 
 
 Progress = Callable[[str, float], None]  # current step, share done in [0, 1]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from fractions import Fraction
 from operator import attrgetter
 from typing import Any, assert_never
@@ -36,13 +36,15 @@ class State:
     weights: Mapping[str, Fraction]
     manual: Mapping[str, Manual]  # settings of mode single, or the last ones of a camera that is off
     t: float = 0.0  # s, time of the last event
-    prediction: ev.BitratePredicted | None = None  # whatever the mode when it arrived
+    prediction: ev.BitratePredicted | None = None  # for all uplinks together, whatever the mode when it arrived
+    predictions: Mapping[str, ev.BitratePredicted] = field(default_factory=lambda: NOTHING)  # by uplink with a name
     total_set: Kbps | None = None  # kbit/s, the operator's last total
     collective_total: Kbps | None = None  # kbit/s, total of mode collective
     operator_since: float | None = None  # t of its side's connection, or of control of an unmeasured link; None: gone
     operator_lost: float | None = None  # t at which the operator's side disconnected
     attention: ev.Attention | None = None  # of the driver, as the operator in control states it
-    link: ev.LinkMeasured | None = None  # None: no operator measures it
+    link: ev.LinkMeasured | None = None  # None: no operator measures it, or uplinks have names
+    links: Mapping[str, ev.LinkMeasured] = field(default_factory=lambda: NOTHING)  # by uplink with a name
     position: ev.PositionReported | None = None
     steering: ev.SteeringReported | None = None
     copies: Mapping[str, int] = field(default_factory=lambda: NOTHING)  # that leave the vehicle; 1 for others
@@ -59,6 +61,10 @@ class State:
             weights={name: camera.weight for name, camera in cameras.items()},
             manual={},
         )
+
+    def over(self, uplink: str) -> State:
+        """As if this uplink, which has a name, were the only one."""
+        return replace(self, link=self.links.get(uplink), prediction=self.predictions.get(uplink))
 
 
 _FIELDS = tuple(part.name for part in fields(State))
@@ -80,8 +86,8 @@ def advance(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision)
 def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision) -> dict[str, Any]:  # noqa: PLR0911, PLR0912
     """Changes of the state by an event, by field."""
     match event:
-        case ev.BitratePredicted():
-            return {"prediction": event}
+        case ev.BitratePredicted(uplink=uplink):
+            return {"predictions": _of_uplink(vehicle, state.predictions, event)} if uplink else {"prediction": event}
         case ev.ModeSelected(mode=mode):
             return _enter(state, mode, in_force)
         case ev.TotalSet(kbps=kbps):
@@ -108,12 +114,12 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
                 _known(vehicle, name)
             return {"weights": {**state.weights, **weights}}
         case ev.LinkMeasured():
-            return {"link": event}
+            return {"links": _of_uplink(vehicle, state.links, event)} if vehicle.uplinks else {"link": event}
         case ev.ControlPassed(operator=operator):
             # Another place, network path and person. If the link is not measured, it is as if they had just connected.
             is_new = bool(operator) and state.link is None and state.operator_since is not None
             since = event.t if is_new else state.operator_since
-            return {"link": None, "attention": None, "operator_since": since}
+            return {"link": None, "links": NOTHING, "attention": None, "operator_since": since}
         case ev.AttentionChanged(attention=attention):
             return {"attention": attention}
         case ev.CopiesCounted(copies=copies):
@@ -124,8 +130,8 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
             since = event.t if state.operator_since is None else state.operator_since
             return {"operator_since": since, "operator_lost": None}
         case ev.OperatorDisconnected():
-            changes = {"operator_since": None, "operator_lost": event.t, "link": None, "attention": None}
-            return changes if state.operator_lost is None else {}
+            changes = {"operator_since": None, "operator_lost": event.t, "attention": None}
+            return {**changes, "link": None, "links": NOTHING} if state.operator_lost is None else {}
         case ev.PositionReported():
             return {"position": event}
         case ev.SteeringReported():
@@ -169,6 +175,15 @@ def _known(vehicle: Vehicle, name: str) -> Camera:
     if name in vehicle.cameras:
         return vehicle.cameras[name]
     raise Refused(f"unknown camera {name!r}{suggest(name, vehicle.cameras)}")
+
+
+def _of_uplink(
+    vehicle: Vehicle, known: Mapping[str, Any], event: ev.BitratePredicted | ev.LinkMeasured
+) -> Mapping[str, Any]:
+    """What is known by uplink, with this event."""
+    if event.uplink in vehicle.uplinks:
+        return {**known, event.uplink: event}
+    raise Refused(f"unknown uplink {event.uplink!r}{suggest(event.uplink, vehicle.uplinks)}")
 
 
 def _only_in(mode: Mode, state: State, event: ev.Event) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 from runner.core import allocation, scaling
 from runner.core.decision import NOTHING, Decision, Draft, Setting
 from runner.core.model import Mode, Roi, Vehicle
-from runner.core.rules import steady  # noqa: F401  (registers its rules, as the imports below do theirs)
+from runner.core.rules import spread, steady  # noqa: F401  (register their rules, as the imports below do theirs)
 from runner.core.rules.paper import whole
 from runner.core.rules.registry import GIVEN, Last, Memories, Memory, Rule, RuleCall, Step, rule
 from runner.core.rules.safe import follow_link
@@ -66,11 +66,11 @@ def decide(vehicle: Vehicle, state: State, memory: Memories) -> tuple[Decision, 
         state.on,
         state.lost,
         state.rois,
-        draft._replace(total=None, uncapped=None, measured=False, believed=None),
+        draft._replace(total=None, uncapped=None, measured=False, believed=None, uplinks=NOTHING),
     )
     # Without a prediction there is only the measurement, so the total without it is unknown.
     uncapped = draft.total if draft.uncapped is None or draft.measured else draft.uncapped
-    return Decision(state.mode, draft.total, settings, asked, uncapped, draft.believed), memory
+    return Decision(state.mode, draft.total, settings, asked, uncapped, draft.believed, draft.uplinks), memory
 
 
 def decide_without_link(vehicle: Vehicle, state: State, memory: Memories) -> Decision:
@@ -141,9 +141,11 @@ def _setting(on: bool, lost: str | None, roi: Roi, draft: Draft, name: str) -> S
     kbps, factor = whole(draft.bitrate[name]), draft.scaling[name]
     sending = draft.sending and kbps >= 1
     width, height = scaling.output_size(roi, factor)
-    reason = draft.reasons.get(name, "")
+    uplinks = draft.placed.get(name, ())
+    reason = draft.reasons.get(name, "") + (f", over {' and '.join(uplinks)}" if uplinks else "")
     if draft.sending and not sending:
         reason += ", below 1 kbit/s: not sending"
     if draft.notes:
         reason = "; ".join((reason, *draft.notes))
-    return Setting(True, sending, draft.demand[name], kbps if sending else 0, kbps, factor, roi, width, height, reason)
+    video = (kbps if sending else 0, kbps, factor, roi, width, height)
+    return Setting(True, sending, draft.demand[name], *video, reason, uplinks)

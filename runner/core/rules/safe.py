@@ -4,37 +4,54 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from fractions import Fraction
-from functools import cache
+from functools import cache, partial
 from math import ceil, inf
+from typing import NamedTuple
 
 from runner.core import allocation, scaling
 from runner.core import follow_link as follow
 from runner.core.belief import LOWEST, Belief
 from runner.core.budget import video_kbps, wire_kbps
-from runner.core.decision import Draft
+from runner.core.decision import Draft, UplinkShare
+from runner.core.events import LinkState
 from runner.core.follow_link import FLOOR, Ceiling, Reports
 from runner.core.model import Camera, Kbps, Mode, Vehicle, exact, plain
+from runner.core.placement import shared
 from runner.core.rules.paper import demands, lasting_share, of_all_copies, whole
 from runner.core.rules.registry import Last, Memory, Step, rule
 from runner.core.state import State
 
+FORGOTTEN_S = 10.0  # without anything that arrives over one of several uplinks, until what it carried counts no more
 _allocated = Last(allocation.allocate_above_floors)
 
 
-@rule(needs=["total", "demand"], gives=["bitrate"], reads=["copies", "weights"])
+@rule(needs=["total", "demand"], gives=["bitrate"], reads=["copies", "weights"], uses=["placed", "uplinks"])
 def share_above_floors(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
     """As `share_by_demand`, but each camera first gets its `floor_kbps`; those with `shed` are given up first.
 
     Memory: the cameras given up.
     """
-    total = draft.total
-    assert total is not None
     draft, given_up, memory = _give_up(vehicle, state, draft, draft.demand, memory)
     wanted = _without(given_up, draft.demand)
-    return draft.replaced(bitrate=_shared(vehicle, state, wanted, total)), memory
+    return draft.replaced(bitrate=_shared(vehicle, state, draft, wanted)), memory
 
 
-def _shared(vehicle: Vehicle, state: State, wanted: Mapping[str, Kbps], total: Kbps) -> Mapping[str, Kbps]:
+def _shared(vehicle: Vehicle, state: State, draft: Draft, wanted: Mapping[str, Kbps]) -> Mapping[str, Kbps]:
+    """kbit/s by camera, of the total, or of what the uplinks carry that it is placed on."""
+    assert draft.total is not None
+    if not draft.placed:
+        return _shared_among(vehicle, state, wanted, draft.total)
+    living = {
+        name: [at for at in uplinks if not draft.uplinks[at].stalled]
+        for name, uplinks in draft.placed.items()
+        if vehicle.cameras[name].redundant
+    }
+    limits = {name: living.get(name) or uplinks[:1] for name, uplinks in draft.placed.items()}
+    totals = {name: share.total for name, share in draft.uplinks.items()}
+    return shared(limits, totals, wanted, partial(_shared_among, vehicle, state))
+
+
+def _shared_among(vehicle: Vehicle, state: State, wanted: Mapping[str, Kbps], total: Kbps) -> Mapping[str, Kbps]:
     """kbit/s by camera: floors first, then Eq. (2); the total counts every copy of a camera that leaves the vehicle."""
     floors = _floors(vehicle)
     if not state.copies:
@@ -42,7 +59,7 @@ def _shared(vehicle: Vehicle, state: State, wanted: Mapping[str, Kbps], total: K
         return allocated
     copies = {name: state.copies.get(name, 1) for name in wanted}
     of_all = {name: own * copies[name] for name, own in wanted.items()}
-    lowest = {name: floor * copies[name] for name, floor in floors.items()}
+    lowest = {name: floor * copies[name] for name, floor in floors.items() if name in copies}
     shares = allocation.allocate_above_floors(of_all, total, state.weights, lowest)
     return {name: Fraction(share) / copies[name] for name, share in shares.items()}
 
@@ -86,7 +103,7 @@ def _shed_order(vehicle: Vehicle) -> tuple[str, ...]:
     needs=["total", "bitrate", "scaling"],
     gives=["bitrate", "scaling"],
     reads=["copies", "rois", "weights"],
-    uses=["sized_for"],
+    uses=["placed", "sized_for", "uplinks"],
 )
 def fit_to_total(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
     """Mode S with less: Eq. (2) in proportion to what the operator has set, with floors as in `share_above_floors`.
@@ -101,7 +118,7 @@ def fit_to_total(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -
     if total >= of_all_copies(state, draft.bitrate):
         return draft, {} if memory else memory
     draft, given_up, memory = _give_up(vehicle, state, draft, draft.bitrate, memory)
-    bitrates = _shared(vehicle, state, _without(given_up, draft.bitrate), total)
+    bitrates = _shared(vehicle, state, draft, _without(given_up, draft.bitrate))
     factors, reasons = dict(draft.scaling), dict(draft.reasons)
     for name, own in factors.items():
         camera, roi = vehicle.cameras[name], state.rois[name]
@@ -117,8 +134,8 @@ def fit_to_total(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -
 
 @rule(
     needs=["total"],
-    gives=["total", "uncapped", "sized_for"],
-    reads=["copies", "link", "on", "operator_since", "prediction", "rois", "t"],
+    gives=["total", "uncapped", "sized_for", "uplinks"],
+    reads=["copies", "link", "links", "on", "operator_since", "prediction", "predictions", "rois", "t"],
 )
 def follow_link(
     vehicle: Vehicle,
@@ -144,40 +161,103 @@ def follow_link(
     bound, and once it is older than its own `valid_s`, otherwise `after_s`, the total is halved, and again every
     `halve_every_s`, down to `floor_kbps`. Before the first prediction, its age counts from the start of the run.
 
-    Memory: `Belief`.
+    Memory: `Belief`, or one by uplink.
     """
+    how = _Following(reports, ceiling, reserve_kbps, start, after_s, halve_every_s, floor_kbps)
+    if vehicle.uplinks:
+        return _follow_each(vehicle, state, draft, memory, how)
+    draft, belief = _follow(vehicle, state, draft, memory.get("belief"), how)
+    return draft, memory if belief is None else {"belief": belief}
+
+
+class _Following(NamedTuple):
+    """The parameters of `follow_link`."""
+
+    reports: Reports
+    ceiling: Ceiling
+    reserve_kbps: Kbps
+    start: Fraction
+    after_s: Fraction
+    halve_every_s: Fraction
+    floor_kbps: Kbps
+
+
+def _follow(
+    vehicle: Vehicle, state: State, draft: Draft, past: Belief | None, how: _Following
+) -> tuple[Draft, Belief | None]:
+    """The total that one uplink carries, and what is believed of it; None: nothing new."""
     asked = draft.total
     assert asked is not None
     cameras, is_automatic = sent_cameras(vehicle, state), state.mode is Mode.AUTOMATIC
-    past: Belief | None = memory.get("belief")
-    link = state.link if reports is Reports.FOLLOWED else None
+    link = state.link if how.reports is Reports.FOLLOWED else None
     if not cameras or not follow.is_measured(state, link, past):
         if is_automatic:
-            draft = follow.faded(state, draft, len(cameras), after_s, halve_every_s, floor_kbps)
-        return follow.started(state, draft, start), memory
-    limit = float(wire_kbps(cameras, asked) + reserve_kbps)
-    has_limit = not is_automatic or ceiling is Ceiling.PREDICTION
+            draft = follow.faded(state, draft, len(cameras), how.after_s, how.halve_every_s, how.floor_kbps)
+        return follow.started(state, draft, how.start), None
+    limit = float(wire_kbps(cameras, asked) + how.reserve_kbps)
+    has_limit = not is_automatic or how.ceiling is Ceiling.PREDICTION
     least = max(exact(LOWEST), Fraction(len(cameras)))
     belief = follow.updated(
         past,
         state,
         link,
-        start=float(start * wire_kbps(cameras, asked)),
+        start=float(how.start * wire_kbps(cameras, asked)),
         most=float(wire_kbps(cameras, of_all_copies(state, _wanted(vehicle, state, draft)))),
-        prediction=follow.predicted(state, cameras, after_s) if is_automatic else follow.NO_PREDICTION,
-        floors=float(_wire_floors(vehicle, state, draft, cameras, reserve_kbps)),
+        prediction=follow.predicted(state, cameras, how.after_s) if is_automatic else follow.NO_PREDICTION,
+        floors=float(_wire_floors(vehicle, state, draft, cameras, how.reserve_kbps)),
         ceiling=limit if has_limit else inf,
     )
 
     def video(wire: float) -> Kbps:
         if has_limit and wire >= min(limit, belief.most):
             return asked
-        carried = video_kbps(cameras, max(wire_kbps(cameras, least), exact(round(wire, 1)) - reserve_kbps))
+        carried = video_kbps(cameras, max(wire_kbps(cameras, least), exact(round(wire, 1)) - how.reserve_kbps))
         return min(asked, carried) if has_limit else carried
 
     draft = draft.replaced(measured=not has_limit and belief.learned.ln is None)
-    draft = follow.followed(draft, video(belief.total), video(belief.lasting), belief, cameras, link)
-    return draft, {"belief": belief}
+    return follow.followed(draft, video(belief.total), video(belief.lasting), belief, cameras, link), belief
+
+
+def _follow_each(vehicle: Vehicle, state: State, draft: Draft, memory: Memory, how: _Following) -> Step:
+    """The same for each of several uplinks, as if it were the only one, with its own reports and predictions.
+
+    Where the total before is a limit, it is one for all together.
+    """
+    asked = draft.total
+    assert asked is not None
+    equal = Fraction(asked) / len(vehicle.uplinks)
+    alone, beliefs = {}, {}
+    for name, reserve in vehicle.uplinks.items():
+        own, past = state.over(name), memory.get(name)
+        predicted = own.prediction.kbps if own.prediction and state.mode is Mode.AUTOMATIC else equal
+        if past and own.link and own.link.evidence.silent_s > FORGOTTEN_S:
+            past = None  # it may be another cell, or another network
+        follows = how._replace(reserve_kbps=how.reserve_kbps + reserve)
+        alone[name], belief = _follow(vehicle, own, draft.replaced(total=predicted, notes=()), past, follows)
+        beliefs[name] = past if belief is None else belief
+    stalled = {name for name, link in state.links.items() if link.state is LinkState.STALLED}
+    return _together(draft, alone, stalled, has_limit=state.mode is not Mode.AUTOMATIC), beliefs
+
+
+def _together(draft: Draft, alone: Mapping[str, Draft], stalled: Collection[str], *, has_limit: bool) -> Draft:
+    """What all uplinks carry, from what each does.
+
+    has_limit  whether the total before is a limit
+    """
+    totals = {name: own.total or allocation.ZERO for name, own in alone.items()}
+    total = sum(totals.values(), allocation.ZERO)
+    if has_limit and draft.total is not None and total > draft.total:
+        totals = {name: own * draft.total / total for name, own in totals.items()}
+        total = draft.total
+    lasting = sum((own.sized_for or own.total or allocation.ZERO for own in alone.values()), allocation.ZERO)
+    return draft.replaced(
+        total=total,
+        uplinks={name: UplinkShare(totals[name], name in stalled, own.believed) for name, own in alone.items()},
+        measured=all(own.measured for own in alone.values()),
+        uncapped=sum((own.uncapped or own.total or allocation.ZERO for own in alone.values()), allocation.ZERO),
+        sized_for=None if lasting == total else lasting,
+        notes=(*draft.notes, *(f"{name}: {note}" for name, own in alone.items() for note in own.notes)),
+    )
 
 
 def sent_cameras(vehicle: Vehicle, state: State) -> tuple[Camera, ...]:

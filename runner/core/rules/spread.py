@@ -1,0 +1,34 @@
+"""Several uplinks: which of them carries which camera."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+from runner.core.decision import Draft
+from runner.core.model import Vehicle
+from runner.core.placement import Carries, Placement, Wanted, place
+from runner.core.rules.registry import Memory, Step, rule
+from runner.core.state import State
+
+
+@rule(needs=["uplinks", "demand"], gives=["placed"], reads=["on", "t", "weights"])
+def spread_over_uplinks(
+    vehicle: Vehicle, state: State, draft: Draft, memory: Memory, *, clear_s: Fraction = Fraction(5)
+) -> Step:
+    """Cameras are spread over the uplinks by what these carry; see `runner.core.placement`.
+
+    Those with `redundant` are on every uplink. An uplink that stalls loses its other cameras at once; they return once
+    it has been clear for `clear_s`. With a single uplink, this rule does nothing.
+
+    Memory: `Placement`.
+    """
+    if not draft.uplinks:
+        return draft, memory
+    cameras = {
+        name: Wanted(float(kbps), float(state.weights[name]), vehicle.cameras[name].redundant)
+        for name, kbps in (draft.bitrate or draft.demand).items()
+        if kbps
+    }
+    uplinks = {name: Carries(float(share.total), share.stalled) for name, share in draft.uplinks.items()}
+    placement = place(memory.get("placement", Placement()), cameras, uplinks, state.t, float(clear_s))
+    return draft.replaced(placed=placement.uplinks), {"placement": placement}
