@@ -248,6 +248,8 @@ def assignments(camera: Camera, knob: str, value: KnobValue, pace: float = 1.0) 
             counts frames. The length of its buffer stays, since it counts that in frames too
     raises  ModelError if the type of the value does not fit the knob
     """
+    if knob == "uplinks":  # which carry the camera is no element's property
+        return []
     of_time, of_frames = _quantities(camera, value), _quantities(camera, value, pace)
     count_frames = {element.name for element in camera.graph.vehicle if element.factory in _COUNT_FRAMES}
     turned: list[Assignment] = []
@@ -337,8 +339,7 @@ def _quantities(camera: Camera, value: KnobValue, pace: float = 1.0) -> dict[str
         left, top = full.x + value.x, full.y + value.y
         right, bottom = native_width - left - value.width, native_height - top - value.height
         return {"left": left, "right": right, "top": top, "bottom": bottom}
-    width, height = value
-    return {"width": width, "height": height}
+    return dict(zip(("width", "height"), value, strict=True))
 
 
 def _buffer(camera: Camera, kbps: int) -> dict[str, Value]:

@@ -258,6 +258,7 @@ class Setup:
     ros         the ROS node, for cameras whose source subscribes to topics
     dimensions  None: unknown
     inputs      keys and buttons of the operator's page
+    uplinks     by name, in order; none: the system's routes decide by which way the vehicle sends
     """
 
     vehicle: Vehicle
@@ -276,6 +277,7 @@ class Setup:
     ros: RosSettings = RosSettings()
     dimensions: Dimensions | None = None
     inputs: Inputs = Inputs()
+    uplinks: Mapping[str, Uplink] = field(default_factory=dict)
 
     def with_cameras(self, cameras: Mapping[str, Camera]) -> Setup:
         """The same, of a vehicle with these cameras."""

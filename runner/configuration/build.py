@@ -21,6 +21,7 @@ from runner.core.model import (
     Element,
     Graph,
     GraphSettings,
+    Kbps,
     KnobTarget,
     Mode,
     ModelError,
@@ -50,6 +51,7 @@ from runner.settings import (
     RosQos,
     RosSettings,
     Setup,
+    Uplink,
 )
 
 if TYPE_CHECKING:
@@ -99,7 +101,19 @@ class Builder:
         modes = {mode: self._rules(mode) for mode in Mode if self.is_valid("modes", mode)}
         mounted = document.get("cameras")
         cameras = {name: self._camera(name) for name in mounted} if isinstance(mounted, dict) else {}
-        sections = ("media", "control", "page", "log", "latency", "keys", "insecure", "metrics", "ros", "strict")
+        sections = (
+            "media",
+            "control",
+            "page",
+            "log",
+            "latency",
+            "keys",
+            "insecure",
+            "metrics",
+            "ros",
+            "strict",
+            "uplinks",
+        )
         if not all(map(self.is_valid, sections)):
             return None
         media = self.part(("media",), _media)
@@ -113,6 +127,7 @@ class Builder:
         recording = self.part(("recording",), _recording)
         page = PageSettings(**document["page"])
         inputs = self.part(("inputs",), lambda data: Inputs(**data)) if "inputs" in document else None
+        uplinks = self._uplinks()
         known = document.get("dimensions") is not None
         dimensions = self.part(("dimensions",), lambda data: Dimensions(**data)) if known else None
         ros = _ros(document.get("ros", {}))
@@ -133,7 +148,7 @@ class Builder:
         if self.problems or recording is None:
             return None
         return Setup(
-            Vehicle(document["name"], built, Mode(document["mode"]), modes),
+            Vehicle(document["name"], built, Mode(document["mode"]), modes, _reserves(document)),
             media=media,
             control=control,
             page=page,
@@ -149,6 +164,7 @@ class Builder:
             ros=ros,
             dimensions=dimensions,
             inputs=inputs or Inputs(),
+            uplinks=uplinks,
         )
 
     def checked(self, built: T | None) -> T:
@@ -221,7 +237,7 @@ class Builder:
         fps, limit = _rate(data["fps"]), document.get("fps_max")
         native = data.get("native")
         pose, place = data.get("pose"), data.get("place")
-        options = _given(data, ("fov_deg", "lens", "shed", "framing", "calibrated"))
+        options = _given(data, ("fov_deg", "lens", "shed", "framing", "calibrated", "redundant"))
         options |= {key: exact(value) for key, value in _given(data, ("weight", "floor_kbps")).items()}
         return self.attempt(
             path,
@@ -323,6 +339,22 @@ class Builder:
         for error in errors:
             self._report(("cameras", camera.name), error)
 
+    def _uplinks(self) -> dict[str, Uplink]:
+        """By name. No two of them are the same way."""
+        uplinks: dict[str, Uplink] = {}
+        ways: dict[str, str] = {}
+        for name, data in (self.composed.document.get("uplinks") or {}).items():
+            given = _given(data, ("interface", "address"))
+            built = self.part(("uplinks", name), lambda _, keys=given: Uplink(**keys))  # type: ignore[misc]
+            for key, way in given.items():
+                if way in ways:
+                    rule = "is already that of another uplink"
+                    self._report((), ModelError(f"uplinks.{name}.{key}", way, rule, f"uplinks.{ways[way]}.{key}"))
+                ways[way] = name
+            if built:
+                uplinks[name] = built
+        return uplinks
+
     def _check_places(self, cameras: Mapping[str, Camera]) -> None:
         """Check that no tile of the page overlaps another one."""
         places = {name: camera.place for name, camera in cameras.items() if camera.place}
@@ -360,6 +392,11 @@ class Builder:
 def _given(data: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
     """The given keys among `keys`; the model has defaults for the others."""
     return {key: data[key] for key in keys if key in data}
+
+
+def _reserves(document: Mapping[str, Any]) -> dict[str, Kbps]:
+    """kbit/s by uplink."""
+    return {name: exact(data.get("reserve_kbps", 0)) for name, data in (document.get("uplinks") or {}).items()}
 
 
 def _media(data: Mapping[str, Any]) -> Media:

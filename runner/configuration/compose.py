@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 # keys of a mount that stay when its kind of camera is replaced
 KEPT_KEYS = (
-    *("place", "pose", "weight", "floor_kbps", "shed", "graph", "source"),
+    *("place", "pose", "weight", "floor_kbps", "shed", "redundant", "graph", "source"),
     *("device", "address", "clip", "bag", "topic", "capture", "credentials"),
 )
 RESTATED = (
