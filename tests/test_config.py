@@ -17,9 +17,9 @@ from runner.core.model import Mode
 from runner.errors import ConfigError, Problem, UserError
 from runner.schema import schema_document
 
-TOP_KEYS = "mode, fps_max, media, control, page, latency, log, name, cameras, modes, graph, source, pqos, ..."
+TOP_KEYS = "mode, fps_max, media, control, page, uplinks, latency, log, name, cameras, modes, graph, source, ..."
 CAMERA_KEYS = (
-    "width_px, height_px, fps, native, rate_quality, lens, fov_deg, weight, floor_kbps, shed, place, pose, device, ..."
+    "width_px, height_px, fps, native, rate_quality, lens, fov_deg, weight, floor_kbps, redundant, shed, place, pose, ..."
 )
 OWN = "files of your own need conf=DIR"
 SWEEP = "a,b,c is a sweep, which print, replay and demo run with -m; write [a,b,c] for a list"

@@ -138,6 +138,7 @@ class ReceptionReport:
     latency_ms     upper bound of the age of the oldest displayed picture, capture to decoding, ms; absent: unknown
     damaged        cameras whose newest picture shows unrecovered packet loss; absent: none
     sent           s since 1970 by the operator's clock; present if the vehicle should answer with a `ClockAnswer`
+    uplink         whose packets these are, and which the vehicle estimates; absent: it has one, without a name
     run            random number of this run of the operator's side, to which delays and times are relative
     """
 
@@ -150,6 +151,7 @@ class ReceptionReport:
     damaged: Annotated[tuple[str, ...], Limits(most=1000, unique=True)] | UnsetType = UNSET
     sent: Clock | UnsetType = UNSET
     run: Annotated[int, Limits(0, 2**32 - 1)] | UnsetType = UNSET
+    uplink: str | UnsetType = UNSET
     offset_s: Annotated[Clock | UnsetType, "the constant that delays are less by, s; absent: no unit"] = UNSET
 
 

@@ -18,7 +18,7 @@ from runner.simulation.encoder import Encoder
 from runner.vehicle.operators import Operators
 from runner.vehicle.repair import KeyFrames
 from runner.vehicle.sending import SendingTimes
-from runner.vehicle.uplink import MeasuredUplink
+from runner.vehicle.uplink import MeasuredUplinks
 
 OPERATOR = "operator"  # id of the only one
 LOOK_S = 0.02  # between two looks at what the payloaders have sent
@@ -41,7 +41,7 @@ class SimulatedVehicle:
     def __post_init__(self) -> None:
         vehicle = self.setup.vehicle
         self.run = start(vehicle)
-        self._uplink, self._sending = MeasuredUplink(vehicle), SendingTimes()
+        self._uplinks, self._sending = MeasuredUplinks(vehicle), SendingTimes()
         self._operators = Operators(self.setup.expires_s)
 
     def take(self, event: Event) -> None:
@@ -75,7 +75,7 @@ class SimulatedVehicle:
             self._sending.add({name: (frame,)})
         reported = self._sending.judge(ReceptionReported(t, OPERATOR, True, report), report.as_of)
         self.on_report(reported)
-        if measured := self._uplink.take(reported):
+        if measured := self._uplinks.take(reported):
             self.take(measured)
         if report.damaged is not UNSET:
             encoders = {name: self.encoders[name] for name in report.damaged}

@@ -43,7 +43,7 @@ from runner.vehicle.refusals import Refusals
 from runner.vehicle.repair import KeyFrames
 from runner.vehicle.replies import Replies
 from runner.vehicle.sending import SendingTimes
-from runner.vehicle.uplink import MeasuredUplink
+from runner.vehicle.uplink import MeasuredUplinks
 
 if TYPE_CHECKING:
     from runner.pqos.track import Track
@@ -105,7 +105,7 @@ class ControlLoop:
         self._inbox = Inbox()
         self.refusals = Refusals(self._now, self._inbox.is_full)
         self._operators = Operators(self.setup.expires_s, self.access.may_control)
-        self._uplink, self._sending, self._key_frames = MeasuredUplink(self.vehicle), SendingTimes(), KeyFrames()
+        self._uplinks, self._sending, self._key_frames = MeasuredUplinks(self.vehicle), SendingTimes(), KeyFrames()
         self._publisher, self._replies = Publisher(self.setup.latency, self.publish), Replies()
         self._report_denial = LimitedReports(self.on_report)
         self._report_once = RepeatedReports(self.on_report)
@@ -263,12 +263,17 @@ class ControlLoop:
         if item.report.run is not UNSET:
             self._operators.reported(item.sender, t, item.report.run)
         reported = ReceptionReported(t, item.sender, item.sender == self._operators.in_control, item.report)
-        is_rival = self._uplink.is_rival(reported)
+        uplink = self._uplinks.of(item.report)
+        if uplink is None:
+            self._report_once(f"{item.sender}: its reports name an uplink that this vehicle does not have; ignored")
+            return
+        is_rival = uplink.is_rival(reported)
         if reported.in_control and not is_rival:
             self._sending.add(self.applier.sent_frames())
-            reported = self._sending.judge(reported, time.time() - (t - item.report.as_of))
+            placed = {name: each.uplinks for name, each in self._run.decision.settings.items() if each.uplinks}
+            reported = self._sending.judge(reported, time.time() - (t - item.report.as_of), placed)
         self.listener.record(reported if reported.in_control else replace(reported, report=_totals(reported.report)))
-        link = self._uplink.take(reported)
+        link = uplink.take(reported)
         if is_rival:
             self._report_once(f"{item.sender}: two processes of this operator send reception reports; one is ignored")
             return

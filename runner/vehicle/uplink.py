@@ -13,18 +13,38 @@ from runner.core.budget import on_the_wire
 from runner.core.events import LinkMeasured
 from runner.core.evidence import EvidenceMemory, LinkReport, ReceivedUnit, observe, rounded, summarise
 from runner.core.model import Graph, Vehicle, exact
-from runner.records.reception import ReceptionReported, UnitReceived
+from runner.records.reception import ReceptionReport, ReceptionReported, UnitReceived
 from runner.vehicle.operators import PRESENT_S
 
 ROUND_TRIPS = 64  # remembered; the smallest is the round trip
 LONGEST_S = 60.0  # upper limit of a reported round trip
 
 
+class MeasuredUplinks:
+    """Measures each uplink of a vehicle."""
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        self._each = {name: MeasuredUplink(vehicle, name) for name in vehicle.uplinks or ("",)}
+
+    def of(self, report: ReceptionReport) -> MeasuredUplink | None:
+        """The one that a report is about; None: the vehicle has no such uplink."""
+        return self._each.get("" if report.uplink is UNSET else report.uplink)
+
+    def take(self, reported: ReceptionReported) -> LinkMeasured | None:
+        """See `MeasuredUplink.take`."""
+        own = self.of(reported.report)
+        return own.take(reported) if own else None
+
+
 @dataclass
 class MeasuredUplink:
-    """Measures the uplink by what the operator in control receives. Another operator or process begins anew."""
+    """Measures an uplink by what the operator in control receives. Another operator or process begins anew.
+
+    name  "": the vehicle's only one
+    """
 
     vehicle: Vehicle
+    name: str = ""
     _source: tuple[str, object] = ("", None)  # operator, and its run
     _at: float = 0.0
     _t: float = 0.0
@@ -53,6 +73,7 @@ class MeasuredUplink:
         summary = summarise(self._memory, evidence)
         return LinkMeasured(
             t=reported.t,
+            uplink=self.name,
             kbps=exact(round(summary.kbps, 1)),
             queue_ms=round(1000 * summary.queue_s, 1),
             loss=round(summary.loss, 4),

@@ -66,7 +66,7 @@ from runner.verbs import Arguments
 if TYPE_CHECKING:
     from runner.drive.positions import RecordedPositions
     from runner.pqos import Pqos
-    from runner.vehicle.uplink import MeasuredUplink
+    from runner.vehicle.uplink import MeasuredUplinks
 
 InputEvent = tuple[dict[str, Any], Event]  # an event, as JSON and parsed
 CHANGING = ("link", "positions", "topic")  # arguments that change the events
@@ -159,13 +159,13 @@ def _output_lines(run: _Prepared, lines: Iterable[str], name: str, began: Began 
         yield from replay(run.vehicle, inputs, run.pqos, log)
 
 
-def _uplink(arguments: Arguments, vehicle: Vehicle) -> MeasuredUplink | None:
+def _uplink(arguments: Arguments, vehicle: Vehicle) -> MeasuredUplinks | None:
     """What measures the link again; None: the logged measurements are used."""
     if arguments.choice("link") == "logged":
         return None
-    from runner.vehicle.uplink import MeasuredUplink
+    from runner.vehicle.uplink import MeasuredUplinks
 
-    return MeasuredUplink(vehicle)
+    return MeasuredUplinks(vehicle)
 
 
 def _begin(text: Iterable[str], name: str) -> tuple[Iterable[str], Began | None]:
@@ -300,7 +300,7 @@ def _acknowledgement(document: Mapping[str, Any], now: Run) -> dict[str, Any]:
     return acknowledged
 
 
-def events(lines: Iterable[str], name: str, uplink: MeasuredUplink | None = None) -> Iterator[InputEvent]:
+def events(lines: Iterable[str], name: str, uplink: MeasuredUplinks | None = None) -> Iterator[InputEvent]:
     """Events of a JSON Lines text, each with the JSON it came from. Other lines of a drive log are skipped.
 
     uplink  measures the link again from the drive's reception reports, in place of the drive's own measurements
