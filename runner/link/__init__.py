@@ -2,7 +2,8 @@
 
 Arrivals, losses and delays are thus measured, not assumed. Two kinds: `netns` (root; packets of any protocol between
 two network namespaces) and `relay` (no root; RTSP, RTP and MQTT through a process). Both limit all traffic from the
-vehicle to the operator in one queue, and all traffic back in another, if that is limited.
+vehicle to the operator in one queue, and all traffic back in another, if that is limited. A link of kind `netns` may
+have lanes, as a vehicle with several modems has: each is a network device of the vehicle with limits of its own.
 
 with limited_link("relay", limit, vehicle.media, vehicle.control, log.record) as link, private_broker(link.broker):
     ...  # [*link.vehicle_command, python, ..., *link.vehicle_overrides] and [python, ..., *link.operator_overrides]
@@ -13,14 +14,16 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, replace
+
+from msgspec import UNSET
 
 from runner.errors import RunError, suggest
 from runner.link import netns
 from runner.link.ends import Ends
-from runner.link.limit import Limit, LinkCounters
+from runner.link.limit import Limit, LinkCounters, Rates
 from runner.link.relayed import relayed
 from runner.records.lines import LinkSample
 from runner.settings import Endpoint
@@ -38,16 +41,17 @@ OnLinkSample = Callable[[LinkSample], None]
 class LimitedLink:
     """A link that is set up. Its rate is the initial one until `start` sets the start of the drive.
 
+    limits     by lane
     on_sample  called with each sample, from a thread of the link
 
     `vehicle_command`, `vehicle_overrides`, `operator_overrides`, `broker` and `notes`: see `Ends`.
     """
 
-    def __init__(self, limit: Limit, ends: Ends, on_sample: OnLinkSample) -> None:
+    def __init__(self, limits: Mapping[str, Limit], ends: Ends, on_sample: OnLinkSample) -> None:
         self.vehicle_command, self.broker = ends.vehicle_command, ends.broker
         self.vehicle_overrides, self.operator_overrides = ends.vehicle_overrides, ends.operator_overrides
         self.notes = ends.notes
-        self._limit, self._shaper, self._on_sample = limit, ends.shaper, on_sample
+        self._limits, self._shapers, self._on_sample = limits, ends.shapers, on_sample
         self._stopped = threading.Event()
         self._failure: Exception | None = None
         self._thread: threading.Thread | None = None
@@ -68,7 +72,8 @@ class LimitedLink:
             raise self._failure
         if self._failure:
             raise RunError(f"the limited link stopped: {self._failure!r}") from self._failure
-        self._shaper.check()
+        for shaper in self._shapers.values():
+            shaper.check()
 
     def stop(self) -> None:
         """Write the last line of the log; the rate stays."""
@@ -83,23 +88,25 @@ class LimitedLink:
             self._failure = error
 
     def _follow(self, zero: float) -> None:
-        in_force, line = self._limit.rates(0), 0
+        in_force, line = {lane: limit.rates(0) for lane, limit in self._limits.items()}, 0
         ended = False
         while not ended:
             ended = self._stopped.wait(POLL_S)
             t = time.monotonic() - zero
-            rates, logs = self._limit.rates(t), t >= line * LOG_S or (ended and t >= 0)
-            if rates != in_force or logs:
-                in_force, counters = rates, self._shaper.limit(rates)
-            if logs:
-                line = int(t / LOG_S) + 1
-                self._on_sample(_sample(t, rates.up, counters))
+            logs = t >= line * LOG_S or (ended and t >= 0)
+            for lane, limit in self._limits.items():
+                rates = limit.rates(t)
+                if rates != in_force[lane] or logs:
+                    in_force[lane], counters = rates, self._shapers[lane].limit(rates)
+                if logs:
+                    self._on_sample(_sample(t, rates, counters, lane))
+            line = int(t / LOG_S) + 1 if logs else line
 
 
-def _sample(t: float, kbps: float, counters: LinkCounters) -> LinkSample:
-    return LinkSample(
-        **asdict(replace(counters, queue_ms=round(counters.queue_ms, 1))), t=round(t, 3), kbps=round(kbps, 3)
-    )
+def _sample(t: float, rates: Rates, counters: LinkCounters, lane: str) -> LinkSample:
+    counted = asdict(replace(counters, queue_ms=round(counters.queue_ms, 1)))
+    kbps = 0.0 if rates.cut else round(rates.up, 3)
+    return LinkSample(**counted, t=round(t, 3), kbps=kbps, lane=lane or UNSET)
 
 
 def check_possible(kind: str) -> None:
@@ -110,22 +117,31 @@ def check_possible(kind: str) -> None:
 
 @contextmanager
 def limited_link(
-    kind: str, limit: Limit, media: Endpoint, control: Endpoint, on_sample: OnLinkSample, *, dials: bool = False
+    kind: str,
+    limit: Limit,
+    media: Endpoint,
+    control: Endpoint,
+    on_sample: OnLinkSample,
+    *,
+    dials: bool = False,
+    lanes: Mapping[str, Limit] | None = None,
 ) -> Iterator[LimitedLink]:
     """The link, for the duration of the block; everything that belongs to it is removed at the end.
 
     kind            netns or relay
-    limit           its rate, queue and delay
+    limit           its rate, queue and delay, unless it has lanes
     media, control  RTSP server and broker as configured
     on_sample       called 10 times a second from a thread, once the link is started; bytes, packets and dropped count
-                    since the link was set up
+                    since the link was set up; for each lane, if it has some
     dials           whether the vehicle dials the operator for media, as with SRT; kind netns
+    lanes           limits by name of the vehicle's device; kind netns. None: one without a name
     raises          RunError if it cannot be set up, with the remedy; at the end, if it has failed meanwhile
     """
     if kind not in KINDS:
         raise RunError(f"link={kind}: unknown kind{suggest(kind, KINDS)}")
-    with KINDS[kind](limit, media, control, dials) as ends:
-        link = LimitedLink(limit, ends, on_sample)
+    limits = lanes or {"": limit}
+    with KINDS[kind](limits, media, control, dials) as ends:
+        link = LimitedLink(limits, ends, on_sample)
         try:
             yield link
         finally:

@@ -13,6 +13,7 @@ from dataclasses import asdict
 from typing import Any, NamedTuple
 
 from runner.link.bucket import Bucket
+from runner.link.limit import How, Rates
 from runner.link.losses import LossModel
 from runner.link.policer import Policer
 
@@ -37,6 +38,7 @@ class Direction:
         self._losses, self._lost = LossModel(loss, burst), 0
         self._policer, self._policed = Policer(*policer, now=time.monotonic()) if policer else None, 0
         self._delayed: deque[tuple[float, Delivery]] = deque()
+        self._cut: How | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._departed = asyncio.Event()
         self._turn = asyncio.Lock()  # connections take turns, in order
@@ -52,10 +54,14 @@ class Direction:
         self._bucket.put(size, delivery, now, keep=keep)
         self._deliver()
 
-    def change(self, kbps: float | None, delay_ms: float | None) -> dict[str, Any]:
-        """Change rate and delay; None: unchanged. Returns `runner.link.limit.LinkCounters` as a dictionary."""
+    def change(self, kbps: float | None, delay_ms: float | None, cut: How | None = None) -> dict[str, Any]:
+        """Change rate and delay; None: unchanged. Returns `runner.link.limit.LinkCounters` as a dictionary.
+
+        cut  see `runner.link.limit.Cut`; None: packets pass
+        """
         now = time.monotonic()
-        self._deliver()  # what has left by now has the former delay
+        self._deliver()  # what has left by now has the former delay, and passed if nothing was cut
+        self._cut = cut
         if kbps is not None:
             self._bucket.set_rate(kbps, now)
         if delay_ms is not None:
@@ -84,12 +90,14 @@ class Direction:
         for left, delivery in self._bucket.take(now):
             newest = self._delayed[-1][0] if self._delayed else left
             self._delayed.append((max(newest, left + self._delay_s), delivery))  # packets stay in order
-        while self._delayed and self._delayed[0][0] <= now:
-            self._delayed.popleft()[1]()
+        arriving = self._delayed if self._cut != "hold" else deque()
+        while arriving and arriving[0][0] <= now:
+            delivery = arriving.popleft()[1]
+            (self._lose if self._cut else delivery)()
         self._departed.set()
         if self._timer:
             self._timer.cancel()
-        times = [self._bucket.due(), self._delayed[0][0] if self._delayed else None]
+        times = [self._bucket.due(), arriving[0][0] if arriving else None]
         known = [when for when in times if when is not None]
         self._timer = asyncio.get_running_loop().call_at(min(known), self._deliver) if known else None
 
@@ -106,19 +114,20 @@ class Link(NamedTuple):
         return cls(Direction(**settings["up"]), Direction(**(settings["down"] or UNLIMITED)))
 
 
-async def take_rates(link: Link, more: Callable[[], Mapping[str, int]] = dict) -> None:
+async def take_rates(link: Link, more: Callable[[Rates], Mapping[str, int]] = lambda _: {}) -> None:
     """Set rates from standard input until it ends: each line has `runner.link.limit.Rates` as a list in JSON.
 
     Each line is answered with the counters of the first direction.
 
-    more  further counters
+    more  called with each; returns further counters
     """
     lines = asyncio.StreamReader()
     await asyncio.get_running_loop().connect_read_pipe(lambda: asyncio.StreamReaderProtocol(lines), sys.stdin)
     while line := await lines.readline():
-        up, down, up_delay_ms, down_delay_ms = json.loads(line)
-        link.down.change(down, down_delay_ms)
-        print(json.dumps({**link.up.change(up, up_delay_ms), **more()}), flush=True)
+        rates = Rates(*json.loads(line))
+        link.down.change(rates.down, rates.down_delay_ms, rates.cut)
+        counters = link.up.change(rates.up, rates.up_delay_ms, rates.cut)
+        print(json.dumps({**counters, **more(rates)}), flush=True)
 
 
 def exact_loop() -> asyncio.AbstractEventLoop:

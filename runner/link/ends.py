@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from runner.link.limit import Shaper
@@ -16,7 +17,7 @@ class Ends:
     vehicle_overrides   addresses at which the vehicle's RTSP server listens and it reaches the broker
     operator_overrides  addresses at which the operator reaches both
     broker              address at which the broker must listen
-    shaper              sets the rates and counts
+    shapers             by lane: sets the rates and counts
     notes               for the user
     """
 
@@ -24,7 +25,7 @@ class Ends:
     vehicle_overrides: tuple[str, ...]
     operator_overrides: tuple[str, ...]
     broker: Endpoint
-    shaper: Shaper
+    shapers: Mapping[str, Shaper]
     notes: tuple[str, ...] = ()
 
 

@@ -4,19 +4,44 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from math import inf
+from typing import Any, Literal, NamedTuple, Protocol
 
+MOST_ADDRESSES = 13  # of the vehicle: one for each lane, and one for each change
 PACKET_BYTES = 1500  # the largest IP packet on Ethernet
 BURST_S = 0.002  # of data that an idle link passes in a burst; with less, late timers on a busy machine would cost rate
 
+How = Literal["carrier", "down", "address", "silence", "hold"]
+
+
+class Cut(NamedTuple):
+    """A lane that is cut, from at_s on for for_s, s after the start of the drive; nothing passes meanwhile.
+
+    how  carrier: the vehicle's device loses its carrier
+         down: that device is down
+         silence: packets vanish without any sign
+         hold: packets are held, and flood out when it ends
+         address: no cut, the device gets another address at once and for good (for_s 0)
+    """
+
+    at_s: float
+    for_s: float
+    how: How
+
 
 class Rates(NamedTuple):
-    """kbit/s in force from vehicle to operator and back, and the delay each way, ms; None: unlimited, unchanged."""
+    """kbit/s in force from vehicle to operator and back, and the delay each way, ms; None: unlimited, unchanged.
+
+    cut    how the lane is cut; None: it is not
+    moves  how often the vehicle has got another address
+    """
 
     up: float
     down: float | None
     up_delay_ms: float | None = None
     down_delay_ms: float | None = None
+    cut: How | None = None
+    moves: int = 0
 
 
 class Policing(NamedTuple):
@@ -79,17 +104,23 @@ class Limit(OneWay):
 
     reverse  effect on traffic from the operator to the vehicle; None: none
     tcp      competing traffic from vehicle to operator; None: none
+    cuts     when nothing passes; kind netns
     """
 
     reverse: OneWay | None = None
     tcp: TcpFlows | None = None
+    cuts: tuple[Cut, ...] = ()
 
     def rates(self, t: float) -> Rates:
         """The rates to set; before the start, those at the start."""
-        at, up, down = max(0.0, t), self.changing_delay_ms, self.reverse
-        if down is None:
-            return Rates(float(self.kbps_at(at)), None, up(at))
-        return Rates(float(self.kbps_at(at)), float(down.kbps_at(at)), up(at), down.changing_delay_ms(at))
+        at, down = max(0.0, t), self.reverse
+        back = (float(down.kbps_at(at)), down.changing_delay_ms(at)) if down else (None, None)
+        cut = next((cut.how for cut in self.cuts if cut.at_s <= at < cut.at_s + cut.for_s), None)
+        return Rates(float(self.kbps_at(at)), back[0], self.changing_delay_ms(at), back[1], cut, self.moves(at))
+
+    def moves(self, t: float = inf) -> int:
+        """How often the vehicle has got another address by then."""
+        return sum(cut.how == "address" and cut.at_s <= t for cut in self.cuts)
 
     def directions(self) -> dict[str, Any]:
         """The settings of both directions at the start."""
@@ -105,7 +136,7 @@ class LinkCounters:
     bytes      forwarded from vehicle to operator
     packets    of these
     dropped    packets that found the queue full, or exceeded the rate of a policer
-    lost       packets lost after the queue
+    lost       packets lost after the queue, at random or while it was cut
     tcp_bytes  that competing TCP flows have delivered
     """
 

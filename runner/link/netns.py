@@ -2,6 +2,11 @@
 
     vehicle's namespace link0 ---- runner.link.tunnel ---- tod-N this machine's namespace
 
+A link of lanes has such a pair, with a process, for each of them. In the vehicle's namespace each is a device with the
+lane's name and an address of its own; all reach this machine's one address. A socket that is bound to such a device or
+address uses that lane or none: packets of a lane that is down never leave by another. Other sockets use the first lane
+that is up.
+
 Both devices are TUN devices of one process, which limits, delays and drops packets of any protocol in both directions.
 Sizes are those of IP packets. The operator, its page and the broker stay in this machine's namespace, where Linux would
 answer at the link's address to whoever is on any network of this machine: rules of routing limit that to the vehicle.
@@ -14,13 +19,11 @@ import ipaddress
 import json
 import os
 import random
-import shutil
 import signal
 import socket
-import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -28,46 +31,65 @@ from typing import Any
 from runner.errors import RunError
 from runner.link.child import Child, ChildShaper
 from runner.link.ends import Ends, overrides
-from runner.link.limit import Limit, TcpFlows
+from runner.link.iproute import ALTERNATIVE, find, run, succeeds
+from runner.link.lane import Lane, LaneShaper
+from runner.link.limit import Limit, Shaper, TcpFlows
 from runner.settings import Endpoint
 from runner.system import children
 from runner.system.signals import urgent
 
-NETWORK = ipaddress.IPv4Network("10.77.0.0/16")  # split into a pair of addresses per link
+NETWORK = ipaddress.IPv4Network("10.77.0.0/16")  # split into a network per link
+PREFIX = 28  # of that: room for this machine's address and MOST_ADDRESSES of the vehicle
 LINK = "link0"  # the vehicle's device
 RUN = Path("/run/netns")  # where ip keeps namespaces by name
 TO_VEHICLE, TO_OTHERS = 7700, 7701  # priorities of the rules for packets from this machine's address of the link
 CAP_NET_ADMIN, CAP_SYS_ADMIN = 12, 21  # linux/capability.h
-COMMAND_S = 10.0  # how long a command of iproute2 may take
-ALTERNATIVE = "or choose link=relay"
 
 
 @contextmanager
-def namespaced(limit: Limit, media: Endpoint, control: Endpoint, dials: bool = False) -> Iterator[Ends]:
+def namespaced(limits: Mapping[str, Limit], media: Endpoint, control: Endpoint, dials: bool = False) -> Iterator[Ends]:
     """The link, for the duration of the block; processes still running in its namespace at the end are killed.
 
+    limits          by lane; "": that of a link without lanes
     media, control  their ports are used, on addresses of the link
     dials           whether the vehicle dials the operator for media, as with SRT
     raises          RunError with the remedy
     """
     ip = check_possible()
-    with _claimed_network(ip) as (name, network), urgent(lambda: _remove(ip, name, network)):
-        machine, vehicle = map(str, network.hosts())
-        devices = (name, f"{name}-far")
+    with _claimed_network(ip) as (name, network), urgent(lambda: _remove(ip, name, network)), ExitStack() as stack:
+        stack.callback(_remove, ip, name, network)
+        lanes = list(_lanes(limits, name, network))
+        tunnels = [stack.enter_context(_tunnel(*each)) for each in zip(lanes, limits.values(), strict=True)]
+        ports = [tunnel.answer()["port"] for tunnel in tunnels]
+        _connect(ip, name, lanes, has_lanes="" not in limits)
+        machine, vehicle = lanes[0].machine, lanes[0].addresses[0]
+        broker = Endpoint(machine, control.port)
+        # As safe as loopback: only the two ends reach these addresses.
+        ends = overrides(Endpoint(machine if dials else vehicle, media.port), broker)
+        both = (*ends, f"insecure={network}")
         inside = (ip, "netns", "exec", name)
-        settings = {"devices": devices, "host": machine, **limit.directions()}
-        try:
-            with _child("tunnel", settings) as tunnel:
-                port = tunnel.answer()["port"]
-                _connect(ip, devices, (machine, vehicle))
-                broker = Endpoint(machine, control.port)
-                # As safe as loopback: only the two ends reach these addresses.
-                ends = overrides(Endpoint(machine if dials else vehicle, media.port), broker)
-                both = (*ends, f"insecure={network}")
-                with _competing_flows(limit.tcp, (machine, port), inside) as (tcp, notes):
-                    yield Ends(inside, both, both, broker, ChildShaper(tunnel, tcp), notes)
-        finally:
-            _remove(ip, name, network)
+        flows = next(iter(limits.values())).tcp
+        tcp, notes = stack.enter_context(_competing_flows(flows, (machine, ports[0]), inside))
+        plain = [ChildShaper(tunnels[0], tcp), *map(ChildShaper, tunnels[1:])]
+        shapers: dict[str, Shaper] = {
+            key: LaneShaper(shaper, lane, (ip, "-netns", name)) if key else shaper
+            for key, shaper, lane in zip(limits, plain, lanes, strict=True)
+        }
+        yield Ends(inside, both, both, broker, shapers, notes)
+
+
+def _lanes(limits: Mapping[str, Limit], name: str, network: ipaddress.IPv4Network) -> Iterator[Lane]:
+    """The lanes of a link, each with as many addresses as it will use."""
+    machine, *free = map(str, network.hosts())
+    for number, (device, limit) in enumerate(limits.items()):
+        needed = 1 + limit.moves()
+        own, free = free[:needed], free[needed:]
+        here, far = (f"{name}-{number}", f"{name}-far{number}") if number else (name, f"{name}-far")
+        yield Lane(number, device or LINK, here, far, machine, own)
+
+
+def _tunnel(lane: Lane, limit: Limit) -> AbstractContextManager[Child]:
+    return _child("tunnel", {"devices": (lane.here, lane.far), "host": lane.machine, **limit.directions()})
 
 
 @contextmanager
@@ -97,20 +119,22 @@ def _competing_flows(
         )
 
 
-def _connect(ip: str, devices: tuple[str, str], addresses: tuple[str, str]) -> None:
-    """Create the namespace, and set up this machine's device and the vehicle's, which moves there."""
-    (name, far), (machine, vehicle) = devices, addresses
-    in_namespace = (ip, "-netns", name)
-    _run(ip, "netns", "add", name)
-    _run(*in_namespace, "link", "set", "dev", "lo", "up")
-    _run(ip, "link", "set", "dev", far, "netns", name, "name", LINK)
-    for command, device, own, peer in (((ip,), name, machine, vehicle), (in_namespace, LINK, vehicle, machine)):
-        with suppress(RunError):  # a kernel without IPv6 lacks this setting, and sends nothing unprompted
-            _run(*command, "link", "set", "dev", device, "addrgenmode", "none")
-        _run(*command, "addr", "add", own, "peer", peer, "dev", device)
-        _run(*command, "link", "set", "dev", device, "up")
-    _run(ip, "rule", "add", "priority", str(TO_VEHICLE), "from", machine, "to", vehicle, "lookup", "main")
-    _run(ip, "rule", "add", "priority", str(TO_OTHERS), "from", machine, "unreachable")
+def _connect(ip: str, name: str, lanes: Sequence[Lane], *, has_lanes: bool) -> None:
+    """Create the namespace, and set up devices, routes and rules on both sides.
+
+    has_lanes  whether packets choose one by their source address
+    """
+    inside = (ip, "-netns", name)
+    run(ip, "netns", "add", name)
+    run(*inside, "link", "set", "dev", "lo", "up")
+    for lane in lanes:
+        lane.connect(ip, name)
+        if has_lanes:
+            lane.connect_routes(inside)
+    own = f"from {lanes[0].machine}"
+    for address in (address for lane in lanes for address in lane.addresses):
+        run(ip, *f"rule add priority {TO_VEHICLE} {own} to {address} lookup main".split())
+    run(ip, *f"rule add priority {TO_OTHERS} {own} unreachable".split())
 
 
 def _remove(ip: str, name: str, network: ipaddress.IPv4Network) -> None:
@@ -119,10 +143,10 @@ def _remove(ip: str, name: str, network: ipaddress.IPv4Network) -> None:
         identity = (RUN / name).stat().st_ino
     except FileNotFoundError:
         return
-    machine, _ = map(str, network.hosts())
     for priority in (TO_VEHICLE, TO_OTHERS):
-        _output_of(ip, "rule", "delete", "priority", str(priority), "from", machine)
-    _output_of(ip, "netns", "delete", name)  # first, so that no more processes can enter
+        while succeeds(ip, "rule", "delete", "priority", str(priority), "from", str(network[1])):
+            pass
+    succeeds(ip, "netns", "delete", name)  # first, so that no more processes can enter
     for pid in _inside(identity):
         with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
@@ -145,7 +169,7 @@ def _claimed_network(ip: str) -> Iterator[tuple[str, ipaddress.IPv4Network]]:
     The search starts at random: connections of an earlier link whose other end no longer exists send to its addresses
     for minutes, and would enter a new link with the same ones.
     """
-    networks = {f"tod-{number}": network for number, network in enumerate(NETWORK.subnets(new_prefix=30))}
+    networks = {f"tod-{number}": network for number, network in enumerate(NETWORK.subnets(new_prefix=PREFIX))}
     _remove_left_behind(ip, networks)
     names = [*networks]
     first = random.randrange(len(names))
@@ -184,24 +208,16 @@ def _claim(network: ipaddress.IPv4Network) -> Iterator[bool]:
 
 def _addresses(ip: str) -> list[ipaddress.IPv4Address]:
     """IPv4 addresses of this machine."""
-    devices = json.loads(_run(ip, "-json", "-4", "addr", "show"))
+    devices = json.loads(run(ip, "-json", "-4", "addr", "show"))
     addresses = (address["local"] for device in devices for address in device.get("addr_info", ()))
     return [ipaddress.IPv4Address(address) for address in addresses]
 
 
 def check_possible() -> str:
     """raises RunError if this machine or its user cannot set up such a link; returns the path of ip"""
-    ip = _find("ip")
+    ip = find("ip")
     _check_allowed()
     return ip
-
-
-def _find(program: str) -> str:
-    """Path of a program of iproute2, which Debian installs in a directory that is only in root's PATH."""
-    path = shutil.which(program, path=f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin")
-    if path is None:
-        raise RunError(f"link=netns needs {program}; on Debian: apt-get install iproute2, {ALTERNATIVE}")
-    return path
 
 
 def _check_allowed() -> None:
@@ -210,24 +226,3 @@ def _check_allowed() -> None:
     if not all(effective >> capability & 1 for capability in (CAP_NET_ADMIN, CAP_SYS_ADMIN)):
         rule = "run as root (CAP_NET_ADMIN and CAP_SYS_ADMIN)"
         raise RunError(f"link=netns may not make a network namespace: {rule}, {ALTERNATIVE}")
-
-
-def _run(*command: str) -> str:
-    """Standard output of a command. raises RunError with its error output if it fails"""
-    done = _done(command)
-    if done.returncode:
-        message = " ".join(done.stderr.split()) or f"status {done.returncode}"
-        raise RunError(f"link=netns: {Path(command[0]).name} {' '.join(command[1:])}: {message}; {ALTERNATIVE[3:]}")
-    return done.stdout
-
-
-def _output_of(*command: str) -> str:
-    """Standard output of a command that may fail."""
-    return _done(command).stdout
-
-
-def _done(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
-    try:
-        return subprocess.run(command, capture_output=True, text=True, check=False, timeout=COMMAND_S)
-    except subprocess.TimeoutExpired:
-        raise RunError(f"link=netns: {' '.join(command)}: has not ended within {COMMAND_S:g} s") from None

@@ -4,7 +4,8 @@ Creates two TUN devices and forwards IP packets between them, limited, delayed a
 `up` is the direction from the second device to the first.
 
 The first line of output shows that both exist, and names the port of a TCP server on `host`, which accepts and discards
-all data. Each line of input sets the rates, see `take_rates`; the process ends with its input, and the devices with it.
+all data. Each line of input sets the rates, see `take_rates`, and whether the second device has a carrier; the process
+ends with its input, and the devices with it.
 """
 
 from __future__ import annotations
@@ -21,9 +22,10 @@ from contextlib import suppress
 from functools import partial
 
 from runner.link.direction import Direction, Link, exact_loop, take_rates
+from runner.link.limit import Rates
 
 TUN = "/dev/net/tun"
-IFF_TUN, IFF_NO_PI, TUNSETIFF = 0x0001, 0x1000, 0x400454CA  # linux/if_tun.h
+IFF_TUN, IFF_NO_PI, TUNSETIFF, TUNSETCARRIER = 0x0001, 0x1000, 0x400454CA, 0x400454E2  # linux/if_tun.h
 IP_FREEBIND = 15  # linux/in.h
 PACKETS_PER_TURN = 64  # read before the other device gets its turn
 
@@ -57,6 +59,22 @@ def write(sink: int, packet: bytes) -> None:
         os.write(sink, packet)
 
 
+class Carrier:
+    """A device's carrier; the process ends if the kernel cannot take it away."""
+
+    def __init__(self, device: int) -> None:
+        self._device, self._is_there = device, True
+
+    def set(self, is_there: bool) -> None:
+        if is_there == self._is_there:
+            return
+        try:
+            fcntl.ioctl(self._device, TUNSETCARRIER, struct.pack("i", is_there))
+        except OSError as error:
+            sys.exit(f"cannot change the carrier of a network device: {error.strerror}; that needs Linux 5.0")
+        self._is_there = is_there
+
+
 class Sink(asyncio.Protocol):
     """Discards received data, and counts it for all connections."""
 
@@ -86,7 +104,13 @@ async def main() -> None:
     loop = asyncio.get_running_loop()
     for source, direction, sink in ((far, link.up, here), (here, link.down, far)):
         loop.add_reader(source, read, source, direction, sink)
-    await take_rates(link, lambda: {"tcp_bytes": Sink.received})
+    carrier = Carrier(far)
+
+    def more(rates: Rates) -> dict[str, int]:
+        carrier.set(rates.cut != "carrier")
+        return {"tcp_bytes": Sink.received}
+
+    await take_rates(link, more)
 
 
 if __name__ == "__main__":

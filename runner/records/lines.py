@@ -70,13 +70,14 @@ class LinkSample:
     """State of the limited link between the sides; counters run since it was made."""
 
     t: Time
-    kbps: Annotated[NonNegative, "rate in force, kbit/s"]
+    kbps: Annotated[NonNegative, "rate in force, kbit/s; 0 while a lane is cut"]
     queue_ms: Annotated[NonNegative, "how long a packet that arrives now waits, ms"]
     bytes: Annotated[Count, "forwarded from vehicle to operator"]
     packets: Annotated[Count, "forwarded from vehicle to operator"]
     dropped: Annotated[Count, "packets that its queue dropped"]
-    lost: Annotated[Count, "packets lost at random, after the queue"] = 0
+    lost: Annotated[Count, "packets lost after the queue, at random or while it was cut"] = 0
     tcp_bytes: Annotated[Count, "that competing TCP flows have delivered, without headers"] = 0
+    lane: Annotated[str, "name of the lane; absent: the link has none"] | UnsetType = UNSET
 
 
 @dataclass(frozen=True, slots=True)

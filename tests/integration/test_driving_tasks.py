@@ -100,13 +100,13 @@ def drive(tmp_path_factory):
     words += ("modes=open_loop",)  # not the measured link, whose stalls would lower the total
     setup = configuration(words, conf).setup()
     with (
-        relayed(Limit(lambda t: WIDE, QUEUE_MS, 0), media, control) as ends,
+        relayed({"": Limit(lambda t: WIDE, QUEUE_MS, 0)}, media, control) as ends,
         private_broker(control),
         fed((str(conf), *words, *ends.vehicle_overrides)) as feeding,
         process("operator", *words, *ends.operator_overrides, f"conf={conf}", stdout=subprocess.DEVNULL),
     ):
         until(lambda: answers(page.port))
-        yield Drive(f"http://127.0.0.1:{page.port}/", setup, feeding, ends.shaper)
+        yield Drive(f"http://127.0.0.1:{page.port}/", setup, feeding, ends.shapers[""])
 
 
 @contextmanager
