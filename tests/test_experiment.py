@@ -210,6 +210,55 @@ def test_delays_over_time_add_to_the_constant_one(tmp_path: Path) -> None:
         limited("link=relay", f"link.delay_file={_rates(tmp_path)}")
 
 
+def test_lanes_differ_from_the_link_and_are_cut(tmp_path: Path) -> None:
+    """The rate of a lane replaces the link's, in whatever form that is stated."""
+    lanes = f"link.lanes={{a: {{file: {_rates(tmp_path)}}}, b: {{delay_ms: 60}}, c: {{kbps: 70, share: 1}}}}"
+    silent, moves = "{lane: b, at_s: 3, for_s: 2, how: silence}", "{lane: b, at_s: 4, how: address}"
+    words = ("pqos=live", "link.kbps=1000", "link.share=2", "link.delay_ms=5", "link.loop=false")
+    link = limited("link=netns", lanes, f"link.cuts=[{silent}, {moves}]", *words)
+    found = {name: [lane.rates(t)[0] for t in (0, 9)] for name, lane in link.lanes.items()}
+    assert found == {"a": [1000, 100], "b": [2000, 2000], "c": [70, 70]}
+    assert [lane.delay_ms for lane in link.lanes.values()] == [5, 60, 5]
+    assert [link.lanes["b"].rates(t)[4:] for t in (2.9, 3, 4, 5)] == [
+        (None, 0),
+        ("silence", 0),
+        ("silence", 1),
+        (None, 1),
+    ]
+    assert link.lanes["a"].rates(3)[4:] == (None, 0)
+
+
+def test_wrong_lanes_and_cuts_are_reported_together(tod: Command) -> None:
+    down = "{lane: wwan1, at_s: 1, for_s: 2, how: down}"
+    cuts = f"{down}, {{lane: b, at_s: 1, for_s: 2, how: hold}}, {{lane: b, at_s: 2.5, for_s: 1, how: down}}"
+    more = "{lane: b, at_s: 5, how: silence}, {lane: b, at_s: 2, for_s: 3, how: address}"
+    words = ("link=netns", "link.lanes={wwan0: {}, b: {kbps: 9, file: x.csv}}", f"link.cuts=[{cuts}, {more}]")
+    assert tod("demo", *words, "log=/nowhere").problems == [
+        "command line: link.lanes.b.kbps: 9: must not be given beside file",
+    ]
+    words = ("link=netns", "link.lanes={wwan0: {}, b: {}}", f"link.cuts=[{cuts}, {more}]")
+    assert tod("demo", *words, "log=/nowhere").problems == [
+        "command line: link.cuts[0].lane: wwan1: unknown lane, did you mean wwan0?",
+        "command line: link.cuts[3].for_s: must be given: how long it lasts, s",
+        "command line: link.cuts[4].for_s: 3: must not be given: the address changes for good",
+        "command line: link.cuts[2]: from 2.5 to 3.5 s: must not overlap cuts[1] of the same lane, from 1 to 3 s",
+    ]
+    name = "must be a name for a network device: at most 15 letters, digits, _, - and ., and not lo, all or default"
+    found = tod("demo", "link=netns", "link.lanes={abcdefghijklmnop: {}, lo: {}}", "log=/nowhere").problems
+    assert found == [f"command line: link.lanes: '{each}': {name}" for each in ("abcdefghijklmnop", "lo")]
+    many = ", ".join(f"l{n}: {{}}" for n in range(13))
+    (found,) = tod(
+        "demo", "link=netns", f"link.lanes={{{many}}}", "link.cuts=[{lane: l0, at_s: 1, how: address}]"
+    ).problems
+    assert found.endswith("need 14 addresses, one each and one for each change: must be at most 13")
+    rule = "is not supported by link=relay; choose link=netns; see conf/link/relay.yaml: kind: 'relay'"
+    assert tod("demo", "link=relay", "link.lanes={a: {}}").problems == [f"command line: link.lanes: {rule}"]
+    assert (
+        "link.lanes: a: must be null: a simulated link has no lanes"
+        in tod("simulate", "link=netns", "link.lanes={a: {}}").err
+    )
+
+
 def _rates(tmp_path: Path) -> Path:
     path = tmp_path / "rates.csv"
     path.write_text("t_s,kbps\n0,500\n1,50\n")

@@ -279,8 +279,13 @@ class Builder:
         elif dialling and len(dialling) < len(cameras):
             rule = f"needs all cameras on RTSP or none: the graph of {dialling[0]} has its own transport"
             self._refuse_link("kind", link.kind, rule, self._place(("cameras", dialling[0]), "graph.transport"))
-        if link.limit.tcp and link.kind == "relay":
-            self._refuse_link("tcp", None, "is not supported by link=relay; choose link=netns", ("link", "kind"))
+        for key, given in (("tcp", link.limit.tcp), ("lanes", link.lanes)):
+            if given and link.kind == "relay":
+                self._refuse_link(key, None, "is not supported by link=relay; choose link=netns", ("link", "kind"))
+        from runner.configuration.experiment import lane_problems
+
+        for error in lane_problems(self.composed.document["link"]):
+            self._report(("link",), error)
 
     def _refuse_link(self, key: str, found: str | None, rule: str, other: schema.Path) -> None:
         self.problems.append(self.composed.problem(("link", key), found, rule, [other]))

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from runner.core.events import ClockAdvanced, Event
 from runner.core.model import Kbps, ModelError, exact
+from runner.errors import suggest
 from runner.pqos import Pqos, build_pqos, build_track, trace
 from runner.pqos.settings import find_file, within
 from runner.schema import event_problem
 
 if TYPE_CHECKING:  # a side that drives loads no evaluation tool
-    from runner.link.limit import Limit, OneWay, Policing, TcpFlows
+    from runner.link.limit import Cut, Limit, OneWay, Policing, TcpFlows
     from runner.pqos.track import Track
 
 RateAtTime = Callable[[float], Kbps]  # rate in force at a time of the drive (s), kbit/s
@@ -48,10 +50,15 @@ class Experiment:
 
 @dataclass(frozen=True)
 class LinkSettings:
-    """A link of limited rate between the two sides: its kind, netns or relay, and how it limits packets."""
+    """A link of limited rate between the two sides: its kind, netns or relay, and how it limits packets.
+
+    limit  that of the first lane, if it has lanes
+    lanes  by name of the vehicle's device; empty: it has none
+    """
 
     kind: str
     limit: Limit
+    lanes: Mapping[str, Limit] = field(default_factory=dict)
 
 
 def read_experiment(data: Mapping[str, Any]) -> Experiment:
@@ -78,12 +85,65 @@ def read_link(data: Mapping[str, Any], predicted: RateAtTime, bases: Sequence[Pa
     bases      directories in which a relative file is looked up
     raises     ModelError with the key, the value found and the rule
     """
+    lanes = {}
+    for name, own in (data.get("lanes") or {}).items():
+        with within(f"lanes.{name}"):
+            lanes[name] = _limit({**data, **_alone(own)}, predicted, bases, _cuts(data, name))
+    limit = next(iter(lanes.values())) if lanes else _limit(data, predicted, bases, ())
+    return LinkSettings(data["kind"], limit, lanes)
+
+
+def _alone(own: Mapping[str, Any]) -> Mapping[str, Any]:
+    """What a lane states, with its rate alone: the link may state one in another form."""
+    return {"file": None, "kbps": None, **own} if own.get("file") or own.get("kbps") else own
+
+
+def _cuts(data: Mapping[str, Any], lane: str) -> tuple[Cut, ...]:
+    from runner.link.limit import Cut
+
+    cuts = [cut for cut in data.get("cuts") or () if cut["lane"] == lane]
+    return tuple(Cut(float(cut["at_s"]), float(cut.get("for_s", 0)), cut["how"]) for cut in cuts)
+
+
+def lane_problems(data: Mapping[str, Any]) -> Iterator[ModelError]:
+    """What the schema does not see in the lanes of a `link` section and in their cuts."""
+    from runner.link.limit import MOST_ADDRESSES
+
+    lanes, cuts = data.get("lanes") or {}, data.get("cuts") or ()
+    needed = len(lanes) + sum(cut["how"] == "address" for cut in cuts)
+    if needed > MOST_ADDRESSES:
+        rule = f"need {needed} addresses, one each and one for each change: must be at most {MOST_ADDRESSES}"
+        yield ModelError("lanes", ", ".join(lanes), rule)
+    for index, cut in enumerate(cuts):
+        if cut["lane"] not in lanes:
+            hint = suggest(cut["lane"], lanes) if lanes else ": link.lanes names none"
+            yield ModelError(f"cuts[{index}].lane", cut["lane"], f"unknown lane{hint}")
+        if cut["how"] == "address" and "for_s" in cut:
+            yield ModelError(f"cuts[{index}].for_s", cut["for_s"], "must not be given: the address changes for good")
+        if cut["how"] != "address" and "for_s" not in cut:
+            yield ModelError(f"cuts[{index}].for_s", None, "must be given: how long it lasts, s")
+    for (first, one), (second, other) in combinations(enumerate(cuts), 2):
+        if one["lane"] == other["lane"] and _overlap(one, other):
+            rule = f"must not overlap cuts[{first}] of the same lane, {_span(one)}"
+            yield ModelError(f"cuts[{second}]", _span(other), rule)
+
+
+def _overlap(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Whether two cuts share some time; the moment of a new address may be within another cut."""
+    if "address" in (one["how"], other["how"]):
+        return False
+    ends = [cut["at_s"] + cut.get("for_s", 0) for cut in (one, other)]
+    return bool(max(one["at_s"], other["at_s"]) < min(ends))
+
+
+def _span(cut: Mapping[str, Any]) -> str:
+    return f"from {cut['at_s']:g} to {cut['at_s'] + cut['for_s']:g} s"
+
+
+def _limit(data: Mapping[str, Any], predicted: RateAtTime, bases: Sequence[Path], cuts: tuple[Cut, ...]) -> Limit:
     from runner.link.limit import Limit
 
-    if predicted is no_rates and not data["file"]:
-        raise ModelError("file", None, "must be given: live predictions give no rate for the link to follow")
-    rates = _recorded(data, data["loop"], bases) if data["file"] else predicted
-    share = float(data["share"])
+    rates, share = _rates(data, predicted, bases), float(data["share"])
 
     def kbps_at(t: float) -> float:
         return share * float(rates(t))
@@ -93,8 +153,20 @@ def read_link(data: Mapping[str, Any], predicted: RateAtTime, bases: Sequence[Pa
     tcp = _tcp(data["tcp"]) if data.get("tcp") else None
     delay_at = _delays(data, data["loop"], bases)
     policer = _policer(data["policer"]) if data.get("policer") else None
-    limit = Limit(kbps_at, **_path(data), delay_at=delay_at, policer=policer, reverse=reverse, tcp=tcp)
-    return LinkSettings(data["kind"], limit)
+    return Limit(kbps_at, **_path(data), delay_at=delay_at, policer=policer, reverse=reverse, tcp=tcp, cuts=cuts)
+
+
+def _rates(data: Mapping[str, Any], predicted: RateAtTime, bases: Sequence[Path]) -> RateAtTime:
+    """The rate of the link, or of a lane: a file's, constant, or else the predicted one."""
+    kbps, file = data.get("kbps"), data["file"]
+    if kbps and file:
+        raise ModelError("kbps", kbps, "must not be given beside file", "file")
+    if kbps:
+        constant = exact(kbps)
+        return lambda _: constant
+    if predicted is no_rates and not file:
+        raise ModelError("file", None, "must be given: live predictions give no rate for the link to follow")
+    return _recorded(data, data["loop"], bases) if file else predicted
 
 
 def _recorded(data: Mapping[str, Any], loop: bool, bases: Sequence[Path]) -> RateAtTime:

@@ -212,6 +212,8 @@ def _compose(words: tuple[str, ...], conf: Path | None, configured: bool) -> tup
     link = config.link(None if configured else lambda _: Kbps(0))
     if link is None:
         raise ArgumentError("link", "null", "must not be null: it describes the link that is simulated")
+    if link.lanes:
+        raise ArgumentError("link.lanes", ", ".join(link.lanes), "must be null: a simulated link has no lanes")
     return config, link.limit
 
 

@@ -314,7 +314,9 @@ def _link(run: _Run) -> Iterator[tuple[LimitedLink | None, Log]]:
     try:
         media, control = run.setup.media, run.setup.control
         dials = any(camera.graph.transport != "rtsp" for camera in run.setup.vehicle.cameras.values())
-        with limited_link(settings.kind, settings.limit, media, control, log.record, dials=dials) as link:
+        with limited_link(
+            settings.kind, settings.limit, media, control, log.record, dials=dials, lanes=settings.lanes
+        ) as link:
             yield link, log
     finally:
         log.close()
