@@ -150,8 +150,8 @@ def draw_rates(axes: Any, drive: Series, t: float, share: float) -> None:
     """What was predicted, what the link carried, what arrived."""
     predicted = drive.predicted
     axes.step(predicted.t, predicted.y / 1000, where="post", color="#888", lw=1, label="predicted")
-    if drive.link is not None:
-        axes.plot(drive.link.t, drive.link.kbps / 1000, color="black", lw=1, label="the link carries")
+    for link in drive.links.values():
+        axes.plot(link.t, link.kbps / 1000, color="black", lw=1, label="the link carries")
     axes.plot(drive.actual.t, drive.actual.y / 1000, color="#0a61a8", lw=1.2, label="video received")
     axes.set_ylim(0, 1.1 * float(np.nanmax(predicted.y)) / 1000)
     axes.set_xlim(0, drive.end)

@@ -14,6 +14,8 @@ from helpers import vehicle
 from runner.configuration.compose import compose
 from runner.core.events import CameraSwitched
 from runner.drive.camera_series import sending_spans
+from runner.drive.document import to_json
+from runner.drive.figures import totals
 from runner.drive.panels import panels
 from runner.drive.read import read_drive
 from runner.drive.series import series
@@ -94,7 +96,7 @@ def test_sides_are_joined_by_the_time_they_began(tmp_path: Path) -> None:
 
 def test_the_vehicle_alone(tmp_path: Path) -> None:
     drive = series(read_drive(write_drive(tmp_path / "drive", ["vehicle"], seconds=20)))
-    assert (drive.measured, drive.link) == ("sent", None)
+    assert (drive.measured, drive.links) == ("sent", {})
     camera = drive.cameras["top_left"]
     assert camera.received is None
     assert camera.sent is not None
@@ -104,6 +106,22 @@ def test_the_vehicle_alone(tmp_path: Path) -> None:
     assert (drive.positions.east[0], drive.positions.north[0]) == (0, 0)
     moved = np.hypot(np.diff(drive.positions.east), np.diff(drive.positions.north)).sum()
     assert moved == pytest.approx(20 * 8, rel=0.01)
+
+
+def test_lanes_of_a_link_are_drawn_with_their_total(tmp_path: Path) -> None:
+    b_only = {"lane": "b", "kbps": 700, "dropped": 3}
+
+    def in_lanes(side: str, lines: Lines) -> Lines:
+        return [line | own for line in lines for own in ({"lane": "a"}, b_only)] if side == "link" else lines
+
+    drive = statistics(series(read_drive(write_drive(tmp_path / "drive", seconds=20, change=in_lanes))))
+    a, b = (drive.series.links[lane] for lane in "ab")
+    assert (set(b.kbps), b.dropped[-1]) == ({700}, 3)
+    shown = {curve.label: curve for curve in totals([drive])[0][0].curves}
+    assert [*shown][:3] == ["link's rate", "lane a", "lane b"]
+    np.testing.assert_array_equal(shown["link's rate"].y, a.kbps + 700)
+    (described,) = to_json([drive], {}, [], [])["drives"]
+    assert (described["link"], described["lanes"]["b"]["max_kbps"]) == (None, 700)
 
 
 def test_the_operator_alone(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
-from typing import Annotated, Literal, TypedDict
+from typing import Annotated, Literal, NotRequired, TypedDict
 
 import numpy as np
 
@@ -45,7 +45,7 @@ class Predictions(TypedDict):
 
 
 class Link(TypedDict):
-    """The limited link of an experiment.
+    """The limited link of an experiment, or a lane of it.
 
     min_kbps, max_kbps  its smallest and largest rate, kbit/s
     queue_p95_ms        95th percentile of a packet's wait, ms
@@ -246,7 +246,8 @@ class DriveDocument(TypedDict):
     lost, rebuilt       packets lost, receivers rebuilt
     damaged_share       of the frames, with visible damage from lost packets; None in older logs
     refused       requests
-    link          None where it was not limited
+    link          None where it was not limited, or has lanes
+    lanes         of the limited link, by name; absent where it has none
     quality       mean of the cameras; None where there is no model, or models are of different metrics
     delivered     None where it was not measured
     warnings      notes on the logs
@@ -281,6 +282,7 @@ class DriveDocument(TypedDict):
     rebuilt: int | None
     refused: Count
     link: Link | None
+    lanes: NotRequired[Mapping[str, Link]]
     quality: Quality | None
     delivered: Delivered | None
     warnings: list[str]
@@ -348,7 +350,8 @@ def rules(drive: Series) -> dict[str, list[str]]:
 
 def _drive(drive: DriveStatistics, checks: Sequence[ClaimCheck]) -> DriveDocument:
     series = drive.series
-    return {
+    lanes = {lane: _link(link) for lane, link in series.links.items()}
+    document: DriveDocument = {
         "label": series.label,
         "path": series.path,
         "replayed": None if series.replayed is None else list(series.replayed),
@@ -374,7 +377,7 @@ def _drive(drive: DriveStatistics, checks: Sequence[ClaimCheck]) -> DriveDocumen
         "damaged_share": number(drive.damaged),
         "rebuilt": drive.rebuilt,
         "refused": series.refused,
-        "link": _link(series.link) if series.link else None,
+        "link": lanes.pop("", None),
         "quality": {
             "metric": drive.metric,
             "mean": number(drive.quality, 5),
@@ -391,6 +394,9 @@ def _drive(drive: DriveStatistics, checks: Sequence[ClaimCheck]) -> DriveDocumen
         "checks": [{"claim": check.claim, "outcome": check.outcome, "holds": check.holds} for check in checks],
         "cameras": [_camera(camera) for camera in drive.cameras.values()],
     }
+    if lanes:
+        document["lanes"] = lanes
+    return document
 
 
 def _predictions(found: Worth) -> Predictions:

@@ -70,8 +70,7 @@ def totals(drives: Drives) -> Rows:
     """Predicted, allocated and actual total."""
 
     def curves(series: Series) -> Iterable[Curve]:
-        if series.link:
-            yield _steps("link's rate", TimeSeries(series.link.t, series.link.kbps), series, "link", filled=True)
+        yield from _link_rates(series)
         yield _steps("allocated", series.allocated, series, "allocated", width=1.6)
         yield _steps("predicted", series.predicted, series, "predicted", dash=1)
         if series.measured:
@@ -80,6 +79,18 @@ def totals(drives: Drives) -> Rows:
     found = [tuple(curves(drive.series)) for drive in drives]
     y = Axis("total in kbit/s", 0.0, _top(found))
     return [[_over_time(drives, at, _label(drives, at), y, each, hover=KBPS)] for at, each in enumerate(found)]
+
+
+def _link_rates(series: Series) -> Iterable[Curve]:
+    """The rate of a limited link; of one with lanes their total, and each of them."""
+    rates = {lane: TimeSeries(link.t, link.kbps) for lane, link in series.links.items()}
+    if rates:
+        t = np.unique(np.concatenate([rate.t for rate in rates.values()]))
+        total = np.sum([held(rate, t) for rate in rates.values()], axis=0)
+        yield _steps("link's rate", TimeSeries(t, total), series, "link", filled=True)
+    for number, (lane, rate) in enumerate(rates.items()):
+        if lane:
+            yield _steps(f"lane {lane}", rate, series, "text", dash=2 + number, width=0.7)
 
 
 def predictions(drives: Drives) -> Rows | str:

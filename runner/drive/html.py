@@ -162,8 +162,8 @@ def _drive_section(drive: DriveStatistics, *, several: bool) -> str:
     ]
     if series.replayed is not None:
         facts.insert(1, ("replayed with", " ".join(series.replayed) or "nothing changed"))
-    if series.link:
-        facts.append(("dropped on the link", f"{series.link.dropped[-1]:.0f} packets"))
+    for lane, link in series.links.items():
+        facts.append((f"dropped on {f'lane {lane}' if lane else 'the link'}", f"{link.dropped[-1]:.0f} packets"))
     return _section(series.label if several else "Drive", _list(facts))
 
 

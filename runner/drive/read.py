@@ -142,13 +142,15 @@ def read_drive(directory: Path) -> Drive:
 def read_link(directory: Path) -> list[LinkSample]:
     """What the limited link of a drive logged: at each change of its rate, and ten times a second.
 
-    raises  UserError with file and line of the first error, or if the drive had no limited link
+    raises  UserError with file and line of the first error, or if the drive had no limited link, or one of lanes
     """
     path = directory / FILES["link"]
     samples = list(_side("link", path, []).of(LinkSample)) if path.is_file() else []
     if not samples:
         rule = f"has no rates in {FILES['link']}: must be a drive over a limited link, which link= sets"
         raise UserError(str(directory), "", None, rule)
+    if any(sample.lane for sample in samples):
+        raise UserError(str(directory), "", None, "has lanes: must be a drive over a link without them")
     return samples
 
 

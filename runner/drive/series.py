@@ -52,7 +52,7 @@ class Positions:
 
 @dataclass(frozen=True, slots=True)
 class LinkSeries:
-    """The limited link of an experiment: rate in force, kbit/s; queueing delay, ms; packets dropped so far."""
+    """A limited link, or a lane of it: rate in force, kbit/s; queueing delay, ms; packets dropped so far."""
 
     t: FloatSeries
     kbps: FloatSeries
@@ -101,6 +101,7 @@ class Series:
     capped     whether rules lowered the total below what was asked for, a step function; empty if not logged
     measured_t when the vehicle measured the link, s
     held_up    (from s, to s), when a side's process was held up, or the vehicle sent frames late
+    links      the limited link by lane; "": it has none; empty: it was not limited
     modes      (from s, mode)
     notes      (s, text)
     refused    number of requests
@@ -123,7 +124,7 @@ class Series:
     capped: TimeSeries
     measured_t: FloatSeries
     held_up: tuple[tuple[float, float], ...]
-    link: LinkSeries | None
+    links: Mapping[str, LinkSeries]
     positions: Positions | None
     modes: tuple[tuple[float, str], ...]
     reasons: tuple[Reason, ...]
@@ -187,7 +188,7 @@ def _series(drive: Drive, label: str) -> Series:
         capped=_capped(operator),
         measured_t=np.array([t for t, _ in vehicle.of(LinkMeasured)], dtype=float),
         held_up=tuple(_held_up(vehicle, samples)),
-        link=_link([at for at in link.of(LinkSample) if 0 <= at[0] <= end]),
+        links=_links([at for at in link.of(LinkSample) if 0 <= at[0] <= end]),
         positions=_positions(_Shifted(leading.lines, 0.0), samples),
         modes=tuple(_modes(decisions)),
         reasons=tuple(_reasons(decisions)),
@@ -274,11 +275,11 @@ def _gaps(times: Sequence[float], every_s: float) -> Iterator[tuple[float, float
     return ((before, t) for before, t in pairwise(times) if t - before > every_s + HELD_UP_S)
 
 
-def _link(lines: Sequence[Any]) -> LinkSeries | None:
-    if not lines:
-        return None
-    rows = np.array([(t, line.kbps, line.queue_ms, line.dropped) for t, line in lines], dtype=float)
-    return LinkSeries(*rows.T)
+def _links(lines: Sequence[tuple[float, LinkSample]]) -> dict[str, LinkSeries]:
+    rows: dict[str, list[tuple[float, ...]]] = {}
+    for t, line in lines:
+        rows.setdefault(line.lane or "", []).append((t, line.kbps, line.queue_ms, line.dropped))
+    return {lane: LinkSeries(*np.array(each, dtype=float).T) for lane, each in rows.items()}
 
 
 def _positions(leading: _Shifted, samples: Sequence[Any]) -> Positions | None:
