@@ -15,7 +15,7 @@ from itertools import groupby
 from math import inf
 from typing import NamedTuple
 
-from test_link import WIDE, _ends, _names, _python, full_rate
+from test_link import WIDE, _ends, _left, _python, full_rate
 
 from rig import needs_root, until
 from runner.link import Limit, limited_link
@@ -181,7 +181,7 @@ def test_a_lane_is_cut_and_restored_while_another_goes_on():
             watching.terminate()
             changes = watching.stdout.read()
         link.check()
-    assert not [found for found in _names() if found.startswith(names[0])]
+    assert not _left(names[0])
     assert names[1] not in subprocess.check_output(["ip", "rule"], text=True)
 
     arrived = {(each.way, each.number) for each in operator.arrivals}
@@ -226,5 +226,5 @@ def test_the_next_run_removes_all_lanes_of_a_killed_one():
     )
     name, host = _python(code).stdout.split()
     with limited_link("netns", WIDE, *_ends(), print):
-        until(lambda: not [found for found in _names() if found.startswith(name)])
+        until(lambda: not _left(name))
         assert host not in subprocess.check_output(["ip", "rule"], text=True)
