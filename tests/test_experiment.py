@@ -251,8 +251,11 @@ def test_wrong_lanes_and_cuts_are_reported_together(tod: Command) -> None:
         "demo", "link=netns", f"link.lanes={{{many}}}", "link.cuts=[{lane: l0, at_s: 1, how: address}]"
     ).problems
     assert found.endswith("need 14 addresses, one each and one for each change: must be at most 13")
-    rule = "is not supported by link=relay; choose link=netns; see conf/link/relay.yaml: kind: 'relay'"
-    assert tod("demo", "link=relay", "link.lanes={a: {}}").problems == [f"command line: link.lanes: {rule}"]
+    rule = (
+        "must be silence or hold: link=relay has no devices; choose link=netns; see conf/link/relay.yaml: kind: 'relay'"
+    )
+    relayed = ("link=relay", "link.lanes={b: {}}", "link.cuts=[{lane: b, at_s: 1, for_s: 2, how: down}]")
+    assert tod("demo", *relayed).problems == [f"command line: link.cuts[0].how: down: {rule}"]
     assert (
         "link.lanes: a: must be null: a simulated link has no lanes"
         in tod("simulate", "link=netns", "link.lanes={a: {}}").err

@@ -271,6 +271,8 @@ class Builder:
 
     def check_link(self, link: LinkSettings) -> None:
         """Check that all cameras can use a limited link, and that its kind supports the settings."""
+        from runner.configuration.experiment import lane_problems
+
         cameras = tuple(self.setup.vehicle.cameras.values()) if self.setup else ()
         dialling = [camera.name for camera in cameras if camera.graph.transport != "rtsp"]
         if dialling and link.kind == "relay":
@@ -279,11 +281,8 @@ class Builder:
         elif dialling and len(dialling) < len(cameras):
             rule = f"needs all cameras on RTSP or none: the graph of {dialling[0]} has its own transport"
             self._refuse_link("kind", link.kind, rule, self._place(("cameras", dialling[0]), "graph.transport"))
-        for key, given in (("tcp", link.limit.tcp), ("lanes", link.lanes)):
-            if given and link.kind == "relay":
-                self._refuse_link(key, None, "is not supported by link=relay; choose link=netns", ("link", "kind"))
-        from runner.configuration.experiment import lane_problems
-
+        if link.limit.tcp and link.kind == "relay":
+            self._refuse_link("tcp", None, "is not supported by link=relay; choose link=netns", ("link", "kind"))
         for error in lane_problems(self.composed.document["link"]):
             self._report(("link",), error)
 

@@ -118,6 +118,9 @@ def lane_problems(data: Mapping[str, Any]) -> Iterator[ModelError]:
         if cut["lane"] not in lanes:
             hint = suggest(cut["lane"], lanes) if lanes else ": link.lanes names none"
             yield ModelError(f"cuts[{index}].lane", cut["lane"], f"unknown lane{hint}")
+        if data["kind"] == "relay" and cut["how"] not in ("silence", "hold"):
+            rule = "must be silence or hold: link=relay has no devices; choose link=netns"
+            yield ModelError(f"cuts[{index}].how", cut["how"], rule, "kind")
         if cut["how"] == "address" and "for_s" in cut:
             yield ModelError(f"cuts[{index}].for_s", cut["for_s"], "must not be given: the address changes for good")
         if cut["how"] != "address" and "for_s" not in cut:

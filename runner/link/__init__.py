@@ -2,8 +2,8 @@
 
 Arrivals, losses and delays are thus measured, not assumed. Two kinds: `netns` (root; packets of any protocol between
 two network namespaces) and `relay` (no root; RTSP, RTP and MQTT through a process). Both limit all traffic from the
-vehicle to the operator in one queue, and all traffic back in another, if that is limited. A link of kind `netns` may
-have lanes, as a vehicle with several modems has: each is a network device of the vehicle with limits of its own.
+vehicle to the operator in one queue, and all traffic back in another, if that is limited. A link may have lanes, as of
+a vehicle with several modems: each is a network device of the vehicle, or one of its addresses, with its own limits.
 
 with limited_link("relay", limit, vehicle.media, vehicle.control, log.record) as link, private_broker(link.broker):
     ...  # [*link.vehicle_command, python, ..., *link.vehicle_overrides] and [python, ..., *link.operator_overrides]
@@ -134,7 +134,7 @@ def limited_link(
     on_sample       called 10 times a second from a thread, once the link is started; bytes, packets and dropped count
                     since the link was set up; for each lane, if it has some
     dials           whether the vehicle dials the operator for media, as with SRT; kind netns
-    lanes           limits by name of the vehicle's device; kind netns. None: one without a name
+    lanes           limits by name, which is that of the vehicle's device; None: one without a name
     raises          RunError if it cannot be set up, with the remedy; at the end, if it has failed meanwhile
     """
     if kind not in KINDS:

@@ -111,18 +111,19 @@ class Child:
 class ChildShaper:
     """A child that forwards packets, and reads rates with `runner.link.direction.take_rates`.
 
-    tcp  child that sends competing TCP flows, started with the first rates; None: no such flows
+    tcp     child that sends competing TCP flows, started with the first rates; None: no such flows
+    number  of the link among those of the child
     """
 
-    def __init__(self, child: Child, tcp: Child | None = None) -> None:
-        self._child, self._tcp = child, tcp
+    def __init__(self, child: Child, tcp: Child | None = None, number: int = 0) -> None:
+        self._child, self._tcp, self._number = child, tcp, number
         self._tcp_started = False
 
     def limit(self, rates: Rates) -> LinkCounters:
         if self._tcp and not self._tcp_started:
             self._tcp_started = True
             self._tcp.ask("start")
-        return LinkCounters(**self._child.ask(json.dumps(rates)))
+        return LinkCounters(**self._child.ask(json.dumps([self._number, rates])))
 
     def check(self) -> None:
         for child in (self._child, self._tcp):

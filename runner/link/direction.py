@@ -8,8 +8,9 @@ import selectors
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from typing import Any, NamedTuple
 
 from runner.link.bucket import Bucket
@@ -39,6 +40,7 @@ class Direction:
         self._policer, self._policed = Policer(*policer, now=time.monotonic()) if policer else None, 0
         self._delayed: deque[tuple[float, Delivery]] = deque()
         self._cut: How | None = None
+        self._repeated: deque[Delivery] = deque()  # of connections, which send again what vanishes in a cut
         self._timer: asyncio.TimerHandle | None = None
         self._departed = asyncio.Event()
         self._turn = asyncio.Lock()  # connections take turns, in order
@@ -51,7 +53,7 @@ class Direction:
             return
         if not keep and self._losses.draw():
             delivery = self._lose
-        self._bucket.put(size, delivery, now, keep=keep)
+        self._bucket.put(size, partial(self._arrive, delivery, keep), now, keep=keep)
         self._deliver()
 
     def change(self, kbps: float | None, delay_ms: float | None, cut: How | None = None) -> dict[str, Any]:
@@ -62,6 +64,8 @@ class Direction:
         now = time.monotonic()
         self._deliver()  # what has left by now has the former delay, and passed if nothing was cut
         self._cut = cut
+        while self._repeated and not cut:
+            self._repeated.popleft()()
         if kbps is not None:
             self._bucket.set_rate(kbps, now)
         if delay_ms is not None:
@@ -72,6 +76,15 @@ class Direction:
 
     def _lose(self) -> None:
         self._lost += 1
+
+    def _arrive(self, delivery: Delivery, keep: bool) -> None:
+        """A packet is at the end of the link."""
+        if not self._cut:
+            delivery()
+        elif keep:
+            self._repeated.append(delivery)
+        else:
+            self._lose()
 
     async def room(self, size: int) -> None:
         """Wait until the queue has room for `size` bytes, which packets that may be dropped do not take meanwhile."""
@@ -92,8 +105,7 @@ class Direction:
             self._delayed.append((max(newest, left + self._delay_s), delivery))  # packets stay in order
         arriving = self._delayed if self._cut != "hold" else deque()
         while arriving and arriving[0][0] <= now:
-            delivery = arriving.popleft()[1]
-            (self._lose if self._cut else delivery)()
+            arriving.popleft()[1]()
         self._departed.set()
         if self._timer:
             self._timer.cancel()
@@ -114,17 +126,18 @@ class Link(NamedTuple):
         return cls(Direction(**settings["up"]), Direction(**(settings["down"] or UNLIMITED)))
 
 
-async def take_rates(link: Link, more: Callable[[Rates], Mapping[str, int]] = lambda _: {}) -> None:
-    """Set rates from standard input until it ends: each line has `runner.link.limit.Rates` as a list in JSON.
+async def take_rates(links: Sequence[Link], more: Callable[[Rates], Mapping[str, int]] = lambda _: {}) -> None:
+    """Set rates from standard input until it ends: a line in JSON has a link's number and `runner.link.limit.Rates`.
 
-    Each line is answered with the counters of the first direction.
+    Each line is answered with the counters of that link's first direction.
 
     more  called with each; returns further counters
     """
     lines = asyncio.StreamReader()
     await asyncio.get_running_loop().connect_read_pipe(lambda: asyncio.StreamReaderProtocol(lines), sys.stdin)
     while line := await lines.readline():
-        rates = Rates(*json.loads(line))
+        number, stated = json.loads(line)
+        link, rates = links[number], Rates(*stated)
         link.down.change(rates.down, rates.down_delay_ms, rates.cut)
         counters = link.up.change(rates.up, rates.up_delay_ms, rates.cut)
         print(json.dumps({**counters, **more(rates)}), flush=True)

@@ -104,7 +104,7 @@ class Limit(OneWay):
 
     reverse  effect on traffic from the operator to the vehicle; None: none
     tcp      competing traffic from vehicle to operator; None: none
-    cuts     when nothing passes; kind netns
+    cuts     when nothing passes; with a relay, by silence or hold
     """
 
     reverse: OneWay | None = None

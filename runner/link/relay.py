@@ -1,4 +1,4 @@
-"""usage: python -m runner.link.relay '{"media": [HOST, PORT], "control": [HOST, PORT], "up": {...}, "down": null}'
+"""usage: python -m runner.link.relay '{"media": [HOST, PORT], "control": [HOST, PORT], "lanes": {"": {"up": {...}}}}'
 
 The process between vehicle and operator. It listens on two ports of its own, named in its first line of output:
 `media` for the operator's RTSP, forwarded to the vehicle's server, and `control` for the vehicle's MQTT, forwarded to
@@ -7,6 +7,9 @@ Traffic from vehicle to operator shares one `Bucket`; UDP packets that find it f
 the next room. Packets count as IP packets: payload plus 28 bytes (UDP), plus 52 bytes for each 1448 (TCP). RTSP
 messages and interleaved packets are never split. The other direction has a `Bucket` of its own if `down` is given,
 otherwise it is unlimited. Losses and delay follow the queue; only UDP packets are lost.
+
+Lanes are told apart by the address that the vehicle sends from, which the operator sees as well: both sides' packets of
+a lane pass a pair of ports at its address. What comes from another address, and all RTSP, uses the first lane.
 
 Each line of input sets the rates, see `take_rates`; the relay ends with its input.
 """
@@ -18,8 +21,9 @@ import gc
 import json
 import socket
 import sys
-from collections.abc import AsyncIterator, Callable, Coroutine, Iterable
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Mapping, Sequence
 from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -36,7 +40,26 @@ WAIT_S = 0.5  # for a server to accept
 
 SocketAddress = tuple[str, int]
 Cut = Callable[[bytes], Iterable[bytes]]
-Serve = Callable[["Link", SocketAddress, socket.socket, SocketAddress], Coroutine[Any, Any, None]]
+SocketPair = tuple[socket.socket, socket.socket]
+Serve = Callable[["Lanes", SocketAddress, socket.socket, SocketAddress], Coroutine[Any, Any, None]]
+
+
+@dataclass(frozen=True)
+class Lanes:
+    """Links by the vehicle's address; "": there is but one."""
+
+    links: Mapping[str, Link]
+
+    @property
+    def addresses(self) -> list[str]:
+        return [address for address in self.links if address]
+
+    @property
+    def first(self) -> Link:
+        return next(iter(self.links.values()))
+
+    def of(self, address: str) -> Link:
+        return self.links.get(address, self.first)
 
 
 async def join(link: Link, vehicle: socket.socket, other: socket.socket, up: Cut, down: Cut) -> None:
@@ -89,20 +112,24 @@ async def _write(arrived: asyncio.Queue[bytes], sink: socket.socket) -> None:
 
 
 class Ports:
-    """Two UDP sockets between both sides' RTP and RTCP ports.
+    """UDP sockets between both sides' RTP and RTCP ports: a pair at the relay's address, and at each lane's.
+
+    The vehicle knows the first pair only, the operator those of the lanes, too.
 
     operator  address of the operator's RTP
     server    host of the vehicle's server; its ports are known from its reply
     """
 
-    def __init__(self, link: Link, host: str, operator: SocketAddress, server: str) -> None:
-        self._link, self._operator, self._server = link, operator, server
+    def __init__(self, lanes: Lanes, host: str, operator: SocketAddress, server: str) -> None:
+        self._lanes, self._operator, self._server = lanes, operator, server
         self.server_port: int | None = None
-        self._sockets = _bind_pair(host)
-        self.port: int = self._sockets[0].getsockname()[1]
-        for index, sock in enumerate(self._sockets):
-            sock.setblocking(False)
-            asyncio.get_running_loop().add_reader(sock, self._read, index, sock)
+        self._near, *others = _bind_pairs([host, *lanes.addresses])
+        self._at = dict(zip(lanes.addresses, others, strict=True))
+        self.port: int = self._near[0].getsockname()[1]
+        for address, pair in (("", self._near), *self._at.items()):
+            for index, sock in enumerate(pair):
+                sock.setblocking(False)
+                asyncio.get_running_loop().add_reader(sock, self._read, address, index, sock)
 
     @property
     def operator_port(self) -> int:
@@ -114,11 +141,12 @@ class Ports:
         return rtsp.with_ports(reply, "client_port", lambda _: self.operator_port)
 
     def close(self) -> None:
-        for sock in self._sockets:
+        for sock in (sock for pair in (self._near, *self._at.values()) for sock in pair):
             asyncio.get_running_loop().remove_reader(sock)
             sock.close()
 
-    def _read(self, index: int, sock: socket.socket) -> None:
+    def _read(self, address: str, index: int, sock: socket.socket) -> None:
+        """Forward what has arrived at a socket, of the lane with that address if it is one's."""
         host, first = self._operator
         operator = (host, first + index)
         for _ in range(DATAGRAMS_PER_TURN):
@@ -129,10 +157,11 @@ class Ports:
             if self.server_port is None:
                 continue  # too early: the server's ports are not known yet
             if source[1] - self.server_port in (0, 1):
-                self._link.up.put(len(data) + UDP_HEADERS, _sender(sock, data, operator))
+                out = self._at.get(source[0], self._near)[index]
+                self._lanes.of(source[0]).up.put(len(data) + UDP_HEADERS, _sender(out, data, operator))
             else:
-                to_vehicle = _sender(sock, data, (self._server, self.server_port + index))
-                self._link.down.put(len(data) + UDP_HEADERS, to_vehicle)
+                to_vehicle = _sender(self._near[index], data, (address or self._server, self.server_port + index))
+                self._lanes.of(address).down.put(len(data) + UDP_HEADERS, to_vehicle)
 
 
 class Rtsp:
@@ -143,8 +172,8 @@ class Rtsp:
     server    the server's host
     """
 
-    def __init__(self, link: Link, operator: str, far: socket.socket, server: str) -> None:
-        self._link, self._operator = link, operator
+    def __init__(self, lanes: Lanes, operator: str, far: socket.socket, server: str) -> None:
+        self._lanes, self._operator = lanes, operator
         self._host, self._server = far.getsockname()[0], server
         self._ports: list[Ports] = []
         self._requests, self._replies = rtsp.Splitter(), rtsp.Splitter()
@@ -173,7 +202,7 @@ class Rtsp:
         for ports in self._ports:
             if ports.operator_port == port:
                 return ports.port
-        self._ports.append(Ports(self._link, self._host, (self._operator, port), self._server))
+        self._ports.append(Ports(self._lanes, self._host, (self._operator, port), self._server))
         return self._ports[-1].port
 
 
@@ -185,39 +214,41 @@ def _sender(sock: socket.socket, data: bytes, address: SocketAddress) -> Deliver
     return send
 
 
-def _bind_pair(host: str) -> tuple[socket.socket, socket.socket]:
-    """Two neighbouring ports, the first one even (RFC 3550, section 11)."""
+def _bind_pairs(hosts: Sequence[str]) -> list[SocketPair]:
+    """The same two neighbouring ports on each host, the first one even (RFC 3550, section 11)."""
     for _ in range(PAIR_TRIES):
-        first, second = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
-        try:
-            first.bind((host, 0))
-            port = first.getsockname()[1]
+        sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2 * len(hosts))]
+        pairs = list(zip(sockets[::2], sockets[1::2], strict=True))
+        port = 0
+        with suppress(OSError):
+            for host, (first, second) in zip(hosts, pairs, strict=True):
+                first.bind((host, port))
+                port = first.getsockname()[1]
+                if port % 2 == 0:
+                    second.bind((host, port + 1))
             if port % 2 == 0:
-                second.bind((host, port + 1))
-                return first, second
-        except OSError:
-            pass
-        first.close()
-        second.close()
-    raise OSError(f"no two neighbouring UDP ports are free on {host}")
+                return pairs
+        for sock in sockets:
+            sock.close()
+    raise OSError(f"no two neighbouring UDP ports are free on {', '.join(hosts)}")
 
 
-async def serve_media(link: Link, server: SocketAddress, near: socket.socket, operator: SocketAddress) -> None:
+async def serve_media(lanes: Lanes, server: SocketAddress, near: socket.socket, operator: SocketAddress) -> None:
     """Join an operator's connection to the vehicle's RTSP server, whose side is limited."""
     async with connected(server) as far:
         if far:
-            passing = Rtsp(link, operator[0], far, server[0])
+            passing = Rtsp(lanes, operator[0], far, server[0])
             try:
-                await join(link, far, near, passing.replies, passing.requests)
+                await join(lanes.first, far, near, passing.replies, passing.requests)
             finally:
                 passing.close()
 
 
-async def serve_control(link: Link, broker: SocketAddress, near: socket.socket, _vehicle: SocketAddress) -> None:
+async def serve_control(lanes: Lanes, broker: SocketAddress, near: socket.socket, vehicle: SocketAddress) -> None:
     """Join the vehicle's connection, which is limited, to the broker."""
     async with connected(broker) as far:
         if far:
-            await join(link, near, far, lambda data: [data], lambda data: [data])
+            await join(lanes.of(vehicle[0]), near, far, lambda data: [data], lambda data: [data])
 
 
 @asynccontextmanager
@@ -244,12 +275,12 @@ def listen(host: str) -> socket.socket:
     return server
 
 
-async def accept(server: socket.socket, link: Link, serve: Serve, address: SocketAddress) -> None:
+async def accept(server: socket.socket, lanes: Lanes, serve: Serve, address: SocketAddress) -> None:
     """Serve each connection in its own task, forever."""
     async with asyncio.TaskGroup() as tasks:
         while True:
             near, client = await asyncio.get_running_loop().sock_accept(server)
-            tasks.create_task(_served(serve(link, address, near, client), near))
+            tasks.create_task(_served(serve(lanes, address, near, client), near))
 
 
 async def _served(serving: Coroutine[Any, Any, None], near: socket.socket) -> None:
@@ -267,17 +298,17 @@ def _ipv4_address(host: str) -> str:
 async def main() -> None:
     settings = json.loads(sys.argv[1])
     media, control = ((_ipv4_address(host), port) for host, port in (settings["media"], settings["control"]))
-    link = Link.of(settings)
+    lanes = Lanes({address: Link.of(each) for address, each in settings["lanes"].items()})
     listening = {"media": listen(media[0]), "control": listen(control[0])}
     print(json.dumps({name: server.getsockname()[1] for name, server in listening.items()}), flush=True)
     gc.freeze()
     gc.disable()  # no reference cycle here lasts long; a collection would delay packets
     async with asyncio.TaskGroup() as tasks:
         serving = [
-            tasks.create_task(accept(listening["media"], link, serve_media, media)),
-            tasks.create_task(accept(listening["control"], link, serve_control, control)),
+            tasks.create_task(accept(listening["media"], lanes, serve_media, media)),
+            tasks.create_task(accept(listening["control"], lanes, serve_control, control)),
         ]
-        await take_rates(link)
+        await take_rates([*lanes.links.values()])
         for task in serving:
             task.cancel()
 

@@ -14,25 +14,34 @@ from runner.link.limit import Limit
 from runner.settings import Endpoint
 from runner.system import children
 
+LANE = "127.0.1.{}"  # address of the vehicle in a lane, by its number from 1 on
+
 
 @contextmanager
 def relayed(limits: Mapping[str, Limit], media: Endpoint, control: Endpoint, dials: bool = False) -> Iterator[Ends]:
     """The relay, for the duration of the block: the operator's RTSP and the vehicle's MQTT pass through it.
 
+    limits          by lane; "": that of a link without lanes
     media, control  where RTSP server and broker listen, on this machine
     raises          RunError
     """
-    lane, limit = next(iter(limits.items()))
-    for what, given in (("tcp", limit.tcp), ("media that the vehicle dials", dials), ("a link of lanes", lane)):
+    tcp = any(limit.tcp for limit in limits.values())
+    for what, given in (("tcp", tcp), ("media that the vehicle dials", dials)):
         if given:
             raise RunError(f"link=relay: {what} is not supported, choose link=netns")
-    settings = {"media": [media.host, media.port], "control": [control.host, control.port], **limit.directions()}
+    addresses = {lane: LANE.format(number) if lane else "" for number, lane in enumerate(limits, 1)}
+    lanes = {addresses[lane]: limit.directions() for lane, limit in limits.items()}
+    settings = {"media": [media.host, media.port], "control": [control.host, control.port], "lanes": lanes}
     command = (sys.executable, "-m", "runner.link.relay", json.dumps(settings))
     relay = Child("relay", command, children.environment())
     try:
         ports = relay.answer()
         for_operator = overrides(Endpoint(media.host, ports["media"]), control)
         for_vehicle = overrides(media, Endpoint(control.host, ports["control"]))
-        yield Ends((), for_vehicle, for_operator, control, {lane: ChildShaper(relay)})
+        shapers = {lane: ChildShaper(relay, number=number) for number, lane in enumerate(limits)}
+        notes = tuple(
+            f"lane {lane}: what the vehicle sends from {address}" for lane, address in addresses.items() if lane
+        )
+        yield Ends((), for_vehicle, for_operator, control, shapers, notes)
     finally:
         relay.end()

@@ -110,7 +110,7 @@ async def main() -> None:
         carrier.set(rates.cut != "carrier")
         return {"tcp_bytes": Sink.received}
 
-    await take_rates(link, more)
+    await take_rates([link], more)
 
 
 if __name__ == "__main__":

@@ -9,19 +9,19 @@ import subprocess
 import sys
 import threading
 import time
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from itertools import groupby
 from math import inf
 from typing import NamedTuple
 
+import pytest
 from test_link import WIDE, _ends, _left, _python, full_rate
 
-from rig import needs_root, until
+from rig import free_port, needs_root, until
 from runner.link import Limit, limited_link
 from runner.link.limit import Cut
-
-pytestmark = needs_root
+from runner.settings import Endpoint
 
 # Sends numbered packets over each way, and prints when each was sent, or why not, and what it received.
 SENDER = """
@@ -111,6 +111,7 @@ def _sending(link, operator, ways, size, every_s, for_s):
     return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
 
 
+@needs_root
 def test_each_lane_holds_its_own_limits():
     lines = []
     lanes = {"a": Limit(lambda t: 1000, 300, 20), "b": Limit(lambda t: 2000, 400, 200)}
@@ -155,6 +156,7 @@ def _stretches(stamped):
         yield is_cut, times[0], times[-1]
 
 
+@needs_root
 def test_a_lane_is_cut_and_restored_while_another_goes_on():
     """Packets leave by both devices, and by `old`, a socket bound to the first address of `a`."""
     stamped = []  # each line with the time at which its rate was in force
@@ -216,6 +218,7 @@ def test_a_lane_is_cut_and_restored_while_another_goes_on():
     assert None not in {why for why, _ in fates("old", sent[-1][2] - 0.3, inf)}
 
 
+@needs_root
 def test_the_next_run_removes_all_lanes_of_a_killed_one():
     code = (
         "import os, signal; from runner.link import *; from runner.settings import Endpoint\n"
@@ -228,3 +231,66 @@ def test_the_next_run_removes_all_lanes_of_a_killed_one():
     with limited_link("netns", WIDE, *_ends(), print):
         until(lambda: not _left(name))
         assert host not in subprocess.check_output(["ip", "rule"], text=True)
+
+
+def _bound(host, port):
+    sock = socket.socket(type=socket.SOCK_DGRAM)
+    sock.settimeout(10)
+    sock.bind((host, port))
+    return sock
+
+
+def _setup(operator, server, own, ports):
+    """Let an operator with the ports `own` and a vehicle's server with others agree on them; returns the relay's."""
+    head = "SETUP rtsp://h/c RTSP/1.0\r\nTransport: RTP/AVP;unicast;client_port={0}-{1}\r\n\r\n"
+    operator.sendall(head.format(own, own + 1).encode())
+    near = int(re.search(rb"client_port=(\d+)", server.recv(1000))[1])
+    transport = f"RTP/AVP;unicast;client_port={near}-{near + 1};server_port={ports}-{ports + 1}"
+    server.sendall(f"RTSP/1.0 200 OK\r\nTransport: {transport}\r\n\r\n".encode())
+    assert int(re.search(rb"server_port=(\d+)", operator.recv(1000))[1]) == near
+    return near
+
+
+def test_lanes_of_a_relay_are_addresses_of_the_vehicle():
+    """A vehicle sends from 127.0.1.1 and 127.0.1.2, and the operator sees and answers these addresses."""
+    lines, own, ports = [], free_port(2), free_port(2)
+    lanes = {"a": replace(WIDE, delay_ms=20), "b": replace(WIDE, delay_ms=150, cuts=(Cut(0.5, 1.5, "silence"),))}
+    with ExitStack() as stack:
+        opened = stack.enter_context
+        server, broker = (opened(socket.create_server(("127.0.0.1", 0))) for _ in range(2))
+        ends = [Endpoint(*each.getsockname()) for each in (server, broker)]
+        link = opened(limited_link("relay", WIDE, *ends, lines.append, lanes=lanes))
+        media, control = (
+            int(word.partition("=")[2])
+            for words, key in ((link.operator_overrides, "media.port="), (link.vehicle_overrides, "control.port="))
+            for word in words
+            if word.startswith(key)
+        )
+        operator = opened(socket.create_connection(("127.0.0.1", media)))
+        near = _setup(operator, opened(server.accept()[0]), own, ports)
+        received, reports = (opened(_bound("127.0.0.1", own + n)) for n in range(2))
+        ways = {lane: opened(_bound(f"127.0.1.{n}", ports)) for n, lane in enumerate("ab", 1)}
+        asked = opened(_bound("127.0.1.2", ports + 1))
+        for way, address, delay_s in ((ways["a"], "127.0.1.1", 0.02), (ways["b"], "127.0.1.2", 0.15)):
+            sent = time.monotonic()
+            way.sendto(b"picture", ("127.0.0.1", near))
+            assert received.recvfrom(100) == (b"picture", (address, near))
+            assert time.monotonic() - sent >= delay_s
+        reports.sendto(b"report", ("127.0.1.2", near + 1))
+        assert asked.recvfrom(100) == (b"report", ("127.0.0.1", near + 1))
+        vehicle = opened(socket.create_connection(("127.0.0.1", control), source_address=("127.0.1.2", 0)))
+        reached = opened(broker.accept()[0])
+        link.start(time.time())
+        until(lambda: [line for line in lines if line.lane == "b" and line.kbps == 0])
+        for way in ways.values():
+            way.sendto(b"cut", ("127.0.0.1", near))
+        vehicle.sendall(b"message")
+        assert received.recvfrom(100) == (b"cut", ("127.0.1.1", near))
+        assert reached.recv(100) == b"message"  # as TCP does, once the lane is back
+        counted = {line.lane: line for line in lines}
+        assert (counted["b"].kbps, counted["b"].lost, counted["a"].lost) == (WIDE.kbps_at(0), 1, 0)
+        assert counted["b"].bytes == len("picture") + len("cut") + 2 * 28 + len("message") + 52
+        received.settimeout(0.3)
+        with pytest.raises(TimeoutError):
+            received.recv(100)
+        link.check()
