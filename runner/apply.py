@@ -48,7 +48,7 @@ from runner.gst.supervised import CameraCaller
 from runner.gst.timers import Guarded, every
 from runner.gst.video_files import VideoFile, VideoFiles
 from runner.gst.watched import WatchedSource
-from runner.records.reception import Arrivals, SentFrame, UplinkReceived, UplinkSent
+from runner.records.reception import Arrivals, SentFrame, UplinkArrivals, UplinkReceived, UplinkSent
 from runner.records.vehicle import CameraReading, SenderStages
 from runner.settings import Media, Uplink
 
@@ -208,6 +208,8 @@ class VehicleSide:
         for command in commands:
             changed.setdefault(command.camera, {})[command.knob] = command.value
         for name, values in changed.items():
+            if uplinks := values.pop("uplinks", None):
+                self.carry({name: uplinks})
             with self._lock:
                 self._wanted[name] |= values
             pipeline = self._pipeline(name)
@@ -446,6 +448,14 @@ class OperatorSide:
             damaged=[name for name, receiver in receivers.items() if receiver.is_damaged],
             arrived=list(chain.from_iterable(receiver.rtp.take_packets() for receiver in receivers.values())),
         )
+
+    def by_uplink(self, arrivals: Arrivals) -> dict[str, Arrivals]:
+        """Arrivals of all uplinks together, split by uplink; to be called from the same thread."""
+        split: dict[str, dict[str, UplinkArrivals]] = {}
+        for camera, receiver in self._receivers.items():
+            for uplink, own in (receiver.rtp.uplinks.take() if receiver.rtp.uplinks else {}).items():
+                split.setdefault(uplink, {})[camera] = own
+        return {uplink: arrivals.of(cameras) for uplink, cameras in split.items()}
 
     def stop(self) -> None:
         def stop() -> None:

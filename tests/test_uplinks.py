@@ -64,10 +64,12 @@ def test_cameras_return_one_at_a_time_once_it_has_been_clear_for_long_enough() -
     moves = []
     while ride.t < back + 10:
         at = ride.over(a=A, b=B)
-        changed = [name for name in CAMERAS if at[name] != before[name]]
+        changed = [name for name in CAMERAS if at[name][0] != before[name][0]]
+        assert all(at[name] == ("b", "a") for name in changed)  # both carry it for a moment
         moves += [(ride.t, changed)] if changed else []
         before = at
     assert moves and all(len(changed) == 1 for _, changed in moves)
+    assert all(len(on) == 1 for name, on in before.items() if name != "front")
     assert all(later - earlier >= 2 for (earlier, _), (later, _) in pairwise(moves))
 
 

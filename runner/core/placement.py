@@ -17,6 +17,7 @@ from runner.core.model import Kbps
 
 MOVES, MOVES_S = 2, 60.0  # a camera moves at most so often in that time, unless its uplink stalls
 SETTLE_S = 2.0  # between two moves, so that the beliefs can follow
+OVERLAP_S = 0.4  # both uplinks carry a camera that moves, longer than any jitter buffer waits: nothing is missing
 GAIN = 0.05  # by how much a move raises the weighted mean of ln(b_alloc / b_dem) at least
 LEAST = 1e-3  # share of its demand that a camera without any bitrate counts as having
 # An uplink carries copies of redundant cameras from this share of what the best uplink would give them, and then down
@@ -55,12 +56,14 @@ class Placement:
     uplinks  by camera: names, its own uplink first, then those that carry a copy
     moved    by camera: times of its moves in the last MOVES_S, except those from a stalled uplink, s
     last     time of the last move, s
+    left     by camera that moves: the uplink that it leaves, and until when that carries it too, s
     clear    by uplink: since when it has not been stalled, s; inf while it is
     """
 
     uplinks: Mapping[str, tuple[str, ...]] = field(default_factory=lambda: NOTHING)
     moved: Mapping[str, tuple[float, ...]] = field(default_factory=lambda: NOTHING)
     last: float = -inf
+    left: Mapping[str, tuple[str, float]] = field(default_factory=lambda: NOTHING)
     clear: Mapping[str, float] = field(default_factory=lambda: NOTHING)
 
 
@@ -87,18 +90,20 @@ def place(
     moved = {
         name: times for name, old in before.moved.items() if (times := tuple(at for at in old if t - at < MOVES_S))
     }
-    last = before.last
+    last, left = before.last, {name: each for name, each in before.left.items() if name in own and t < each[1]}
     homeless = single.keys() - own.keys()
     for name in sorted(homeless, key=lambda name: (-_importance(single[name]), name)):
         own[name], last = max(ready, key=lambda uplink: problem.value({**own, name: uplink})), t
     if not homeless and t - last >= SETTLE_S:
         free = [name for name in single if len(moved.get(name, ())) < MOVES]
         if move := problem.best_move(own, free, ready):
-            name, own[name] = move
+            name = move[0]
+            left[name], own[name] = (own[name], t + OVERLAP_S), move[1]
             moved[name], last = (*moved.get(name, ()), t), t
     everywhere = (*carriers, *(name for name in uplinks if name not in living))
     at = {name: everywhere if name in redundant else (own[name],) for name in cameras}
-    return Placement(_all_measured(at, cameras, uplinks), moved, last, clear)
+    at |= {name: (*at[name], uplink) for name, (uplink, _) in left.items() if uplink not in at[name]}
+    return Placement(_all_measured(at, cameras, uplinks), moved, last, left, clear)
 
 
 def _carriers(redundant: Mapping[str, Wanted], kbps: Mapping[str, float], before: Placement) -> tuple[str, ...]:

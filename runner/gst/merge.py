@@ -103,6 +103,11 @@ class Merge:
         transits = [each.transit.seconds for each in tuple(self._uplinks.values()) if now - each.at < CURRENT_S]
         self.difference_s = max(transits) - min(transits) if len(transits) > 1 else 0.0
 
+    @property
+    def frames(self) -> dict[str, ArrivingFrames]:
+        """By uplink, what it alone has delivered of the camera."""
+        return {name: each.frames for name, each in tuple(self._uplinks.items())}
+
     def counts(self) -> dict[str, UplinkReceived]:
         return {
             name: UplinkReceived(each.packets, each.frames.missing, each.twins, each.late)

@@ -13,12 +13,12 @@ from itertools import chain
 
 from gi.repository import Gst
 
-from runner.gst.arriving import FIXED_BYTES, HEADER_BYTES, read_packet
+from runner.gst.arriving import FIXED_BYTES, HEADER_BYTES, ArrivingFrames, read_packet
 from runner.gst.merge import Merge
 from runner.gst.packet_senders import PacketSenders
 from runner.gst.packet_times import received_at
 from runner.gst.probes import PassingBuffer, PassProbe
-from runner.records.reception import UplinkReceived
+from runner.records.reception import UplinkArrivals, UplinkReceived
 
 # Firewalls forget what they have let through: 30 s after the only packet that went out.
 OPEN_S = 10.0
@@ -43,6 +43,7 @@ class ReceivedUplinks:
     def begin(self) -> None:
         """The receiver has built a new pipeline."""
         self.merge = Merge(is_authentic=not self._has_keys)
+        self._counted: dict[str, tuple[int, int]] = {}
         self._source: _Source | None = None
         self._sinks: list[tuple[Gst.Element, socket.AddressFamily]] = []
         self._opened = 0.0
@@ -113,6 +114,17 @@ class ReceivedUplinks:
                     for host in _of_family(self.hosts, family):
                         with suppress(OSError):  # no route to it now
                             duplicate.sendto(b"", (host, sink.get_property("port")))
+
+    def take(self) -> dict[str, UplinkArrivals]:
+        """By uplink, what it has delivered since the last call. From any one thread."""
+        now = time.monotonic()
+        return {name: self._take(name, frames, now) for name, frames in self.merge.frames.items()}
+
+    def _take(self, name: str, frames: ArrivingFrames, now: float) -> UplinkArrivals:
+        received, missing = self._counted.get(name, (0, 0))
+        self._counted[name] = frames.received, max(missing, frames.missing)  # it drops if packets were only reordered
+        lost = self._counted[name][1] - missing
+        return UplinkArrivals(frames.take(now), frames.take_packets(), frames.received - received, lost)
 
     def counts(self) -> dict[str, UplinkReceived]:
         """By uplink, since the pipeline was built."""

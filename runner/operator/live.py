@@ -152,7 +152,8 @@ class LiveOperator:
     def _report_reception(self, side: OperatorSide) -> None:
         is_held_up = self._late.is_excused(time.monotonic())  # other threads first read what has arrived meanwhile
         if not is_held_up and not self.station.link.is_behind():  # else they accumulate for the next report
-            self.station.report_reception(side.take_arrivals())
+            arrivals = side.take_arrivals()
+            self.station.report_reception(side.by_uplink(arrivals) if self.setup.uplinks else {"": arrivals})
 
     def _repeat(self, what: str, every_s: float, work: Callable[[], None]) -> None:
         """Repeat a piece of work until stopped; an exception must not end the operator's view of a moving vehicle.
@@ -171,6 +172,8 @@ class LiveOperator:
                     self.station.note(last_fault)
 
     def _sample(self, side: OperatorSide) -> None:
+        if addresses := self.station.addresses:
+            side.admit(addresses)
         self.station.take(side.sample(self.station.sending()))
         self._sampled = time.monotonic()
         notify("WATCHDOG=1")
@@ -260,6 +263,7 @@ def live_operator(
             operator=station.identity,
             keyring=keyring,
             vehicle=setup.vehicle.name,
+            uplinks=station.addresses if setup.uplinks else None,
         )
 
     operator = LiveOperator(setup, station, drive, build, requests)

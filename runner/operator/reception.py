@@ -12,11 +12,12 @@ from runner.records.reception import Arrivals, ReceptionReport, UnitReceived
 class ReceptionReports:
     """Makes the reports of one run of the operator's side; in one thread.
 
-    run  identifies them
+    run     identifies them
+    uplink  what they are about; "": the vehicle has one
     """
 
-    def __init__(self, run: int, latency: Latency) -> None:
-        self._run, self._latency = run, latency
+    def __init__(self, run: int, latency: Latency, uplink: str = "") -> None:
+        self._run, self._latency, self._uplink = run, latency, uplink
         self._packets = PacketCount()
         self._delay_s: float | None = None  # of the first access unit: reported delays are relative to it
 
@@ -49,5 +50,6 @@ class ReceptionReports:
             damaged=tuple(arrivals.damaged) or UNSET,
             sent=UNSET if sent is None else sent,
             run=self._run,
+            uplink=self._uplink or UNSET,
             offset_s=round(base, 4) if received else UNSET,
         )

@@ -37,7 +37,7 @@ from runner.operator.requests import OnReply, Requests
 from runner.records import combined, to_json
 from runner.records.lines import Note
 from runner.records.operator import CameraSample, Sample
-from runner.records.reception import Arrivals
+from runner.records.reception import NOTHING_ARRIVED, Arrivals
 from runner.records.vehicle import NOTHING_ENCODED, CameraState, CameraTelemetry, Telemetry, VehicleState
 from runner.security.keyring import Keyring
 from runner.settings import Setup
@@ -146,7 +146,7 @@ class Station:
         self._late = LateCheck()
         self.latency = Latency(fps, self._cameras)
         self._run = secrets.randbits(32)  # identifies the reports of this process
-        self._reports = ReceptionReports(self._run, self.latency)
+        self._reports = {name: ReceptionReports(self._run, self.latency, name) for name in setup.uplinks or ("",)}
         self._to_request = topic(vehicle.name, "request", self.identity)
         self._to_report = topic(vehicle.name, "reception", self.identity)
         self._requests = Requests(
@@ -207,6 +207,12 @@ class Station:
         state = self.state  # another thread may replace it
         return state.cameras if state else {}
 
+    @property
+    def addresses(self) -> Mapping[str, tuple[str, ...]]:
+        """Addresses that the vehicle sends from, by uplink; none if it has one, or was never online."""
+        telemetry = self._telemetry
+        return telemetry.uplinks if telemetry and telemetry.uplinks is not UNSET else {}
+
     def sending(self) -> dict[str, bool]:
         """Which cameras should send, according to the vehicle; empty while the vehicle is offline.
 
@@ -235,12 +241,16 @@ class Station:
         for listener in self.listeners:
             listener.on_sample(sample)
 
-    def report_reception(self, arrivals: Arrivals) -> None:
-        """Report arrivals since the last report to the vehicle; to be called every REPORT_S, by one thread."""
+    def report_reception(self, arrivals: Mapping[str, Arrivals]) -> None:
+        """Report arrivals since the last report to the vehicle; to be called every REPORT_S, by one thread.
+
+        arrivals  by uplink; "": the vehicle has one
+        """
         now = time.monotonic()
         as_of = self._requests.vehicle_now(now) if self._may_reach_vehicle() else None
-        if report := self._reports.make(arrivals, now, as_of):
-            self.link.publish(self._to_report, to_json(report), behind=True)  # its arrivals are in no other report
+        for uplink, reports in self._reports.items():
+            if report := reports.make(arrivals.get(uplink, NOTHING_ARRIVED), now, as_of):
+                self.link.publish(self._to_report, to_json(report), behind=True)  # its arrivals are in no other report
 
     def rows(self) -> list[CameraRow]:
         cameras = self._cameras()

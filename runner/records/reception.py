@@ -77,6 +77,15 @@ class UplinkReceived(NamedTuple):
     late: int = 0
 
 
+class UplinkArrivals(NamedTuple):
+    """Of one camera by one uplink, since the last call; see `Arrivals`."""
+
+    frames: Sequence[Arrival] = ()
+    arrived: Sequence[ArrivedPacket] = ()
+    packets: int = 0
+    lost: int = 0
+
+
 class Arrivals(NamedTuple):
     """What the operator's side has received since the last call.
 
@@ -93,6 +102,18 @@ class Arrivals(NamedTuple):
     lost: int = 0
     damaged: Sequence[str] = ()
     arrived: Sequence[ArrivedPacket] = ()
+
+    def of(self, cameras: Mapping[str, UplinkArrivals]) -> Arrivals:
+        """What one uplink alone has delivered, by camera; of pictures, which all share, the same."""
+        return self._replace(
+            frames={name: each.frames for name, each in cameras.items()},
+            packets=sum(each.packets for each in cameras.values()),
+            lost=sum(each.lost for each in cameras.values()),
+            arrived=[packet for each in cameras.values() for packet in each.arrived],
+        )
+
+
+NOTHING_ARRIVED = Arrivals({}, {})
 
 
 class UnitReceived(NamedTuple):

@@ -127,6 +127,9 @@ class Telemetry:
     refused: Annotated[Count, "requests refused since the start"]
     errors: Annotated[Count, "exceptions caught by the control loop since the start"] = 0
     speed_factor: Annotated[Share | None, "as in `SpeedAdvice`; None: not advised"] = None
+    uplinks: Annotated[
+        Mapping[str, tuple[str, ...]] | UnsetType, "addresses that it sends from, by uplink; absent: there is one"
+    ] = UNSET
 
 
 @dataclass(frozen=True, slots=True)

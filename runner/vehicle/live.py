@@ -382,7 +382,7 @@ def live_vehicle(
             report(rate)
         video = apply.VideoFiles(log, drive.video, drive.video_shift) if log and setup.log_video else None
         side = apply.VehicleSide(
-            plans, setup.media, lambda camera, what: report(f"{camera}: {what}"), video, keyring, lost
+            plans, setup.media, lambda camera, what: report(f"{camera}: {what}"), video, keyring, lost, setup.uplinks
         )
         ending.callback(side.stop)
         control = _VehicleControl(setup, document, report, keyring)

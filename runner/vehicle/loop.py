@@ -32,8 +32,9 @@ from runner.pqos import Pqos
 from runner.records.reception import ReceptionReport, ReceptionReported, SentFrame
 from runner.records.vehicle import CameraReading, Outcome, SenderStages, Telemetry
 from runner.schema import event_problem, shortened
-from runner.settings import Setup
+from runner.settings import Setup, Uplink
 from runner.system.held_up import LateCheck
+from runner.system.interfaces import addresses_of
 from runner.system.reports import LimitedReports, RepeatedReports
 from runner.vehicle.access import Access
 from runner.vehicle.inbox import MAX_QUEUED, Answer, Inbox, Item, QueuedReport, Request
@@ -393,11 +394,17 @@ class ControlLoop:
         self._replies.settle(self._run, self._cameras, now)
 
     def _publish_measured(self, t: float) -> None:
+        uplinks = {name: _addresses(each) for name, each in self.setup.uplinks.items()}
         telemetry = self._publisher.telemetry(
-            self._run, t, self._cameras, self.applier.stages(), self.refusals.count, self.errors
+            self._run, t, self._cameras, self.applier.stages(), self.refusals.count, self.errors, uplinks
         )
         self.listener.record(telemetry)
         self.publish(telemetry)
+
+
+def _addresses(uplink: Uplink) -> tuple[str, ...]:
+    """From which packets may come that leave by it: none while its device is missing or has none."""
+    return (uplink.address,) if uplink.address else addresses_of(uplink.interface or "")
 
 
 def _changes(before: Run, after: Run, event: Event) -> Iterator[str]:

@@ -88,8 +88,12 @@ class Publisher:
         stages: Mapping[str, SenderStages],
         refused: int,
         errors: int,
+        uplinks: Mapping[str, tuple[str, ...]],
     ) -> Telemetry:
-        """What was read back from the elements, and what the encoders have output so far."""
+        """What was read back from the elements, and what the encoders have output so far.
+
+        uplinks  addresses by uplink
+        """
         measured = {
             name: combined(
                 CameraTelemetry, camera.encoded, stages.get(name), applied=applied_to_json(name, camera.applied)
@@ -99,7 +103,7 @@ class Publisher:
         prediction = run.state.prediction
         predicted = plain(prediction.kbps) if prediction else None
         position, factor = self._current_position(t), self._speed_factor(run, t)
-        return Telemetry(t, predicted, position, measured, refused, errors, factor)
+        return Telemetry(t, predicted, position, measured, refused, errors, factor, uplinks or UNSET)
 
     def _current_position(self, t: float) -> Position | None:
         """The position, while it is not stale; its speed becomes stale earlier."""
