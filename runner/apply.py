@@ -11,7 +11,6 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +19,7 @@ from runner.core.decision import NOTHING
 from runner.errors import RunError, suggest
 from runner.graph import Plan
 from runner.gst import TYPELIBS, GLib, Gst
+from runner.gst.arrivals import take_arrivals
 from runner.gst.clocks import captured_at
 from runner.gst.credentials import Login
 from runner.gst.decoders import DecoderWatch
@@ -48,7 +48,7 @@ from runner.gst.supervised import CameraCaller
 from runner.gst.timers import Guarded, every
 from runner.gst.video_files import VideoFile, VideoFiles
 from runner.gst.watched import WatchedSource
-from runner.records.reception import Arrivals, SentFrame, UplinkArrivals, UplinkReceived, UplinkSent
+from runner.records.reception import Arrivals, SentFrame, UplinkReceived, UplinkSent
 from runner.records.vehicle import CameraReading, SenderStages
 from runner.settings import Media, Uplink
 
@@ -208,8 +208,8 @@ class VehicleSide:
         for command in commands:
             changed.setdefault(command.camera, {})[command.knob] = command.value
         for name, values in changed.items():
-            if uplinks := values.pop("uplinks", None):
-                self.carry({name: uplinks})
+            if isinstance(uplinks := values.pop("uplinks", None), tuple):
+                self.carry({name: [str(each) for each in uplinks]})
             with self._lock:
                 self._wanted[name] |= values
             pipeline = self._pipeline(name)
@@ -436,26 +436,9 @@ class OperatorSide:
         for receiver in self._receivers.values():
             receiver.rtp.request_tails()
 
-    def take_arrivals(self) -> Arrivals:
-        """Arrivals since the last call; to be called from one thread."""
-        receivers = self._receivers
-        counted = [receiver.rtp.take_counts() for receiver in receivers.values()]
-        return Arrivals(
-            frames={name: receiver.rtp.take_arrivals() for name, receiver in receivers.items()},
-            newest={name: receiver.newest for name, receiver in receivers.items() if receiver.newest},
-            packets=sum(received for received, _ in counted),
-            lost=sum(lost for _, lost in counted),
-            damaged=[name for name, receiver in receivers.items() if receiver.is_damaged],
-            arrived=list(chain.from_iterable(receiver.rtp.take_packets() for receiver in receivers.values())),
-        )
-
-    def by_uplink(self, arrivals: Arrivals) -> dict[str, Arrivals]:
-        """Arrivals of all uplinks together, split by uplink; to be called from the same thread."""
-        split: dict[str, dict[str, UplinkArrivals]] = {}
-        for camera, receiver in self._receivers.items():
-            for uplink, own in (receiver.rtp.uplinks.take() if receiver.rtp.uplinks else {}).items():
-                split.setdefault(uplink, {})[camera] = own
-        return {uplink: arrivals.of(cameras) for uplink, cameras in split.items()}
+    def take_arrivals(self) -> dict[str, Arrivals]:
+        """Arrivals since the last call, by uplink, "" if the vehicle has one; to be called from one thread."""
+        return take_arrivals(self._receivers)
 
     def stop(self) -> None:
         def stop() -> None:

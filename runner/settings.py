@@ -56,10 +56,6 @@ class Uplink:
     interface: str | None = None
     address: str | None = None
 
-    def __post_init__(self) -> None:
-        if not (self.interface or self.address):
-            raise ModelError("interface", None, "an uplink needs an interface or an address")
-
 
 @dataclass(frozen=True, slots=True)
 class PageSettings:

@@ -19,7 +19,8 @@ from runner.schema import schema_document
 
 TOP_KEYS = "mode, fps_max, media, control, page, uplinks, latency, log, name, cameras, modes, graph, source, ..."
 CAMERA_KEYS = (
-    "width_px, height_px, fps, native, rate_quality, lens, fov_deg, weight, floor_kbps, redundant, shed, place, pose, ..."
+    "width_px, height_px, fps, native, rate_quality, lens, fov_deg, weight, floor_kbps, redundant, shed, place, pose,"
+    " ..."
 )
 OWN = "files of your own need conf=DIR"
 SWEEP = "a,b,c is a sweep, which print, replay and demo run with -m; write [a,b,c] for a list"

@@ -14,6 +14,7 @@ from runner import schema
 from runner.clips import view
 from runner.configuration.origin import GRAPH_PARTS, Composed
 from runner.configuration.rule_lists import call_entry, check_order
+from runner.configuration.uplinks import built_uplinks, reserves_kbps, uplink_problems
 from runner.core.commands import KnobValue
 from runner.core.model import (
     Camera,
@@ -21,7 +22,6 @@ from runner.core.model import (
     Element,
     Graph,
     GraphSettings,
-    Kbps,
     KnobTarget,
     Mode,
     ModelError,
@@ -51,7 +51,6 @@ from runner.settings import (
     RosQos,
     RosSettings,
     Setup,
-    Uplink,
 )
 
 if TYPE_CHECKING:
@@ -67,6 +66,7 @@ GRAPH_STRUCTURE = (
     *("effort", "efforts"),
 )
 GRAPH_SETTINGS = [part.name for part in fields(GraphSettings)]
+SECTIONS = ("media", "control", "page", "log", "latency", "keys", "insecure", "metrics", "ros", "strict", "uplinks")
 ONLY_EFFORT = "medium"  # of graphs without `efforts`
 
 T = TypeVar("T")
@@ -101,20 +101,7 @@ class Builder:
         modes = {mode: self._rules(mode) for mode in Mode if self.is_valid("modes", mode)}
         mounted = document.get("cameras")
         cameras = {name: self._camera(name) for name in mounted} if isinstance(mounted, dict) else {}
-        sections = (
-            "media",
-            "control",
-            "page",
-            "log",
-            "latency",
-            "keys",
-            "insecure",
-            "metrics",
-            "ros",
-            "strict",
-            "uplinks",
-        )
-        if not all(map(self.is_valid, sections)):
+        if not all(map(self.is_valid, SECTIONS)):
             return None
         media = self.part(("media",), _media)
         if media is None:
@@ -127,7 +114,9 @@ class Builder:
         recording = self.part(("recording",), _recording)
         page = PageSettings(**document["page"])
         inputs = self.part(("inputs",), lambda data: Inputs(**data)) if "inputs" in document else None
-        uplinks = self._uplinks()
+        uplinks = built_uplinks(document["uplinks"])
+        for error in uplink_problems(document["uplinks"]):
+            self._report(("uplinks",), error)
         known = document.get("dimensions") is not None
         dimensions = self.part(("dimensions",), lambda data: Dimensions(**data)) if known else None
         ros = _ros(document.get("ros", {}))
@@ -148,7 +137,7 @@ class Builder:
         if self.problems or recording is None:
             return None
         return Setup(
-            Vehicle(document["name"], built, Mode(document["mode"]), modes, _reserves(document)),
+            Vehicle(document["name"], built, Mode(document["mode"]), modes, reserves_kbps(document["uplinks"])),
             media=media,
             control=control,
             page=page,
@@ -343,22 +332,6 @@ class Builder:
         for error in errors:
             self._report(("cameras", camera.name), error)
 
-    def _uplinks(self) -> dict[str, Uplink]:
-        """By name. No two of them are the same way."""
-        uplinks: dict[str, Uplink] = {}
-        ways: dict[str, str] = {}
-        for name, data in (self.composed.document.get("uplinks") or {}).items():
-            given = _given(data, ("interface", "address"))
-            built = self.part(("uplinks", name), lambda _, keys=given: Uplink(**keys))  # type: ignore[misc]
-            for key, way in given.items():
-                if way in ways:
-                    rule = "is already that of another uplink"
-                    self._report((), ModelError(f"uplinks.{name}.{key}", way, rule, f"uplinks.{ways[way]}.{key}"))
-                ways[way] = name
-            if built:
-                uplinks[name] = built
-        return uplinks
-
     def _check_places(self, cameras: Mapping[str, Camera]) -> None:
         """Check that no tile of the page overlaps another one."""
         places = {name: camera.place for name, camera in cameras.items() if camera.place}
@@ -396,11 +369,6 @@ class Builder:
 def _given(data: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
     """The given keys among `keys`; the model has defaults for the others."""
     return {key: data[key] for key in keys if key in data}
-
-
-def _reserves(document: Mapping[str, Any]) -> dict[str, Kbps]:
-    """kbit/s by uplink."""
-    return {name: exact(data.get("reserve_kbps", 0)) for name, data in (document.get("uplinks") or {}).items()}
 
 
 def _media(data: Mapping[str, Any]) -> Media:

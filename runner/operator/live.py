@@ -152,8 +152,7 @@ class LiveOperator:
     def _report_reception(self, side: OperatorSide) -> None:
         is_held_up = self._late.is_excused(time.monotonic())  # other threads first read what has arrived meanwhile
         if not is_held_up and not self.station.link.is_behind():  # else they accumulate for the next report
-            arrivals = side.take_arrivals()
-            self.station.report_reception(side.by_uplink(arrivals) if self.setup.uplinks else {"": arrivals})
+            self.station.report_reception(side.take_arrivals())
 
     def _repeat(self, what: str, every_s: float, work: Callable[[], None]) -> None:
         """Repeat a piece of work until stopped; an exception must not end the operator's view of a moving vehicle.

@@ -133,6 +133,7 @@ class Station:
         self._published: VehicleState | None = None  # the last state that the vehicle published
         self.attention: Attention | None = None  # of the driver, as the page detects it
         self._telemetry: Telemetry | None = None
+        self.addresses: Mapping[str, tuple[str, ...]] = {}  # that the vehicle sends from, by uplink, as it last said
         self._signed_off = False  # the vehicle, by itself or through its last will
         self._last_message = 0.0
         self._known = _KnownVehicles()
@@ -206,12 +207,6 @@ class Station:
         """The vehicle's cameras by its state; none while it is offline."""
         state = self.state  # another thread may replace it
         return state.cameras if state else {}
-
-    @property
-    def addresses(self) -> Mapping[str, tuple[str, ...]]:
-        """Addresses that the vehicle sends from, by uplink; none if it has one, or was never online."""
-        telemetry = self._telemetry
-        return telemetry.uplinks if telemetry and telemetry.uplinks is not UNSET else {}
 
     def sending(self) -> dict[str, bool]:
         """Which cameras should send, according to the vehicle; empty while the vehicle is offline.
@@ -325,6 +320,8 @@ class Station:
             return
         self._requests.vehicle_time = (telemetry.t, time.monotonic())
         self._telemetry = telemetry
+        if telemetry.uplinks is not UNSET:
+            self.addresses = telemetry.uplinks
         self._vehicle_online()
 
     def _on_steering(self, message: MqttMessage) -> None:

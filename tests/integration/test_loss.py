@@ -123,16 +123,16 @@ def test_a_picture_with_unrecovered_loss_is_healed_by_a_key_frame(graph, monkeyp
         try:
             until(lambda: len(units) > 20)
             left[0] = 3
-            until(lambda: operator.take_arrivals().damaged)
+            until(lambda: operator.take_arrivals()[""].damaged)
             lost_at = len(units)
             until(lambda: len(units) > lost_at + 20)
-            assert operator.take_arrivals().damaged == ["front_left"]  # nothing else heals it
+            assert operator.take_arrivals()[""].damaged == ["front_left"]  # nothing else heals it
             side.send_key_frames(["front_left", "no_such_camera"])
             asked_at = len(units)
-            until(lambda: not operator.take_arrivals().damaged)
+            until(lambda: not operator.take_arrivals()[""].damaged)
             assert len(units) - asked_at < 15
             until(lambda: len(units) > asked_at + 30)
-            assert operator.take_arrivals().damaged == []
+            assert operator.take_arrivals()[""].damaged == []
             received = operator.sample(SENDING)["front_left"]
             assert (received.width, received.height) == knobs["size"]
         finally:

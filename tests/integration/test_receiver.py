@@ -208,7 +208,7 @@ def test_loss_during_a_rebuild_shows_until_a_wave_is_complete():
         until(lambda: side.sample(SENDING)["front"].rebuilt == 1, every_s=0.1)
         more()
         until(lambda: side.sample(SENDING)["front"].damaged > 0, every_s=0.1)
-        until(lambda: not side.take_arrivals().damaged, every_s=0.1)
+        until(lambda: not side.take_arrivals()[""].damaged, every_s=0.1)
 
 
 def test_what_was_rebuilt_is_freed_at_once():
