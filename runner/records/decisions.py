@@ -45,7 +45,7 @@ class Turned:
     """A knob of a camera that was turned."""
 
     camera: CameraName
-    knob: Annotated[str, Limits(among=("sending", "roi", "size", "bitrate")), "name of the knob"]
+    knob: Annotated[str, Limits(among=("sending", "roi", "size", "bitrate", "uplinks")), "name of the knob"]
     value: Annotated[Any, "the new one"]
 
 
