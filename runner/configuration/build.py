@@ -114,8 +114,8 @@ class Builder:
         recording = self.part(("recording",), _recording)
         page = PageSettings(**document["page"])
         inputs = self.part(("inputs",), lambda data: Inputs(**data)) if "inputs" in document else None
-        uplinks = built_uplinks(document["uplinks"])
-        for error in uplink_problems(document["uplinks"]):
+        ways = document.get("uplinks") or {}  # older drives have none
+        for error in uplink_problems(ways):
             self._report(("uplinks",), error)
         known = document.get("dimensions") is not None
         dimensions = self.part(("dimensions",), lambda data: Dimensions(**data)) if known else None
@@ -137,7 +137,7 @@ class Builder:
         if self.problems or recording is None:
             return None
         return Setup(
-            Vehicle(document["name"], built, Mode(document["mode"]), modes, reserves_kbps(document["uplinks"])),
+            Vehicle(document["name"], built, Mode(document["mode"]), modes, reserves_kbps(ways)),
             media=media,
             control=control,
             page=page,
@@ -153,7 +153,7 @@ class Builder:
             ros=ros,
             dimensions=dimensions,
             inputs=inputs or Inputs(),
-            uplinks=uplinks,
+            uplinks=built_uplinks(ways),
         )
 
     def checked(self, built: T | None) -> T:
