@@ -61,9 +61,9 @@ def test_a_default_given_changes_nothing_and_another_value_does(key_tables: Modu
         return {each.name: getattr(found, each.name) for each in fields(Camera)}
 
     minimal = camera()
-    others: dict[str, Any] = {"lens": "fisheye", "calibrated": "true"}
+    others: dict[str, Any] = {"lens": "fisheye", "calibrated": "true", "redundant": "true"}
     stated = [key for keys in key_tables.tables().values() for key in keys if key.default.startswith("`")]
-    assert len(stated) == 11
+    assert len(stated) == 12
     for key in stated:
         assert camera(f"cameras.a.{key.path}={key.default.strip('`')}") == minimal, key.path
         assert camera(f"cameras.a.{key.path}={others.get(key.path, 5)}") != minimal, key.path

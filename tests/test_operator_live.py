@@ -31,6 +31,7 @@ def operator(hangs: int, notes: list[str], samples: list[Any]) -> LiveOperator:
         close=lambda: None,
         link=SimpleNamespace(is_behind=lambda: True),
         sending=dict,
+        addresses={},
         take=samples.append,
         note=notes.append,
     )

@@ -412,7 +412,8 @@ def test_files_in_linked_folders_are_checked_and_loops_are_not_followed(tod: Com
     assert [line for line in found if "van.yaml" in line or "mine.yaml" in line] == [
         f"~/graph/across/van.yaml: {nested} graph/, not in subfolders",
         f"~/graph/old/mine.yaml: {nested} graph/, not in subfolders",
-        "~/vehicle/van.yaml: heigth: unknown key; expected one of defaults, name, cameras, latency, dimensions",
+        "~/vehicle/van.yaml: heigth: unknown key; expected one of defaults, name, cameras, uplinks, latency,"
+        " dimensions",
         f"~/vehicle/across/old/mine.yaml: {nested} vehicle/, not in subfolders",
     ]
     named = tod("validate", str(conf.path / "vehicle" / "van.yaml")).problems

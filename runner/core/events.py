@@ -302,7 +302,7 @@ def to_json(event: Event) -> dict[str, Any]:
     document: dict[str, Any] = {"t": event.t, "event": NAMES[type(event)]}
     for name in (f.name for f in fields(event) if f.name != "t"):
         value = getattr(event, name)
-        if value is None:
+        if value is None or (name, value) == ("uplink", ""):
             continue
         if isinstance(value, Roi):
             document |= {key: getattr(value, key) for key in _ROI}
