@@ -154,6 +154,12 @@ def test_a_frame_began_when_the_kernel_received_its_first_packet() -> None:
     assert (frame.first, frame.arrived, frame.whole) == (10.001, 10.006, True)
 
 
+def test_a_frame_whose_packets_have_times_out_of_order_does_not_end_before_it_began() -> None:
+    """As after two processors took them from different devices."""
+    (frame,) = receive((1, 10.0061), (2, 10.006), (3, 10.006)).take(10.3)
+    assert (frame.first, frame.arrived) == (10.006, 10.006)
+
+
 @pytest.mark.parametrize("times", [(None, None, None), (10.001, 10.004, None), (None, 10.004, 10.006)])
 def test_when_a_frame_began_is_unknown_unless_the_kernel_states_its_first_and_last_packet(times: list[float]) -> None:
     """Over TCP and SRT packets are read after others, and by a process that other threads hold up."""

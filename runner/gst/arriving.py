@@ -217,6 +217,8 @@ class ArrivingFrames:
     def _emit(self) -> None:
         if self._ahead is not None:
             at, first = (self._handled, None) if self._received is None else (self._received, self._first)
+            if first is not None:  # processors that take packets from different devices state their times out of order
+                first = min(first, at)
             self._frames.append(Arrival(at, self._captured, self._bytes, self._whole, first))
         self._bytes, self._emitted = 0, True
 
