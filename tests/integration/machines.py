@@ -12,7 +12,7 @@ import time
 from bisect import bisect
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from itertools import pairwise
+from itertools import count, pairwise
 from math import inf
 from pathlib import Path
 
@@ -25,6 +25,7 @@ OWN = "mount -t tmpfs own /run; for own in etc var; do mkdir -p /run/own/$own /r
     "mount -t overlay own -o lowerdir=/$own,upperdir=/run/own/$own,workdir=/run/own/work.$own /$own; done; "
 )
 VEHICLE, CARRIER, OPERATOR = "100.64.0.{}", "100.64.0.1", "198.51.100.10"  # RFC 6598 and RFC 5737
+FORWARDING, STRICT = "sysctl -qw net.ipv4.ip_forward=1", "sysctl -qw net.ipv4.conf.all.rp_filter=1"
 TRANSLATING = """\
 table ip nat {
   chain postrouting {
@@ -105,7 +106,7 @@ class Mobile:
         cable(carrier, "out0", operator, "eth0")
         carrier.run(f"ip addr add {CARRIER}/24 dev in0")
         carrier.run("ip addr add 198.51.100.1/24 dev out0")
-        carrier.run("sysctl -qw net.ipv4.ip_forward=1")
+        carrier.run(FORWARDING)
         operator.run(f"ip addr add {OPERATOR}/24 dev eth0")
         if translated:
             carrier.run("nft -f -", TRANSLATING)
@@ -132,6 +133,73 @@ class Mobile:
 def mobile(translated: bool) -> Iterator[Mobile]:
     with machines("vehicle", "carrier", "operator") as made:
         yield Mobile(*made, translated)
+
+
+class Modems:
+    """A vehicle with two modems, each of a carrier with NAT, and an operator with one address.
+
+    Both carriers have the same network. The vehicle's kernel drops what comes by another device than answers leave by.
+    """
+
+    def __init__(self, vehicle: Machine, operator: Machine, *carriers: Machine) -> None:
+        self.vehicle, self.operator, self._carriers = vehicle, operator, carriers
+        self._addresses = count(2)
+        vehicle.run(STRICT)
+        for number, carrier in enumerate(carriers):
+            cable(carrier, "out0", operator, f"eth{number}")
+            carrier.run(f"ip addr add 203.0.113.{number + 1}/32 peer {OPERATOR} dev out0")
+            operator.run(f"ip addr add {OPERATOR}/32 peer 203.0.113.{number + 1} dev eth{number}")
+            carrier.run(FORWARDING)
+            carrier.run("nft -f -", TRANSLATING)
+            self.plug_in(number)
+
+    def plug_in(self, number: int) -> None:
+        """A modem connects, with an address that it did not have, and the vehicle's network manager sets it up."""
+        device, metric = f"wwan{number}", 700 + number
+        cable(self.vehicle, device, self._carriers[number], "in0")
+        self._carriers[number].run(f"ip addr add {CARRIER}/24 dev in0")
+        own = f"addr add {VEHICLE.format(next(self._addresses))}/24 dev {device} metric {metric}\n"
+        self.vehicle.run("ip -batch -", f"{own}route add default via {CARRIER} dev {device} metric {metric}\n")
+
+    def unplug(self, number: int) -> None:
+        self.vehicle.run(f"ip link del dev wwan{number}")
+
+
+class Routers:
+    """A vehicle behind two routers, 10.1.0.1 and 10.2.0.1, and an operator who reaches it by both.
+
+    A router forwards nothing that comes from another address than the vehicle's in its network.
+    """
+
+    def __init__(self, vehicle: Machine, operator: Machine, *routers: Machine) -> None:
+        self.vehicle, self.operator, self._routers = vehicle, operator, routers
+        vehicle.run(STRICT)
+        operator.run("ip addr add 10.0.0.1/32 dev lo")
+        for number, router in enumerate(routers):
+            own = number + 1
+            cable(vehicle, f"eth{own}", router, "in0")
+            cable(router, "out0", operator, f"eth{own}")
+            router.run(f"ip addr add 10.{own}.0.1/24 dev in0")
+            router.run("sysctl -qw net.ipv4.conf.in0.rp_filter=1")
+            router.run(FORWARDING)
+            operator.run(f"ip route add 10.{own}.0.0/24 via 10.{own}.0.1 dev eth{own} onlink src 10.0.0.1")
+            vehicle.run(f"ip addr add 10.{own}.0.2/24 dev eth{own}")
+            vehicle.run(f"ip route add default via 10.{own}.0.1 dev eth{own} metric {100 + own}")
+            self.plug_in(number)
+
+    def plug_in(self, number: int) -> None:
+        self._routers[number].run("ip link set dev out0 up")
+        self._routers[number].run("ip route replace 10.0.0.1 dev out0")
+
+    def unplug(self, number: int) -> None:
+        """A router is cut off: the vehicle's device does not tell."""
+        self._routers[number].run("ip link set dev out0 down")
+
+
+@contextmanager
+def two_uplinks(kind: type[Modems | Routers]) -> Iterator[Modems | Routers]:
+    with machines("vehicle", "operator", "first", "second") as made:
+        yield kind(*made)
 
 
 class Watch:

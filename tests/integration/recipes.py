@@ -17,6 +17,7 @@ from rig import CHECKOUT, WAIT_S, process, until
 DOCUMENT = CHECKOUT / "docs" / "deployment.md"
 VEHICLE = "10.0.0.2"  # its address there, also where a recipe gives it another one later
 TWO_MACHINES, FIREWALLS, SRT, WIREGUARD = "From two bare machines to driving", "Firewalls", "SRT", "WireGuard"
+TWO_MODEMS, TWO_UPLINKS = "Two modems", "Two uplinks"
 # There is no systemd here: replacements for its services.
 BROKER = "sudo install -d -o mosquitto /run/mosquitto; sudo mosquitto -d -c /etc/mosquitto/mosquitto.conf"
 SERVICES = {"sudo systemctl restart mosquitto": BROKER}
@@ -110,8 +111,8 @@ class Site:
     def follow(self, line: Line) -> None:
         for where in self.machines if line.where == "both" else (line.where,):
             output = self.shell(where, line.text)
-            if line.text.endswith("wg pubkey"):
-                self.other[f"{where.upper()}S_PUBLIC_KEY"] = output.strip()
+            if key := re.search(r"/\w+(-\w)?\.key \| wg pubkey$", line.text):
+                self.other[f"{where}s_PUBLIC_KEY{(key[1] or '').replace('-', '_')}".upper()] = output.strip()
 
     def prepare(self, heading: str) -> dict[str, list[str]]:
         """Follow a recipe until both sides can be started; returns the words of each, shortened."""

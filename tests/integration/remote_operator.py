@@ -50,6 +50,7 @@ def main(words: list[str]) -> None:
             operator=station.identity,
             keyring=keyring,
             vehicle=setup.vehicle.name,
+            uplinks=station.addresses if setup.uplinks else None,
         )
 
     operator = LiveOperator(setup, station, Log(None, "operator", {}, {}, station.note), build)

@@ -6,10 +6,11 @@ import json
 import subprocess
 import sys
 import time
+from itertools import pairwise
 
 import pytest
-from machines import Mobile, cable, machines, mobile
-from recipes import FIREWALLS, SRT, TWO_MACHINES, WIREGUARD, Site, files, watched
+from machines import Mobile, Modems, Routers, cable, machines, mobile, two_uplinks
+from recipes import FIREWALLS, SRT, TWO_MACHINES, TWO_MODEMS, TWO_UPLINKS, WIREGUARD, Site, files, watched
 
 from rig import needs_root, process, until
 from runner.drive.read import read_drive
@@ -128,6 +129,53 @@ def test_through_wireguard_nothing_is_fragmented(path, mtu, rtp, tmp_path):
             assert (packets["longer"], packets["fragments"]) == (0, 0), packets
         none = {"FragCreates": 0, "FragFails": 0, "ReasmReqds": 0}
         assert [fragments(machine) for machine in (network.vehicle, network.carrier, network.operator)] == [none] * 3
+
+
+# --- two uplinks ------------------------------------------------------------------------------------------------------
+
+REDUNDANT, PICTURE_S = "front_center", 1 / 15
+SPREAD = ("modes=safe", f"cameras.{REDUNDANT}.redundant=true")
+
+
+def await_sending(machine, device):
+    """Until pictures have left by a device."""
+
+    def sent():
+        return json.loads(machine.run(f"ip -json -statistics link show dev {device}"))[0]["stats64"]["tx"]["bytes"]
+
+    before = sent()
+    until(lambda: sent() > before + 20_000, every_s=0.1)
+
+
+def longest_gap(times, since):
+    return max(new - old for old, new in pairwise(times) if new > since)
+
+
+@pytest.mark.parametrize("number", [1])
+@pytest.mark.parametrize(
+    ("heading", "kind", "devices"),
+    [(TWO_MODEMS, Modems, ("wg-a", "wg-b")), (TWO_UPLINKS, Routers, ("eth1", "eth2"))],
+    ids=["modems", "routers"],
+)
+@pytest.mark.soak
+def test_a_redundant_camera_goes_on_when_one_of_two_uplinks_is_cut(heading, kind, devices, number, tmp_path):
+    """Both machines are behind the firewalls of the document."""
+    with two_uplinks(kind) as network:
+        site = Site(network.vehicle, network.operator, tmp_path)
+        for file in files(FIREWALLS):
+            site.write(file)
+            site.shell(file.where, f"sudo nft -f {file.path}")
+        with watched(site, heading, *SPREAD) as watch:
+            for device in devices:
+                await_sending(network.vehicle, device)
+            changed = time.monotonic()
+            network.unplug(number)
+            time.sleep(BACK_S)
+            assert longest_gap(watch.times[REDUNDANT], changed) < 4 * PICTURE_S, watch.notes
+            back = watch.back(changed)
+            assert max(back.values()) < BACK_S, (back, watch.notes, site.output.read_text())
+            network.plug_in(number)
+            await_sending(network.vehicle, devices[number])
 
 
 # --- roaming ----------------------------------------------------------------------------------------------------------
