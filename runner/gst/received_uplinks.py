@@ -51,7 +51,9 @@ class ReceivedUplinks:
     def direct(self, client: Gst.Element) -> None:
         """Let a new pipeline's client connect by another uplink than the one before, first to where it would anyway."""
         uri = Gst.Uri.from_string(client.get_property("location"))
-        hosts = [uri.get_host(), *(host for host in self.hosts if host != uri.get_host())]
+        # With keys, an IPv6 address cannot be the server's name: see `runner.security.exposure`.
+        others = _of_family(self.hosts, socket.AF_INET) if self._has_keys else self.hosts
+        hosts = [uri.get_host(), *(host for host in others if host != uri.get_host())]
         uri.set_host(hosts[next(self._attempts) % len(hosts)])
         client.set_property("location", uri.to_string())
 

@@ -8,18 +8,19 @@ import struct
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import pytest
-from ways import ADDRESSES, OPERATOR, Way, Ways, two_ways
+from ways import ADDRESSES, ADDRESSES_6, OPERATOR, OPERATOR_6, Way, Ways, two_ways
 
 from keyed import CONTROLLER, VEHICLE, issue
 from rig import free_port, needs_root, repeating, small_robot, until
 from runner.system import children
+from runner.system.interfaces import addresses_of
 
 CAMERA, FPS = "front", 30
 VIDEO, REPEATED = 96, 97  # payload types
@@ -78,13 +79,13 @@ class Operator:
     reported  what it reported
     """
 
-    def __init__(self, words: list[str], host: str) -> None:
+    def __init__(self, words: list[str], addresses: Mapping[str, str]) -> None:
         from runner.apply import OperatorSide, check_plan
         from runner.configuration.config import configuration
         from runner.plans import compile_plans
         from runner.security.exposure import viewer_keyring
 
-        setup = configuration([*words, f"media.host={host}"], check=check_plan).setup()
+        setup = configuration([*words, f"media.host='{addresses['a']}'"], check=check_plan).setup()
         self.units: list[tuple[float, bool, float]] = []
         self.reported: list[str] = []
         self.side = OperatorSide(
@@ -93,7 +94,7 @@ class Operator:
             on_unit=self._on_unit,
             keyring=viewer_keyring(setup),
             vehicle=setup.vehicle.name,
-            uplinks={name: [address] for name, address in ADDRESSES.items()},
+            uplinks={name: [address] for name, address in addresses.items()},
         )
 
     def _on_unit(self, _camera: str, unit: Any) -> None:
@@ -109,15 +110,18 @@ class Operator:
 
 
 @contextmanager
-def drive(tmp_path: Path, keys: bool) -> Iterator[tuple[Ways, Vehicle, Operator]]:
+def drive(
+    tmp_path: Path, keys: bool, addresses: Mapping[str, str] = ADDRESSES
+) -> Iterator[tuple[Ways, Vehicle, Operator]]:
     port = free_port()
-    words = [*small_robot(CAMERA), "source=test", "media.host=0.0.0.0", f"media.port={port}", "page.serve=false"]
+    everywhere = "'::'" if addresses is ADDRESSES_6 else "0.0.0.0"
+    words = [*small_robot(CAMERA), "source=test", f"media.host={everywhere}", f"media.port={port}", "page.serve=false"]
     holders = [issue(tmp_path / "keys") / name for name in (VEHICLE, CONTROLLER)] if keys else []
     own = [[f"keys={holder}"] for holder in holders] or [["insecure=true"]] * 2
-    with two_ways() as ways:
+    with two_ways(addresses) as ways:
         ways["a"].delay_s, ways["b"].delay_s = FAST_S, SLOW_S
         vehicle = Vehicle(ways, [*words, *own[0]])
-        operator = Operator([*words, *own[1]], ADDRESSES["a"])
+        operator = Operator([*words, *own[1]], addresses)
         try:
             with repeating(operator.sample, SAMPLES_S):
                 until(lambda: len(operator.units) > FPS)
@@ -159,6 +163,26 @@ def test_a_camera_changes_its_uplink_and_no_picture_is_lost(tmp_path: Path, keys
         assert {name: each.lost for name, each in counted.items()} == {"a": 0, "b": 0}
         assert counted["a"].twins == 0 < counted["b"].twins
         assert sum(vehicle.sent.values()) > 65_536 - WRAPS_SOON
+
+
+@needs_root
+def test_over_ipv6(tmp_path: Path) -> None:
+    """A camera changes its uplink, and packets from another address are dropped."""
+    with drive(tmp_path, keys=False, addresses=ADDRESSES_6) as (ways, vehicle, operator):
+        assert OPERATOR_6 in addresses_of("lo")
+        ports: set[int] = set()
+        ways["b"].seen = lambda packet: ports.add(int.from_bytes(packet[42:44], "big")) is None
+        for carried in ("b", "a"):
+            vehicle.carry(carried)
+            before = {name: way.passed for name, way in ways.named.items()}
+            operator.watch(1.2)
+            used = {name for name, way in ways.named.items() if way.passed - before[name] > FPS}
+            assert used == set(carried)
+        check_every_picture(operator)
+        with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as stranger:
+            for port in ports:
+                stranger.sendto(bytes(100), (OPERATOR_6, port))
+        until(lambda: operator.sample().foreign)
 
 
 @needs_root
@@ -293,6 +317,21 @@ def test_what_is_lost_is_sent_again_although_the_other_uplink_is_cut(tmp_path: P
             lost, repeated = kinds.count(VIDEO) // 60, kinds.count(REPEATED)
             assert lost <= repeated < 2 * lost
         check_every_picture(operator)
+
+
+@pytest.mark.parametrize("has_keys", [False, True])
+def test_a_new_pipeline_connects_by_the_next_uplink(has_keys: bool) -> None:
+    """With keys not to an IPv6 address, which GnuTLS refuses as the name of a server."""
+    from runner.gst import Gst
+    from runner.gst.received_uplinks import ReceivedUplinks
+
+    uplinks = ReceivedUplinks({"a": ["10.0.1.2"], "b": ["10.0.2.2", "fd78::2"]}, has_keys=has_keys)
+    expected = ["10.0.1.2", "10.0.2.2", *([] if has_keys else ["[fd78::2]"])]
+    for host in (*expected, *expected):
+        client = Gst.ElementFactory.make("rtspsrc")
+        client.set_property("location", "rtsp://10.0.1.2:8554/front")
+        uplinks.direct(client)
+        assert client.get_property("location") == f"rtsp://{host}:8554/front"
 
 
 def test_feedback_that_comes_by_both_uplinks_passes_once() -> None:

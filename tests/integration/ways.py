@@ -14,7 +14,7 @@ import select
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 
 from machines import Machine
@@ -22,10 +22,16 @@ from machines import Machine
 from rig import WAIT_S
 from runner.link.tunnel import create
 
-OPERATOR = "10.78.0.1"
+OPERATOR, OPERATOR_6 = "10.78.0.1", "fd78::1"
 ADDRESSES = {"a": "10.78.1.2", "b": "10.78.2.2"}  # of the vehicle
+ADDRESSES_6 = {"a": "fd78:1::2", "b": "fd78:2::2"}
 FLOOD_S = 0.0004  # between two packets of a flood: 24 Mbit/s
 TURN = 64  # packets read before the other devices get their turn
+
+
+def whole(address: str) -> str:
+    """An address with the length of a prefix that is nothing but this address; it is usable at once."""
+    return f"{address}/128 nodad" if ":" in address else f"{address}/32"
 
 
 def ip(words: str) -> None:
@@ -42,7 +48,7 @@ class Way:
     seen      called with each packet from the vehicle; returns whether it passes
     """
 
-    def __init__(self, name: str, vehicle: Machine) -> None:
+    def __init__(self, name: str, vehicle: Machine, address: str) -> None:
         self.name, self.device, self._vehicle, self._near = name, f"way-{name}", vehicle, f"op-{name}"
         self.delay_s, self.is_cut, self.passed = 0.0, False, 0
         self.seen: Callable[[bytes], bool] = lambda packet: True
@@ -50,7 +56,7 @@ class Way:
         self.free_at = 0.0  # when the last packet that was held will be gone
         self.waiting: list[tuple[int, bytes]] = []
         self.near = self.far = -1
-        self.create(ADDRESSES[name])
+        self.create(address)
 
     def create(self, address: str) -> None:
         """Create both devices."""
@@ -58,10 +64,11 @@ class Way:
         metric = 1 + list(ADDRESSES).index(self.name)
         ip(f"link set dev {self.device} netns {self._vehicle.pid}")
         ip(f"link set dev {self._near} up")
-        ip(f"route add {address} dev {self._near} src {OPERATOR}")
-        self._vehicle.run(f"ip addr add {address}/32 dev {self.device}")
+        family, operator = ("-6", OPERATOR_6) if ":" in address else ("-4", OPERATOR)
+        ip(f"route add {address} dev {self._near} src {operator}")
+        self._vehicle.run(f"ip addr add {whole(address)} dev {self.device}")
         self._vehicle.run(f"ip link set dev {self.device} up")
-        self._vehicle.run(f"ip route add default dev {self.device} metric {metric}")
+        self._vehicle.run(f"ip {family} route add default dev {self.device} metric {metric}")
         self.near = near
 
     def remove(self) -> None:
@@ -89,11 +96,12 @@ class Way:
 class Ways:
     """The ways by name; `vehicle` is the machine of the vehicle."""
 
-    def __init__(self, vehicle: Machine) -> None:
+    def __init__(self, vehicle: Machine, addresses: Mapping[str, str]) -> None:
         self.vehicle = vehicle
         ip("link set dev lo up")
-        ip(f"addr add {OPERATOR}/32 dev lo")
-        self.named = {name: Way(name, vehicle) for name in ADDRESSES}
+        for own in (OPERATOR, OPERATOR_6):
+            ip(f"addr add {whole(own)} dev lo")
+        self.named = {name: Way(name, vehicle, address) for name, address in addresses.items()}
         self._ended = False
         self._thread = threading.Thread(target=self._forward, daemon=True)
         self._thread.start()
@@ -127,7 +135,8 @@ class Ways:
         self._thread.join()
         for way in self.named.values():
             way.remove()
-        ip(f"addr del {OPERATOR}/32 dev lo")
+        for own in (OPERATOR, OPERATOR_6):
+            ip(f"addr del {whole(own).split()[0]} dev lo")
 
 
 def read(source: int) -> Iterator[bytes]:
@@ -144,10 +153,10 @@ def write(sink: int, packet: bytes) -> None:
 
 
 @contextmanager
-def two_ways() -> Iterator[Ways]:
+def two_ways(addresses: Mapping[str, str] = ADDRESSES) -> Iterator[Ways]:
     vehicle = Machine("vehicle")
     try:
-        ways = Ways(vehicle)
+        ways = Ways(vehicle, addresses)
         try:
             yield ways
         finally:
