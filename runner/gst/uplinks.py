@@ -21,6 +21,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from gi.repository import Gio, GObject, Gst
 
 from runner.gst.probes import IdleProbe, PassingBuffer, PassProbe, TypeProbe
+from runner.gst.sender_filter import SenderFilter
 from runner.gst.uplink_sockets import device_of, open_socket, sharing_ports
 from runner.gst.viewers import over_uplink
 from runner.records.reception import UplinkSent
@@ -181,6 +182,7 @@ class _Channel:
                 if action == "remove":
                     self._count(name, branch.sent_to(viewer))
                 branch.change(action, viewer)
+                branch.senders.admit(*self._hosts)
         self.renew()
 
     def _begin(self, tee: Gst.Element) -> None:
@@ -223,17 +225,25 @@ class _Channel:
         former = self._branches.get(name)
         try:
             sockets = self._open_sockets(uplink, former.sockets.values() if former else ())
+            senders = SenderFilter(*self._hosts)
+            for own in sockets.values():
+                senders.attach(own.get_fd())
         except OSError as error:
             self._on_fault(name, f"{uplink.interface or uplink.address}: {error.strerror}")
             return
         self._on_fault(name, "")
         assert self._tee
-        self._branches[name] = _Branch(self._library, self._tee, sockets, device, self._viewers.elements())
+        self._branches[name] = _Branch(self._library, self._tee, sockets, senders, device, self._viewers.elements())
         if not self._is_rtp:
             self._branches[name].receive(self._sockets, self._feedback)
         if former:
             self._count(name, former.sent())
             self._retired.append(former)
+
+    @property
+    def _hosts(self) -> set[str]:
+        """Of its viewers."""
+        return {host for host, _ in +self._viewers}
 
     @property
     def _sockets(self) -> Sockets:
@@ -288,7 +298,8 @@ class Feedback:
 class _Branch:
     """An uplink's sink behind a tee, closed at first.
 
-    device  number of the device to which its sockets are bound
+    device   number of the device to which its sockets are bound
+    senders  from which they receive: the viewers
     """
 
     def __init__(
@@ -296,10 +307,12 @@ class _Branch:
         library: Gst.Element,
         tee: Gst.Element,
         sockets: Sockets,
+        senders: SenderFilter,
         device: int,
         viewers: Iterator[Destination],
     ) -> None:
         self._pipeline, self._tee, self.sockets, self.device = tee.get_parent(), tee, sockets, device
+        self.senders = senders
         self._valve, self._queue = map(Gst.ElementFactory.make, ("valve", "queue"))
         self.sink = Gst.ElementFactory.make("multiudpsink", f"{OWN}{next(_numbers)}")
         self._added = [self._valve, self._queue, self.sink]
@@ -382,6 +395,7 @@ class _Branch:
 
     def close(self) -> None:
         """Close its sockets, once nothing uses them."""
+        self.senders.close()
         for own in self.sockets.values():
             own.close()
 

@@ -272,6 +272,40 @@ def test_packets_of_an_intruder_change_nothing(tmp_path: Path, keys: bool) -> No
         assert (reported, operator.sample().foreign > 2 * FPS) == (([], False) if keys else (foreign, True))
 
 
+def requests(media: int, number: int) -> bytes:
+    """RTCP by which a viewer requests a key picture, and packets again (RFC 4585)."""
+    viewer = 1
+    report = struct.pack("!BBHI", 0x80, 201, 1, viewer)
+    key_picture = struct.pack("!BBHII", 0x81, 206, 2, viewer, media)
+    again = struct.pack("!BBHIIHH", 0x81, 205, 3, viewer, media, number, 0xFFFF)
+    return report + key_picture + again
+
+
+@needs_root
+def test_requests_of_an_intruder_change_nothing(tmp_path: Path) -> None:
+    """They come by an uplink, from an address that is not the viewer's."""
+    with drive(tmp_path, keys=False) as (ways, _vehicle, operator):
+        way, kinds = ways["b"], []
+
+        def ask(packet: bytes) -> bool:
+            kinds.append(payload_type(packet))
+            if kinds[-1] == VIDEO:
+                port, number, media = (
+                    int.from_bytes(packet[begin:end], "big") for begin, end in ((20, 22), (30, 32), (36, 40))
+                )
+                rtcp = (ADDRESSES["b"], port + 1)
+                way.to_vehicle(datagram(way, "10.78.3.2", rtcp, requests(media, (number - 20) % 65_536)))
+            return True
+
+        way.seen = ask
+        operator.watch(2)
+        way.seen = lambda packet: True
+        operator.watch(0.5)
+        assert kinds.count(VIDEO) > FPS
+        assert kinds.count(REPEATED) == 0
+        check_every_picture(operator)
+
+
 @needs_root
 def test_an_uplink_whose_device_comes_back_with_another_address_is_used_again(tmp_path: Path) -> None:
     with drive(tmp_path, keys=False) as (ways, vehicle, operator):

@@ -79,8 +79,12 @@ class Way:
         os.close(far)
 
     def to_operator(self, packet: bytes) -> None:
-        """Let a packet arrive at once."""
+        """Let a packet arrive at once there."""
         write(self.near, packet)
+
+    def to_vehicle(self, packet: bytes) -> None:
+        """Let a packet arrive at once there."""
+        write(self.far, packet)
 
     def passes(self, packet: bytes, sink: int) -> bool:
         """Whether a packet goes on now."""
