@@ -221,6 +221,49 @@ def test_the_operators_total_limits_both_together() -> None:
     assert sum(share.total for share in ride.run.decision.uplinks.values()) == ride.total == 2000
 
 
+def test_the_operators_total_may_go_over_the_wider_uplink() -> None:
+    ride = Vehicle("mode=collective")
+    ride.accept("total_set", kbps=4000)
+    ride.drive(20, a=6000, b=500)
+    shares = {name: float(share.total) for name, share in ride.run.decision.uplinks.items()}
+    assert ride.total == sum(shares.values()) == 4000
+    assert shares["a"] > 3300  # more than half of it
+
+
+def test_a_prediction_for_all_is_shared_equally_until_it_is_known_better() -> None:
+    ride = Vehicle()
+    ride.accept("bitrate_predicted", t=1, kbps=4000)
+    assert {share.total for share in ride.run.decision.uplinks.values()} == {1000}  # half of the half, at the start
+    for _ in range(20):
+        ride.accept("bitrate_predicted", kbps=4000)
+        ride.drive(0.5, a=4000, b=500)
+    totals = {name: float(share.total) for name, share in ride.run.decision.uplinks.items()}
+    assert totals["a"] > 2500 and totals["b"] < 500
+
+
+def test_as_a_ceiling_a_prediction_for_all_limits_the_sum_and_one_for_an_uplink_that_uplink() -> None:
+    ride = Vehicle("++modes.automatic.follow_link.ceiling=prediction")
+    for _ in range(20):
+        ride.accept("bitrate_predicted", t=ride.run.state.t + 0.01, kbps=3000)
+        ride.drive(0.5, a=6000, b=500)
+    totals = {name: float(share.total) for name, share in ride.run.decision.uplinks.items()}
+    assert sum(totals.values()) == ride.total == 3000
+    assert totals["a"] > 2400
+    ride.accept("bitrate_predicted", kbps=1000, uplink="a")
+    ride.drive(0.1, a=6000, b=500)
+    assert 900 < ride.run.decision.uplinks["a"].total <= 1000
+
+
+def test_in_mode_single_no_uplink_is_given_more_than_it_carries() -> None:
+    ride = Vehicle("mode=single")
+    ride.drive(20, a=2500, b=2500)
+    for camera in ride.vehicle.cameras:
+        ride.accept("camera_configured", camera=camera, kbps=1500)
+    ride.drive(1, a=2500, b=2500)
+    for name, share in ride.run.decision.uplinks.items():
+        assert 1500 < ride.load(name) <= share.total
+
+
 def test_in_mode_single_the_operators_settings_are_spread() -> None:
     ride = Vehicle("mode=single")
     ride.drive(20, a=9000, b=9000)

@@ -62,9 +62,16 @@ class State:
             manual={},
         )
 
-    def over(self, uplink: str) -> State:
-        """As if this uplink, which has a name, were the only one."""
-        return replace(self, link=self.links.get(uplink), prediction=self.predictions.get(uplink))
+    def over(self, uplink: str, uplinks: int) -> State:
+        """As if this uplink, one of several, were the only one.
+
+        Without predictions of its own it has an equal part of those for all together.
+        """
+        own, of_all = self.predictions.get(uplink), self.prediction
+        if own is None and of_all:
+            lower = None if of_all.lower_kbps is None else of_all.lower_kbps / uplinks
+            own = replace(of_all, kbps=of_all.kbps / uplinks, lower_kbps=lower)
+        return replace(self, link=self.links.get(uplink), prediction=own)
 
 
 _FIELDS = tuple(part.name for part in fields(State))

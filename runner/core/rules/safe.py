@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 from fractions import Fraction
 from functools import cache, partial
 from math import ceil, inf
@@ -115,10 +116,12 @@ def fit_to_total(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -
     """
     total = draft.total
     assert total is not None
-    if total >= of_all_copies(state, draft.bitrate):
+    if total >= of_all_copies(state, draft.bitrate) and not draft.placed:
         return draft, {} if memory else memory
     draft, given_up, memory = _give_up(vehicle, state, draft, draft.bitrate, memory)
     bitrates = _shared(vehicle, state, draft, _without(given_up, draft.bitrate))
+    if bitrates == draft.bitrate:
+        return draft, memory
     factors, reasons = dict(draft.scaling), dict(draft.reasons)
     for name, own in factors.items():
         camera, roi = vehicle.cameras[name], state.rois[name]
@@ -183,11 +186,16 @@ class _Following(NamedTuple):
 
 
 def _follow(
-    vehicle: Vehicle, state: State, draft: Draft, past: Belief | None, how: _Following
+    vehicle: Vehicle, state: State, draft: Draft, past: Belief | None, how: _Following, of_all: Kbps | None = None
 ) -> tuple[Draft, Belief | None]:
-    """The total that one uplink carries, and what is believed of it; None: nothing new."""
-    asked = draft.total
-    assert asked is not None
+    """The total that one uplink carries, and what is believed of it; None: nothing new.
+
+    of_all  total of several uplinks, which limits this one too; that before is what it begins with, and its prediction
+            is part of one for all, no evidence of its capacity. None: the total before is its own, as is the prediction
+    """
+    begins = draft.total
+    assert begins is not None
+    asked = begins if of_all is None else of_all
     cameras, is_automatic = sent_cameras(vehicle, state), state.mode is Mode.AUTOMATIC
     link = state.link if how.reports is Reports.FOLLOWED else None
     if not cameras or not follow.is_measured(state, link, past):
@@ -196,14 +204,15 @@ def _follow(
         return follow.started(state, draft, how.start), None
     limit = float(wire_kbps(cameras, asked) + how.reserve_kbps)
     has_limit = not is_automatic or how.ceiling is Ceiling.PREDICTION
+    is_predicted = is_automatic and of_all is None
     least = max(exact(LOWEST), Fraction(len(cameras)))
     belief = follow.updated(
         past,
         state,
         link,
-        start=float(how.start * wire_kbps(cameras, asked)),
+        start=float(how.start * wire_kbps(cameras, begins)),
         most=float(wire_kbps(cameras, of_all_copies(state, _wanted(vehicle, state, draft)))),
-        prediction=follow.predicted(state, cameras, how.after_s) if is_automatic else follow.NO_PREDICTION,
+        prediction=follow.predicted(state, cameras, how.after_s) if is_predicted else follow.NO_PREDICTION,
         floors=float(_wire_floors(vehicle, state, draft, cameras, how.reserve_kbps)),
         ceiling=limit if has_limit else inf,
     )
@@ -221,34 +230,30 @@ def _follow(
 def _follow_each(vehicle: Vehicle, state: State, draft: Draft, memory: Memory, how: _Following) -> Step:
     """The same for each of several uplinks, as if it were the only one, with its own reports and predictions.
 
-    Where the total before is a limit, it is one for all together.
+    Where the total before is a limit, it is one for all together; a prediction for one uplink limits that one.
     """
-    asked = draft.total
+    asked, is_automatic = draft.total, state.mode is Mode.AUTOMATIC
     assert asked is not None
-    equal = Fraction(asked) / len(vehicle.uplinks)
     alone, beliefs = {}, {}
     for name, reserve in vehicle.uplinks.items():
-        own, past = state.over(name), memory.get(name)
-        predicted = own.prediction.kbps if own.prediction and state.mode is Mode.AUTOMATIC else equal
+        own, past = state.over(name, len(vehicle.uplinks)), memory.get(name)
+        begins = own.prediction.kbps if own.prediction and is_automatic else Fraction(asked) / len(vehicle.uplinks)
         if past and own.link and own.link.evidence.silent_s > FORGOTTEN_S:
             past = None  # it may be another cell, or another network
         follows = how._replace(reserve_kbps=how.reserve_kbps + reserve)
-        alone[name], belief = _follow(vehicle, own, draft.replaced(total=predicted, notes=()), past, follows)
+        of_all = None if name in state.predictions and is_automatic else asked
+        alone[name], belief = _follow(vehicle, own, draft.replaced(total=begins, notes=()), past, follows, of_all)
         beliefs[name] = past if belief is None else belief
     stalled = {name for name, link in state.links.items() if link.state is LinkState.STALLED}
-    return _together(draft, alone, stalled, has_limit=state.mode is not Mode.AUTOMATIC), beliefs
+    has_limit = how.ceiling is Ceiling.PREDICTION and state.prediction is not None if is_automatic else True
+    together = _together(draft, alone, stalled)
+    return _limited(together, asked, shares=state.mode is not Mode.SINGLE) if has_limit else together, beliefs
 
 
-def _together(draft: Draft, alone: Mapping[str, Draft], stalled: Collection[str], *, has_limit: bool) -> Draft:
-    """What all uplinks carry, from what each does.
-
-    has_limit  whether the total before is a limit
-    """
+def _together(draft: Draft, alone: Mapping[str, Draft], stalled: Collection[str]) -> Draft:
+    """What all uplinks carry, from what each does."""
     totals = {name: own.total or allocation.ZERO for name, own in alone.items()}
     total = sum(totals.values(), allocation.ZERO)
-    if has_limit and draft.total is not None and total > draft.total:
-        totals = {name: own * draft.total / total for name, own in totals.items()}
-        total = draft.total
     lasting = sum((own.sized_for or own.total or allocation.ZERO for own in alone.values()), allocation.ZERO)
     return draft.replaced(
         total=total,
@@ -258,6 +263,22 @@ def _together(draft: Draft, alone: Mapping[str, Draft], stalled: Collection[str]
         sized_for=None if lasting == total else lasting,
         notes=(*draft.notes, *(f"{name}: {note}" for name, own in alone.items() for note in own.notes)),
     )
+
+
+def _limited(draft: Draft, limit: Kbps, *, shares: bool) -> Draft:
+    """With a limit for all uplinks together.
+
+    shares  whether what each carries is limited in proportion; otherwise any of them may carry all of it
+    """
+    total = draft.total
+    assert total is not None
+    if total < limit:
+        return draft.replaced(uncapped=limit)
+    uplinks = draft.uplinks
+    if shares and total:
+        uplinks = {name: replace(each, total=each.total * limit / total) for name, each in uplinks.items()}
+    lasting = None if draft.sized_for is None or draft.sized_for >= limit else draft.sized_for
+    return draft.replaced(total=limit, uplinks=uplinks, uncapped=None, sized_for=lasting)
 
 
 def sent_cameras(vehicle: Vehicle, state: State) -> tuple[Camera, ...]:
