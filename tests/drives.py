@@ -133,8 +133,7 @@ class _Made:
 
     def _take(self, event: Event, cause: str) -> None:
         self._step(event, cause)
-        prediction = self.pqos.observe(event)
-        if prediction is not None:
+        for prediction in self.pqos.observe(event):
             self._step(prediction, f"bitrate_predicted kbps {plain(prediction.kbps)}")
 
     def _step(self, event: Event, cause: str) -> None:

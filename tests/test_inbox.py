@@ -49,6 +49,7 @@ def test_a_measurement_supersedes_an_older_one_but_not_across_a_change_of_the_mo
     assert inbox.put(make_request("a", "steering_reported", rad=0.1)) is None
     assert inbox.put(make_request("a", "bitrate_predicted", kbps=2)) is first
     assert inbox.put(make_request("b", "bitrate_predicted", kbps=7)) is None
+    assert inbox.put(make_request("b", "bitrate_predicted", kbps=7, uplink="x")) is None
     inbox.put(make_request("a", "mode_selected", mode="single"))
     assert inbox.put(make_request("a", "bitrate_predicted", kbps=3)) is None
     own = [r.document for r in all_of(inbox) if r.sender == "a"]

@@ -16,7 +16,7 @@ from shared_data import shared
 
 from runner.core.events import BitratePredicted, to_json
 from runner.core.model import Vehicle
-from runner.pqos import Pqos, build_pqos
+from runner.pqos import Pqos, Predictions, build_pqos
 from runner.verbs.replay import events, replay
 
 pytestmark = pytest.mark.usefixtures("composed_once")
@@ -38,7 +38,7 @@ def answers(
     documents: Iterable[dict[str, Any]], replayed: Vehicle = VEHICLE, pqos: Pqos | None = None
 ) -> list[dict[str, Any]]:
     inputs = events(lines(documents).splitlines(keepends=True), "test")
-    return [json.loads(line) for line in replay(replayed, inputs, pqos)]
+    return [json.loads(line) for line in replay(replayed, inputs, Predictions({"": pqos}) if pqos else None)]
 
 
 @pytest.fixture

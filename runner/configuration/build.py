@@ -260,7 +260,7 @@ class Builder:
 
     def check_link(self, link: LinkSettings) -> None:
         """Check that all cameras can use a limited link, and that its kind supports the settings."""
-        from runner.configuration.experiment import lane_problems
+        from runner.configuration.experiment import lane_problems, unreachable_uplinks
 
         cameras = tuple(self.setup.vehicle.cameras.values()) if self.setup else ()
         dialling = [camera.name for camera in cameras if camera.graph.transport != "rtsp"]
@@ -274,6 +274,9 @@ class Builder:
             self._refuse_link("tcp", None, "is not supported by link=relay; choose link=netns", ("link", "kind"))
         for error in lane_problems(self.composed.document["link"]):
             self._report(("link",), error)
+        if self.is_valid("uplinks"):
+            for error in unreachable_uplinks(self.composed.document):
+                self._report(("uplinks",), error)
 
     def _refuse_link(self, key: str, found: str | None, rule: str, other: schema.Path) -> None:
         self.problems.append(self.composed.problem(("link", key), found, rule, [other]))

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import cached_property
+from collections.abc import Callable, Sequence
+from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from runner.configuration.build import Builder, PlanCheck
 from runner.configuration.compose import compose, recompose
@@ -16,11 +16,12 @@ if TYPE_CHECKING:
     from runner.configuration.experiment import Experiment, LinkSettings, RateAtTime
     from runner.configuration.origin import Composed
     from runner.core.model import Vehicle
-    from runner.pqos import Pqos
+    from runner.pqos import Predictions
     from runner.pqos.track import Track
     from runner.rate_quality.study import Study
     from runner.settings import Setup
 
+T = TypeVar("T")
 CONF = "conf="
 Base = tuple[dict[str, Any], str]  # a configuration composed before, and its location
 
@@ -75,15 +76,35 @@ class Configuration:
     def vehicle(self) -> Vehicle:
         return self.setup().vehicle
 
-    def pqos(self) -> tuple[Pqos, Track | None]:
-        """The source of predictions, and the drive that gives positions if no GPS does."""
-        from runner.pqos import build_pqos, build_track
+    def pqos(self) -> tuple[Predictions, Track | None]:
+        """The sources of predictions, and the drive that gives positions if no GPS does."""
+        from runner.pqos import Predictions, build_pqos, build_track
 
         part = self._builder.part
-        pqos = part(("pqos",), lambda settings: build_pqos(settings, self._bases))
+        common = part(("pqos",), lambda settings: build_pqos(settings, self._bases))
         # A map that cannot be read is reported once, although the drive also uses its points.
-        track = part(("pqos",), lambda settings: build_track(settings, self._bases)) if pqos else None
-        return self._builder.checked(pqos), track
+        track = part(("pqos",), lambda settings: build_track(settings, self._bases)) if common else None
+        own = self._of_uplinks(lambda settings: build_pqos(settings, self._bases)) if common else {}
+        uplinks = self.document.get("uplinks") or {}
+        sources = own if uplinks and own.keys() == uplinks.keys() else {"": common, **own}
+        return self._builder.checked(Predictions({name: each for name, each in sources.items() if each})), track
+
+    def _of_uplinks(self, make: Callable[[dict[str, Any]], T]) -> dict[str, T | None]:
+        """By uplink with predictions of its own, what is made of their source; None: that is wrong."""
+        from runner.configuration.uplinks import check_complete, pqos_of_uplinks
+
+        builder = self._builder
+        if not (builder.is_valid("uplinks") and builder.is_valid("pqos")):
+            return {}
+
+        def complete(name: str, settings: dict[str, Any]) -> T:
+            check_complete(settings, name)
+            return make(settings)
+
+        return {
+            name: builder.attempt(("uplinks", name, "pqos"), partial(complete, name, settings))
+            for name, settings in pqos_of_uplinks(self.document).items()
+        }
 
     def study(self) -> Study:
         """How rate-quality models of the cameras are measured."""
@@ -105,9 +126,9 @@ class Configuration:
     def link(self, rates: RateAtTime | None = None) -> LinkSettings | None:
         """The limited link between the demo's sides, if any.
 
-        rates  to follow if it names no file; None: what the source of predictions states
+        rates  to follow if it names no file; None: what the source of predictions states, for a lane that of its uplink
         """
-        from runner.configuration.experiment import read_link, true_rates
+        from runner.configuration.experiment import lane_of, read_link, true_rates
 
         builder = self._builder
         if "link" not in self.document:
@@ -115,7 +136,9 @@ class Configuration:
         followed = rates or builder.part(("pqos",), lambda settings: true_rates(settings, self._bases))
         if followed is None:
             return builder.checked(None)
-        link = builder.part(("link",), lambda settings: read_link(settings, followed, self._bases))
+        own = {} if rates else self._of_uplinks(lambda settings: true_rates(settings, self._bases))
+        by_lane = {lane: each for name, each in own.items() if each and (lane := lane_of(self.document, name))}
+        link = builder.part(("link",), lambda settings: read_link(settings, followed, self._bases, by_lane))
         if link:
             builder.check_link(link)
         return builder.checked(link)

@@ -78,17 +78,20 @@ def _request(index: int, data: Mapping[str, Any]) -> TimedRequest:
     return TimedRequest(float(data["at_s"]), event)
 
 
-def read_link(data: Mapping[str, Any], predicted: RateAtTime, bases: Sequence[Path]) -> LinkSettings:
+def read_link(
+    data: Mapping[str, Any], predicted: RateAtTime, bases: Sequence[Path], by_lane: Mapping[str, RateAtTime]
+) -> LinkSettings:
     """The link that the `link` section describes.
 
     predicted  rates to follow if it names no file, see `true_rates`
+    by_lane    likewise, for lanes of uplinks that have predictions of their own
     bases      directories in which a relative file is looked up
     raises     ModelError with the key, the value found and the rule
     """
     lanes = {}
     for name, own in (data.get("lanes") or {}).items():
         with within(f"lanes.{name}"):
-            lanes[name] = _limit({**data, **_alone(own)}, predicted, bases, _cuts(data, name))
+            lanes[name] = _limit({**data, **_alone(own)}, by_lane.get(name, predicted), bases, _cuts(data, name))
     limit = next(iter(lanes.values())) if lanes else _limit(data, predicted, bases, ())
     return LinkSettings(data["kind"], limit, lanes)
 
@@ -103,6 +106,37 @@ def _cuts(data: Mapping[str, Any], lane: str) -> tuple[Cut, ...]:
 
     cuts = [cut for cut in data.get("cuts") or () if cut["lane"] == lane]
     return tuple(Cut(float(cut["at_s"]), float(cut.get("for_s", 0)), cut["how"]) for cut in cuts)
+
+
+def lane_of(document: Mapping[str, Any], uplink: str) -> str | None:
+    """The lane that an uplink sends by; None: none, or the link has no lanes."""
+    from runner.link.relayed import lane_addresses
+
+    link, way = document["link"], document["uplinks"][uplink]
+    lanes = link.get("lanes") or {}
+    if link["kind"] == "relay":
+        return next((lane for lane, at in lane_addresses(lanes).items() if at == way.get("address")), None)
+    return way["interface"] if way.get("interface") in lanes else None
+
+
+def unreachable_uplinks(document: Mapping[str, Any]) -> Iterator[ModelError]:
+    """Uplinks that would not use a lane of the limited link."""
+    from runner.link.netns import LINK
+    from runner.link.relayed import lane_addresses
+
+    link = document["link"]
+    lanes = link.get("lanes") or {}
+    if link["kind"] == "relay":
+        key, other, why = "address", "interface", "link=relay has no devices, only addresses"
+        known, device = [f"{at} is {lane}" for lane, at in lane_addresses(lanes).items()], None
+    else:
+        key, other, why = "interface", "address", "link=netns takes new addresses for each drive"
+        known, device = [f"link.lanes has {', '.join(lanes)}"] if lanes else ["link.lanes is null"], LINK
+    for name, way in (document.get("uplinks") or {}).items() if known else ():
+        if other in way:
+            yield ModelError(f"{name}.{other}", way[other], f"must not be given: {why}")
+        elif lane_of(document, name) is None and (lanes or way.get(key) != device):
+            yield ModelError(f"{name}.{key}", way.get(key), f"no such lane: {', '.join(known)}")
 
 
 def lane_problems(data: Mapping[str, Any]) -> Iterator[ModelError]:

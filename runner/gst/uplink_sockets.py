@@ -10,21 +10,17 @@ from contextlib import ExitStack, contextmanager
 from gi.repository import Gio
 
 from runner.settings import Uplink
+from runner.system.interfaces import number_of
 
 ANY = {socket.AF_INET: "0.0.0.0", socket.AF_INET6: "::"}
 
 
 def device_of(uplink: Uplink) -> int:
-    """Number of an uplink's device, 0 while there is none: a device that comes back has another one.
+    """Number of an uplink's device, 0 while there is none.
 
     Sockets that are bound to an address alone need not be made anew.
     """
-    if uplink.interface is None:
-        return -1
-    try:
-        return socket.if_nametoindex(uplink.interface)
-    except OSError:
-        return 0
+    return -1 if uplink.interface is None else number_of(uplink.interface)
 
 
 def open_socket(uplink: Uplink, family: int, port: int) -> Gio.Socket | None:

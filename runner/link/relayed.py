@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 
 from runner.errors import RunError
@@ -15,6 +15,11 @@ from runner.settings import Endpoint
 from runner.system import children
 
 LANE = "127.0.1.{}"  # address of the vehicle in a lane, by its number from 1 on
+
+
+def lane_addresses(lanes: Iterable[str]) -> dict[str, str]:
+    """What the vehicle sends from in each lane; "": that of a link without lanes."""
+    return {lane: LANE.format(number) if lane else "" for number, lane in enumerate(lanes, 1)}
 
 
 @contextmanager
@@ -29,7 +34,7 @@ def relayed(limits: Mapping[str, Limit], media: Endpoint, control: Endpoint, dia
     for what, given in (("tcp", tcp), ("media that the vehicle dials", dials)):
         if given:
             raise RunError(f"link=relay: {what} is not supported, choose link=netns")
-    addresses = {lane: LANE.format(number) if lane else "" for number, lane in enumerate(limits, 1)}
+    addresses = lane_addresses(limits)
     lanes = {addresses[lane]: limit.directions() for lane, limit in limits.items()}
     settings = {"media": [media.host, media.port], "control": [control.host, control.port], "lanes": lanes}
     command = (sys.executable, "-m", "runner.link.relay", json.dumps(settings))

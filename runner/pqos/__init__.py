@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from random import Random
@@ -95,6 +95,26 @@ class WrongPqos:
 
     def _factor(self, second: int) -> Kbps:
         return exact(round(Random(second).lognormvariate(0, self._noise), 4)) if self._noise else Kbps(1)
+
+
+class Predictions:
+    """All sources of a vehicle, by uplink; "" is for all together."""
+
+    def __init__(self, sources: Mapping[str, Pqos]) -> None:
+        self._sources = sources
+
+    @property
+    def warnings(self) -> Iterator[str]:
+        """Of all sources, see `Pqos`."""
+        for uplink, source in self._sources.items():
+            yield from (f"uplink {uplink}: {warning}" if uplink else warning for warning in source.warnings)
+
+    def observe(self, event: Event) -> Iterator[BitratePredicted]:
+        """The predictions that follow from an event."""
+        for uplink, source in self._sources.items():
+            prediction = source.observe(event)
+            if prediction is not None:
+                yield replace(prediction, uplink=uplink) if uplink else prediction
 
 
 def trace(path: Path, loop: bool, off_trace: Kbps | None, column: Column | None = None) -> Callable[[float], Kbps]:

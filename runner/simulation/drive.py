@@ -16,7 +16,7 @@ from runner.core.events import BitratePredicted, ClockAdvanced, Event, parse
 from runner.core.step import Run
 from runner.link.limit import TcpFlows
 from runner.link.losses import LossModel
-from runner.pqos import Pqos
+from runner.pqos import Predictions
 from runner.records.reception import Arrival, ReceptionReported
 from runner.settings import Setup
 from runner.simulation.control import ControlMessages, segments
@@ -156,7 +156,7 @@ class Simulation:
     """One drive. Events wait in a heap; packets do not, see `runner.simulation.queues`."""
 
     def __init__(
-        self, setup: Setup, link: Link, pqos: Pqos, duration_s: float, conditions: Conditions, seed: int,
+        self, setup: Setup, link: Link, pqos: Predictions, duration_s: float, conditions: Conditions, seed: int,
         recorder: Recorder, requests: Sequence[TimedRequest] = (),
     ) -> None:  # fmt: skip
         self.link, self.conditions, self.recorder = link, conditions, recorder

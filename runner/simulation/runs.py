@@ -18,6 +18,7 @@ from runner.errors import ArgumentError, suggest
 from runner.link.limit import Limit, OneWay
 from runner.link.losses import LossModel
 from runner.link.policer import Policer
+from runner.pqos import Predictions
 from runner.pqos.settings import find_file, find_path
 from runner.simulation.drive import Conditions, Drive, Link, Recorder, Simulation
 from runner.simulation.families import FAMILIES, LEFT_OUT, generate, is_family
@@ -258,7 +259,7 @@ def run_job(common: Common, job: Job, keep: bool = False, log: tuple[Path, float
     if job.prediction == CONFIGURED:
         seen, _ = config.pqos()
     else:
-        seen = prediction(job.prediction, capacity, job.duration_s, job.seed)
+        seen = Predictions({"": prediction(job.prediction, capacity, job.duration_s, job.seed)})
     link, requests, setup = _link(common, job, limit, capacity), config.experiment().requests, config.setup()
     with _recorder(common, job, log) as recorder:
         drive = Simulation(setup, link, seen, job.duration_s, common.conditions, job.seed, recorder, requests).run()

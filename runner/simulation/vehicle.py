@@ -11,7 +11,7 @@ from msgspec import UNSET
 from runner.core.events import ClockAdvanced, ControlPassed, Event, OperatorConnected, OperatorDisconnected
 from runner.core.step import Run, start, step
 from runner.errors import RunError
-from runner.pqos import Pqos
+from runner.pqos import Predictions
 from runner.records.reception import ReceptionReport, ReceptionReported, SentFrame
 from runner.settings import Setup
 from runner.simulation.encoder import Encoder
@@ -30,7 +30,7 @@ class SimulatedVehicle:
     """on_step: called with each event and the run before and after it; on_report: with each reception report."""
 
     setup: Setup
-    pqos: Pqos
+    pqos: Predictions
     encoders: Mapping[str, Encoder]
     on_step: OnStep
     on_report: Callable[[ReceptionReported], None]
@@ -47,7 +47,7 @@ class SimulatedVehicle:
     def take(self, event: Event) -> None:
         """Process an event, and the prediction that follows from it."""
         self._step(event)
-        if prediction := self.pqos.observe(event):
+        for prediction in self.pqos.observe(event):
             self._step(prediction)
 
     def connect(self, t: float) -> None:

@@ -1,4 +1,4 @@
-"""The IP addresses of a network device."""
+"""Network devices: their numbers and IP addresses."""
 
 from __future__ import annotations
 
@@ -11,6 +11,14 @@ from pathlib import Path
 
 SIOCGIFADDR, IFREQ = 0x8915, "16s2xH4s16x"  # linux/sockios.h; struct ifreq with a struct sockaddr_in
 IF_INET6, GLOBAL = Path("/proc/self/net/if_inet6"), "00"  # scope there
+
+
+def number_of(interface: str) -> int:
+    """Of a device; 0: there is none. One that comes back has another number."""
+    try:
+        return socket.if_nametoindex(interface)
+    except OSError:
+        return 0
 
 
 def addresses_of(interface: str) -> tuple[str, ...]:

@@ -46,10 +46,10 @@ class Request(NamedTuple):
         return self.sender
 
     @property
-    def measures(self) -> str | None:
-        """Its event, if it measures a quantity, so that a newer measurement supersedes it."""
+    def measures(self) -> tuple[str, object] | None:
+        """Its event and uplink, if it measures a quantity, so that a newer measurement supersedes it."""
         name = self.document.get("event")
-        return name if name in MEASUREMENTS else None
+        return (name, self.document.get("uplink", "")) if name in MEASUREMENTS else None
 
     @property
     def changes_mode(self) -> bool:

@@ -48,6 +48,7 @@ from runner.security.exposure import vehicle_keyring
 from runner.security.keyring import Keyring
 from runner.settings import Setup
 from runner.system.held_up import LateCheck
+from runner.system.interfaces import number_of
 from runner.system.kernel_clock import clock_error_s, wall_ahead_s
 from runner.system.service import notify
 from runner.vehicle.access import Access
@@ -321,6 +322,18 @@ def _check_ros(setup: Setup) -> None:
         check_discovery(setup.ros, setup.insecure)
 
 
+def _missing_devices(setup: Setup) -> list[str]:
+    """Uplinks whose device does not exist, or not yet. raises RunError if the vehicle must not start without one"""
+    missing = [
+        f"uplink {name}: {uplink.interface}: no such device"
+        for name, uplink in setup.uplinks.items()
+        if uplink.interface and not number_of(uplink.interface)
+    ]
+    if missing and setup.strict:
+        raise RunError("; ".join(missing))
+    return [f"{each}; it is used once there is one" for each in missing]
+
+
 def ros_cameras(
     setup: Setup, push: Callable[[str, SharedPicture], bool], report: Callable[[str], None]
 ) -> RosCameras | None:
@@ -364,7 +377,7 @@ def live_vehicle(
     _check_ros(setup)
     render_missing(setup.vehicle, progress)
     plans = compile_plans(setup)
-    lost = apply.check_machine(plans, strict=setup.strict)
+    lost, missing = apply.check_machine(plans, strict=setup.strict), _missing_devices(setup)
     if log and setup.strict:
         check_free(log, "vehicle")
     console = _Console(say)
@@ -378,8 +391,8 @@ def live_vehicle(
             console.say(what)
             drive.note(what)
 
-        for rate in rates:
-            report(rate)
+        for found in (*rates, *missing):
+            report(found)
         video = apply.VideoFiles(log, drive.video, drive.video_shift) if log and setup.log_video else None
         side = apply.VehicleSide(
             plans, setup.media, lambda camera, what: report(f"{camera}: {what}"), video, keyring, lost, setup.uplinks

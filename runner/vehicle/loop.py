@@ -28,7 +28,7 @@ from runner.core.events import (
     parse,
 )
 from runner.core.step import Run, start, step
-from runner.pqos import Pqos
+from runner.pqos import Predictions
 from runner.records.reception import ReceptionReport, ReceptionReported, SentFrame
 from runner.records.vehicle import CameraReading, Outcome, SenderStages, Telemetry
 from runner.schema import event_problem, shortened
@@ -87,7 +87,7 @@ class ControlLoop:
 
     setup: Setup
     applier: Applier
-    pqos: Pqos
+    pqos: Predictions
     track: Track | None
     listener: Listener
     publish: Publish
@@ -151,7 +151,7 @@ class ControlLoop:
         """
         self._began = self.beat = time.monotonic()
         self.listener.begin()
-        self._warned = 0
+        self._warned = set[str]()
         self._run = start(self.vehicle)
         self._guarded("cameras", self._read)
         self._guarded("sources", lambda: self._check_sources(0.0))
@@ -348,11 +348,12 @@ class ControlLoop:
 
     def _take(self, event: Event, answer: Answer | None = None) -> None:
         self._take_run(step(self.vehicle, self._run, event), event, answer)
-        prediction = self.pqos.observe(event)
-        for warning in self.pqos.warnings[self._warned :]:
-            self._warned += 1
-            self.on_report(warning)
-        if prediction is not None:
+        predictions = list(self.pqos.observe(event))
+        for warning in self.pqos.warnings:
+            if warning not in self._warned:
+                self._warned.add(warning)
+                self.on_report(warning)
+        for prediction in predictions:
             self._take_run(step(self.vehicle, self._run, prediction), prediction)
 
     def _take_run(self, after: Run, event: Event, answer: Answer | None = None) -> None:

@@ -22,11 +22,12 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 from runner.configuration.config import configuration
+from runner.configuration.uplinks import KEYS, described, pqos_of_uplinks
 from runner.core.commands import wanted
 from runner.core.decision import Decision
 from runner.core.events import BitratePredicted, Event, ModeSelected, TotalSet
@@ -40,6 +41,8 @@ from runner.records.decisions import CameraDecision
 from runner.redact import redacted
 from runner.verbs import Arguments
 
+Uplinks = Mapping[str, Mapping[str, str]]  # by name, what is to be said of each
+
 
 def run(arguments: Arguments) -> int:
     form = arguments.choice("format", ("json",) if arguments.sweeps else ())
@@ -47,10 +50,10 @@ def run(arguments: Arguments) -> int:
         return _sweep(arguments)
     if form == "yaml":
         return _print_configuration(arguments)
-    vehicle, plans, decision = _plan(arguments)
-    text = json.dumps(as_json(plans, decision), indent=2, ensure_ascii=False) if form == "json" else ""
-    stand_ins = _stand_ins(plans) if form == "json" else []
-    _print(text or as_text(vehicle, plans, decision), [*stand_ins, *_parameter_sets(plans)])
+    vehicle, plans, decision, uplinks = _plan(arguments)
+    text = json.dumps(as_json(plans, decision, uplinks), indent=2, ensure_ascii=False) if form == "json" else ""
+    notes = _notes(plans, uplinks) if form == "json" else []
+    _print(text or as_text(vehicle, plans, decision, uplinks), [*notes, *_parameter_sets(plans)])
     return 0
 
 
@@ -68,10 +71,11 @@ def _sweep(arguments: Arguments) -> int:
 
     runs = prepare_all(arguments, _plan)
     lines = [
-        json.dumps({"overrides": words, **as_json(plans, decision)}, ensure_ascii=False)
-        for words, (_, plans, decision) in runs
+        json.dumps({"overrides": words, **as_json(plans, decision, uplinks)}, ensure_ascii=False)
+        for words, (_, plans, decision, uplinks) in runs
     ]
-    _print("\n".join(lines), list(dict.fromkeys(note for _, (_, plans, _) in runs for note in _stand_ins(plans))))
+    notes = (note for _, (_, plans, _, uplinks) in runs for note in _notes(plans, uplinks))
+    _print("\n".join(lines), list(dict.fromkeys(notes)))
     return 0
 
 
@@ -87,10 +91,23 @@ def _parameter_sets(plans: Sequence[Plan]) -> list[str]:
     return [f"{plan.camera.name}: {sentence}" for plan in suspected for sentence in parameter_set_notes(plan)]
 
 
-def _plan(arguments: Arguments) -> tuple[Vehicle, Sequence[Plan], Decision]:
+def _plan(arguments: Arguments) -> tuple[Vehicle, Sequence[Plan], Decision, Uplinks]:
     total = arguments.number("total_kbps")
-    setup = configuration(arguments.overrides, arguments.conf).setup()
-    return setup.vehicle, compile_plans(setup), decide(setup.vehicle, None if total is None else exact(total))
+    config = configuration(arguments.overrides, arguments.conf)
+    setup = config.setup()
+    decision = decide(setup.vehicle, None if total is None else exact(total))
+    return setup.vehicle, compile_plans(setup), decision, _uplinks(config.document)
+
+
+def _uplinks(document: Mapping[str, Any]) -> Uplinks:
+    """By uplink its ways, and where predictions of what it carries come from."""
+    own = pqos_of_uplinks(document)
+    of_all = f"{described(document['pqos'])}, for all together"
+    return {
+        name: {key: way[key] for key in KEYS if key in way}
+        | {"predictions": described(own[name]) if name in own else of_all}
+        for name, way in document.get("uplinks", {}).items()
+    }
 
 
 def _print(text: str, notes: list[str]) -> None:
@@ -115,7 +132,7 @@ def decide(vehicle: Vehicle, total: Kbps | None) -> Decision:
     return run.decision
 
 
-def as_json(plans: Sequence[Plan], decision: Decision) -> dict[str, Any]:
+def as_json(plans: Sequence[Plan], decision: Decision, uplinks: Uplinks) -> dict[str, Any]:
     cameras = {
         plan.camera.name: {
             "vehicle": plan.vehicle_line(wanted(decision.settings[plan.camera.name])),
@@ -125,12 +142,15 @@ def as_json(plans: Sequence[Plan], decision: Decision) -> dict[str, Any]:
         }
         for plan in plans
     }
-    return {"mode": decision.mode.value, "total_kbps": plain(decision.total), "cameras": cameras}
+    ways = {"uplinks": uplinks} if uplinks else {}
+    return {"mode": decision.mode.value, "total_kbps": plain(decision.total), **ways, "cameras": cameras}
 
 
-def as_text(vehicle: Vehicle, plans: Sequence[Plan], decision: Decision) -> str:
+def as_text(vehicle: Vehicle, plans: Sequence[Plan], decision: Decision, uplinks: Uplinks) -> str:
     lines = [f"# {vehicle.name}, mode {decision.mode}, total {plain(decision.total)} kbit/s"]
-    lines += [f"# {note}" for note in _stand_ins(plans)]
+    for name, way in uplinks.items():
+        lines.append(f"# uplink {name}: {', '.join(f'{key} {value}' for key, value in way.items())}")
+    lines += [f"# {note}" for note in _notes(plans, uplinks)]
     for plan in plans:
         setting = decision.settings[plan.camera.name]
         what = f"{setting.width}x{setting.height} at {setting.kbps} kbit/s" if setting.sending else "not sending"
@@ -142,6 +162,10 @@ def as_text(vehicle: Vehicle, plans: Sequence[Plan], decision: Decision) -> str:
     return "\n".join(lines)
 
 
-def _stand_ins(plans: Sequence[Plan]) -> list[str]:
-    names = [plan.camera.name for plan in plans if plan.stands_in]
-    return [f"videotestsrc stands in for the frames of {', '.join(names)}"] if names else []
+def _notes(plans: Sequence[Plan], uplinks: Uplinks) -> list[str]:
+    stand_ins = [plan.camera.name for plan in plans if plan.stands_in]
+    notes = [f"videotestsrc stands in for the frames of {', '.join(stand_ins)}"] if stand_ins else []
+    redundant = [plan.camera.name for plan in plans if plan.camera.redundant]
+    if redundant and len(uplinks) < 2:
+        notes.append(f"redundant has no effect on {', '.join(redundant)}: it needs two uplinks")
+    return notes

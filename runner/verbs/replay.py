@@ -10,8 +10,8 @@ A drive (the directory that log= wrote, or its drive.jsonl) is replayed with its
 those of the drive. Overrides change that configuration and so answer "what if"; with log= the result is written as a
 new drive, for `report`, and to output= only if that is given. A drive of an older log format is refused.
 
-Predictions are taken from the input. With a pqos= on the command line they are dropped and that source predicts
-instead, from the positions and times of the input; its events are marked "source": "pqos".
+Predictions are taken from the input. With a pqos= on the command line, or uplinks.NAME.pqos=, they are dropped and that
+source predicts instead, from the positions and times of the input; its events are marked "source": "pqos".
 
 Link measurements are taken from the input. With link=again they are made again from the drive's reception reports;
 the same version makes the same events.
@@ -37,6 +37,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import sys
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
@@ -65,10 +66,11 @@ from runner.verbs import Arguments
 
 if TYPE_CHECKING:
     from runner.drive.positions import RecordedPositions
-    from runner.pqos import Pqos
+    from runner.pqos import Predictions
     from runner.vehicle.uplink import MeasuredUplinks
 
 InputEvent = tuple[dict[str, Any], Event]  # an event, as JSON and parsed
+OTHER_PQOS = re.compile(r"\+*(pqos[=.@]|uplinks\.[^.=]+\.pqos[=.])")  # an override of a source of predictions
 CHANGING = ("link", "positions", "topic")  # arguments that change the events
 NOTHING_PREDICTED = (
     "the source of predictions on the command line has predicted nothing from this input (a map needs positions in it);"
@@ -84,7 +86,7 @@ class _Prepared(NamedTuple):
     arguments: Arguments
     config: Mapping[str, Any]
     vehicle: Vehicle
-    pqos: Pqos | None
+    pqos: Predictions | None
     positions: RecordedPositions | None
 
 
@@ -126,8 +128,7 @@ def _sweep(arguments: Arguments) -> int:
 
 def _prepare(arguments: Arguments, name: str, began: Began | None, positions: RecordedPositions | None) -> _Prepared:
     config = configuration(arguments.overrides, arguments.conf, base=_base(name, began), runnable=False)
-    chosen = any(word.lstrip("+").startswith(("pqos=", "pqos.")) for word in arguments.overrides)
-    pqos = config.pqos()[0] if chosen else None
+    pqos = config.pqos()[0] if any(map(OTHER_PQOS.match, arguments.overrides)) else None
     return _Prepared(arguments, config.document, config.vehicle(), pqos, positions)
 
 
@@ -224,7 +225,7 @@ def _words(arguments: Arguments, began: Began | None) -> tuple[str, ...]:
 
 
 def replay(
-    vehicle: Vehicle, inputs: Iterable[InputEvent], pqos: Pqos | None = None, log: Log | None = None
+    vehicle: Vehicle, inputs: Iterable[InputEvent], pqos: Predictions | None = None, log: Log | None = None
 ) -> Iterator[str]:
     """One line of JSON per event, in order.
 
@@ -255,14 +256,13 @@ def _with_positions(inputs: Iterable[InputEvent], recorded: RecordedPositions, b
         raise recorded.no_overlap(f"the input: {time_span(began.time, began.time + last)}")
 
 
-def _with_predictions(inputs: Iterable[InputEvent], pqos: Pqos) -> Iterator[InputEvent]:
+def _with_predictions(inputs: Iterable[InputEvent], pqos: Predictions) -> Iterator[InputEvent]:
     """The events with the predictions of another source in place of their own."""
     found = False
     for document, event in inputs:
         if not isinstance(event, BitratePredicted):
             yield document, event
-        prediction = pqos.observe(event)
-        if prediction is not None:
+        for prediction in pqos.observe(event):
             found = True
             yield to_json(prediction) | {"source": "pqos"}, prediction
     if not found:
