@@ -14,6 +14,9 @@ from hypothesis import strategies as st
 
 from runner.core.placement import MOVES, MOVES_S, Carries, Placement, Wanted, place, shared
 from runner.core.step import start
+from runner.records.decisions import DecisionMade
+from runner.records.lines import line_from_json, line_to_json
+from runner.schema import log_problem
 
 CAMERAS = {
     "front": Wanted(6000, 4, redundant=True),
@@ -272,3 +275,14 @@ def test_in_mode_single_the_operators_settings_are_spread() -> None:
     ride.drive(1, a=9000, b=9000)
     assert all(ride[camera].kbps == 1000 for camera in ride.vehicle.cameras)
     assert {ride[camera].uplinks for camera in ride.vehicle.cameras if camera != "front"} == {("a",), ("b",)}
+
+
+def test_a_decision_states_what_each_uplink_carries() -> None:
+    ride = Vehicle()
+    ride.drive(20, a=3000, b=None)
+    line = line_to_json(DecisionMade.of(20.0, "link_measured", ride.run.decision, ()))
+    assert (log_problem(line), line_to_json(line_from_json(line))) == (None, line)
+    assert line["cameras"]["front"]["uplinks"] == ("a", "b")
+    a, b = (line["uplinks"][name] for name in "ab")
+    assert (a["stalled"], b["stalled"]) == (False, True)
+    assert a["total_kbps"] == float(ride.run.decision.uplinks["a"].total) < a["believed"]["kbps"]

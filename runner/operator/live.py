@@ -173,7 +173,7 @@ class LiveOperator:
     def _sample(self, side: OperatorSide) -> None:
         if addresses := self.station.addresses:
             side.admit(addresses)
-        self.station.take(side.sample(self.station.sending()))
+        self.station.take(side.sample(self.station.sending()), side.received())
         self._sampled = time.monotonic()
         notify("WATCHDOG=1")
         while self._requests and self._elapsed_s() >= self._requests[0].at_s:

@@ -8,9 +8,10 @@ import uuid
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
-from msgspec import UNSET
+from msgspec import UNSET, UnsetType
 
 from runner.configuration import agreement
+from runner.core.decision import NOTHING
 from runner.core.events import Attention
 from runner.mqtt.link import ControlLink
 from runner.mqtt.login import Login
@@ -37,8 +38,15 @@ from runner.operator.requests import OnReply, Requests
 from runner.records import combined, to_json
 from runner.records.lines import Note
 from runner.records.operator import CameraSample, Sample
-from runner.records.reception import NOTHING_ARRIVED, Arrivals
-from runner.records.vehicle import NOTHING_ENCODED, CameraState, CameraTelemetry, Telemetry, VehicleState
+from runner.records.reception import NOTHING_ARRIVED, Arrivals, UplinkReceived
+from runner.records.vehicle import (
+    NOTHING_ENCODED,
+    CameraState,
+    CameraTelemetry,
+    Telemetry,
+    UplinkMeasured,
+    VehicleState,
+)
 from runner.security.keyring import Keyring
 from runner.settings import Setup
 from runner.system.held_up import LateCheck
@@ -215,8 +223,13 @@ class Station:
         """
         return {name: camera.sending and not camera.fault for name, camera in self._cameras().items()}
 
-    def take(self, samples: Mapping[str, Reception]) -> None:
-        """Process a sample of all counters; to be called a few times a second, since it also checks timeouts."""
+    def take(
+        self, samples: Mapping[str, Reception], over: Mapping[str, Mapping[str, UplinkReceived]] = NOTHING
+    ) -> None:
+        """Process a sample of all counters; to be called a few times a second, since it also checks timeouts.
+
+        over  by camera, what each uplink brought; no camera if the vehicle has one
+        """
         now = time.monotonic()
         is_excused = self._late.is_excused(now)
         if self.state and now - self._last_message > SILENT_S and not is_excused:
@@ -232,7 +245,7 @@ class Station:
         for name, received in samples.items():
             self._rates[name] = self.meters[name].add(now, received, cameras.get(name))
         self.samples = samples
-        sample = self._sample()
+        sample = self._sample(over)
         for listener in self.listeners:
             listener.on_sample(sample)
 
@@ -261,10 +274,12 @@ class Station:
         latencies = f"latencies ± {1000 * clock.bound_s:.1f} ms" if clock else "latencies still unknown"
         return f"{self._vehicle.name}, mode {state.mode}, total {state.total_words} kbit/s, {latencies}"
 
-    def _sample(self) -> Sample:
+    def _sample(self, over: Mapping[str, Mapping[str, UplinkReceived]]) -> Sample:
         telemetry, clock = self._telemetry if self.state else None, self.latency.clock
         measured = telemetry.cameras if telemetry else {}
-        cameras = {row.name: _camera_sample(row, measured.get(row.name)) for row in self.rows()}
+        cameras = {
+            row.name: _camera_sample(row, measured.get(row.name), over.get(row.name, UNSET)) for row in self.rows()
+        }
         return Sample(
             t=time.time(),
             predicted_kbps=telemetry.predicted_kbps if telemetry else None,
@@ -277,6 +292,7 @@ class Station:
             speed_factor=telemetry.speed_factor if telemetry else None,
             clock_ahead_ms=round(1000 * clock.ahead_s, 3) if clock else None,
             clock_bound_ms=round(1000 * clock.bound_s, 3) if clock else None,
+            uplinks=_uplinks(telemetry),
         )
 
     def _on_any_state(self, message: MqttMessage) -> None:
@@ -321,7 +337,7 @@ class Station:
         self._requests.vehicle_time = (telemetry.t, time.monotonic())
         self._telemetry = telemetry
         if telemetry.uplinks is not UNSET:
-            self.addresses = telemetry.uplinks
+            self.addresses = {name: each.addresses for name, each in telemetry.uplinks.items()}
         self._vehicle_online()
 
     def _on_steering(self, message: MqttMessage) -> None:
@@ -376,7 +392,17 @@ def _expiring(ends: Mapping[str, float]) -> tuple[str, ...]:
     return tuple(expiring(ends, time.time()))
 
 
-def _camera_sample(row: CameraRow, measured: CameraTelemetry | None) -> CameraSample:
+def _uplinks(telemetry: Telemetry | None) -> Mapping[str, UplinkMeasured] | UnsetType:
+    """Those over which something has arrived."""
+    if telemetry is None or telemetry.uplinks is UNSET:
+        return UNSET
+    measured = ((name, each.measured) for name, each in telemetry.uplinks.items())
+    return {name: each for name, each in measured if each is not UNSET}
+
+
+def _camera_sample(
+    row: CameraRow, measured: CameraTelemetry | None, over: Mapping[str, UplinkReceived] | UnsetType
+) -> CameraSample:
     received, state = row.received, row.state
     return combined(
         CameraSample,
@@ -389,4 +415,5 @@ def _camera_sample(row: CameraRow, measured: CameraTelemetry | None) -> CameraSa
         scaling=state.scaling if state else None,
         arrivals=(),
         stages_ms=stages(received, measured),
+        received=over,
     )

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 from msgspec import UNSET, UnsetType
 
 from runner.core.commands import Command, KnobValues
-from runner.core.decision import Believed, Decision, Setting
+from runner.core.decision import Believed, Decision, Setting, UplinkShare
 from runner.core.limits import Count, Limits
 from runner.core.model import Mode, Roi, plain
 from runner.records import Amount, CameraName, Json, Number, Time, to_json
@@ -34,10 +34,31 @@ class CameraDecision:
     width: Count
     height: Count
     reason: Annotated[str, "why, in words"]
+    uplinks: Annotated[tuple[str, ...] | UnsetType, "that carry it, its own first; absent: there is one"] = field(
+        default=UNSET, kw_only=True
+    )
 
     @classmethod
     def of(cls, setting: Setting) -> CameraDecision:
         return cls(**decided(setting))
+
+
+@dataclass(frozen=True, slots=True)
+class UplinkDecision:
+    """What one of several uplinks is to carry, see `runner.core.decision.UplinkShare`."""
+
+    total_kbps: Annotated[Amount, "of all cameras and copies on it, kbit/s"]
+    stalled: Annotated[bool, "whether nothing arrives over it"]
+    believed: Annotated[Believed | UnsetType, "absent: no rule believes anything of it"] = UNSET
+
+    @classmethod
+    def of(cls, share: UplinkShare) -> UplinkDecision:
+        return cls(plain(share.total), share.stalled, share.believed or UNSET)
+
+
+UplinkDecisions = Annotated[
+    Mapping[str, UplinkDecision] | UnsetType, "by uplink; absent: no rule shares the total among several"
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,20 +81,29 @@ class DecisionMade:
     cameras: Annotated[Mapping[str, CameraDecision], "settings by camera"]
     commands: Annotated[tuple[Turned, ...], "knobs that were turned"]
     believed: Annotated[Believed | UnsetType, "absent: no rule believes anything of the uplink"] = UNSET
+    uplinks: UplinkDecisions = UNSET
 
     @classmethod
     def of(cls, t: float, cause: str, decision: Decision, commands: tuple[Command, ...]) -> DecisionMade:
         cameras = {name: CameraDecision.of(setting) for name, setting in decision.settings.items()}
         turned = tuple(Turned(**command.to_json()) for command in commands)
-        believed = decision.believed or UNSET
-        return cls(t, cause, decision.mode, plain(decision.total), cameras, turned, believed)
+        believed, uplinks = decision.believed or UNSET, uplinks_decided(decision)
+        return cls(t, cause, decision.mode, plain(decision.total), cameras, turned, believed, uplinks)
 
 
 def decision_to_json(decision: Decision) -> Json:
     """The JSON object of a decision; without an intermediate record, since a replay writes thousands per second."""
     cameras = {name: decided(setting) | {"roi": setting.roi.to_json()} for name, setting in decision.settings.items()}
     document = {"mode": decision.mode, "total_kbps": plain(decision.total), "cameras": cameras}
-    return document if decision.believed is None else {**document, "believed": to_json(decision.believed)}
+    if decision.believed is not None:
+        document["believed"] = to_json(decision.believed)
+    if decision.uplinks:
+        document["uplinks"] = to_json(uplinks_decided(decision))
+    return document
+
+
+def uplinks_decided(decision: Decision) -> Mapping[str, UplinkDecision] | UnsetType:
+    return {name: UplinkDecision.of(share) for name, share in decision.uplinks.items()} or UNSET
 
 
 def applied_to_json(camera: str, knobs: KnobValues) -> Applied:
@@ -82,7 +112,8 @@ def applied_to_json(camera: str, knobs: KnobValues) -> Applied:
 
 
 def decided(setting: Setting) -> Json:
-    return {
+    """The fields of a `CameraDecision`."""
+    values = {
         "on": setting.on,
         "sending": setting.sending,
         "demand_kbps": plain(setting.demand),
@@ -93,3 +124,4 @@ def decided(setting: Setting) -> Json:
         "height": setting.height,
         "reason": setting.reason,
     }
+    return {**values, "uplinks": setting.uplinks} if setting.uplinks else values

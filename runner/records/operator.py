@@ -6,9 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
+from msgspec import UNSET, UnsetType
+
 from runner.core.limits import Count, NonNegative, Share
 from runner.records import Amount, Number, Time
-from runner.records.vehicle import EncoderCounts, Position
+from runner.records.reception import UplinkReceived
+from runner.records.vehicle import EncoderCounts, Position, UplinkMeasured
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +56,9 @@ class CameraSample(EncoderCounts):
     arrivals: tuple[tuple[float, float | None], ...]
     foreign: Annotated[Count, "packets from senders other than the vehicle, dropped"] = 0
     buffer_ms: Count | None = None
+    received: Annotated[
+        Mapping[str, UplinkReceived] | UnsetType, "by uplink, since the pipeline was built; absent: there is one"
+    ] = UNSET
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,3 +78,4 @@ class Sample:
     ] = None
     clock_bound_ms: Annotated[NonNegative | None, "maximum error of that and of each latency, ms; None: unknown"] = None
     speed_factor: Annotated[Share | None, "as in `SpeedAdvice`; None: not advised"] = None
+    uplinks: Annotated[Mapping[str, UplinkMeasured] | UnsetType, "by uplink; absent: there is one"] = UNSET

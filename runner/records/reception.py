@@ -8,7 +8,7 @@ from typing import Annotated, NamedTuple
 
 from msgspec import UNSET, UnsetType
 
-from runner.core.limits import Limits, NonNegative
+from runner.core.limits import Count, Limits, NonNegative
 from runner.records import Clock, Time
 
 Size = Annotated[int, Limits(0, 10**8)]  # bytes or packets of a report
@@ -47,21 +47,25 @@ class SentFrame(NamedTuple):
     sent: float
 
 
-class UplinkSent(NamedTuple):
-    """RTP packets of a camera that an uplink was to send, to each viewer, and bytes that the system has taken.
+@dataclass(frozen=True, slots=True)
+class UplinkSent:
+    """RTP packets of a camera over an uplink.
 
-    errors  how often the system has refused to send some of them, or RTCP
+    packets  that it was to send, to each viewer
+    bytes    that the system has taken
+    errors   how often the system has refused to send some of them, or RTCP
     """
 
-    packets: int = 0
-    bytes: int = 0
-    errors: int = 0
+    packets: Count = 0
+    bytes: Count = 0
+    errors: Count = 0
 
     def plus(self, other: UplinkSent) -> UplinkSent:
         return UplinkSent(self.packets + other.packets, self.bytes + other.bytes, self.errors + other.errors)
 
 
-class UplinkReceived(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class UplinkReceived:
     """RTP packets of a camera that have come by an uplink.
 
     packets  all of them, also those that were requested again
@@ -71,10 +75,10 @@ class UplinkReceived(NamedTuple):
     late     came more than 1 s after newer ones, and were dropped
     """
 
-    packets: int = 0
-    lost: int = 0
-    twins: int = 0
-    late: int = 0
+    packets: Count = 0
+    lost: Count = 0
+    twins: Count = 0
+    late: Count = 0
 
 
 class UplinkArrivals(NamedTuple):

@@ -10,11 +10,20 @@ from msgspec import UNSET, UnsetType
 
 from runner.core.commands import KnobValues
 from runner.core.decision import NOTHING, Believed, Setting
-from runner.core.events import Attention, Latitude, Longitude, PositionReported, Steering
+from runner.core.events import (
+    Attention,
+    Latitude,
+    LinkMeasured,
+    LinkState,
+    Longitude,
+    PositionReported,
+    Steering,
+)
 from runner.core.limits import Count, Limits, NonNegative, Share
 from runner.core.model import Mode
 from runner.records import Amount, Clock, Json, Number, Time, to_json
-from runner.records.decisions import Applied, CameraDecision, applied_to_json, decided
+from runner.records.decisions import Applied, CameraDecision, UplinkDecisions, applied_to_json, decided
+from runner.records.reception import UplinkSent
 
 SLOW, SLOW_S = 0.7, 2.0  # a camera is slow if it has delivered less than this share of its rate for so long, s
 
@@ -78,6 +87,7 @@ class VehicleState:
         float | UnsetType, "when the certificate of the vehicle expires, s since 1970; absent: it has none"
     ] = UNSET
     believed: Annotated[Believed | UnsetType, "of the uplink; absent: nothing"] = UNSET
+    uplinks: UplinkDecisions = UNSET
 
     @property
     def total_words(self) -> str:
@@ -114,6 +124,32 @@ class CameraTelemetry(EncoderCounts):
         float | None, "ms of the last sampled picture from its capture to the encoder; None: unknown"
     ] = None
     encode_ms: Annotated[float | None, "ms that it took through the encoder; None: unknown"] = None
+    sent: Annotated[
+        Mapping[str, UplinkSent] | UnsetType, "by uplink, since its pipeline was built; absent: there is one"
+    ] = UNSET
+
+
+@dataclass(frozen=True, slots=True)
+class UplinkMeasured:
+    """What the operator in control receives over one of several uplinks, as in `runner.core.events.LinkMeasured`."""
+
+    kbps: Annotated[NonNegative, "in the last 0.5 s, with packet headers, kbit/s"]
+    queue_ms: Annotated[NonNegative, "standing queue in front of it, ms"]
+    loss: Annotated[Share, "share of the packets of the last second that was lost"]
+    state: Annotated[LinkState, "stalled: nothing arrives"]
+    rtt_ms: Annotated[NonNegative, "round trip of the control link, ms"]
+
+    @classmethod
+    def of(cls, event: LinkMeasured) -> UplinkMeasured:
+        return cls(float(event.kbps), event.queue_ms, event.loss, event.state, event.rtt_ms)
+
+
+@dataclass(frozen=True, slots=True)
+class UplinkTelemetry:
+    """One of several uplinks."""
+
+    addresses: Annotated[tuple[str, ...], "that it sends from; none while its device has none"]
+    measured: Annotated[UplinkMeasured | UnsetType, "absent: nothing has arrived at the operator in control"] = UNSET
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,9 +163,7 @@ class Telemetry:
     refused: Annotated[Count, "requests refused since the start"]
     errors: Annotated[Count, "exceptions caught by the control loop since the start"] = 0
     speed_factor: Annotated[Share | None, "as in `SpeedAdvice`; None: not advised"] = None
-    uplinks: Annotated[
-        Mapping[str, tuple[str, ...]] | UnsetType, "addresses that it sends from, by uplink; absent: there is one"
-    ] = UNSET
+    uplinks: Annotated[Mapping[str, UplinkTelemetry] | UnsetType, "by uplink; absent: there is one"] = UNSET
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,8 +29,8 @@ from runner.core.events import (
 )
 from runner.core.step import Run, start, step
 from runner.pqos import Predictions
-from runner.records.reception import ReceptionReport, ReceptionReported, SentFrame
-from runner.records.vehicle import CameraReading, Outcome, SenderStages, Telemetry
+from runner.records.reception import ReceptionReport, ReceptionReported, SentFrame, UplinkSent
+from runner.records.vehicle import CameraReading, CameraTelemetry, Outcome, SenderStages, Telemetry
 from runner.schema import event_problem, shortened
 from runner.settings import Setup, Uplink
 from runner.system.held_up import LateCheck
@@ -60,6 +60,7 @@ class Applier(Protocol):
     def read(self) -> Mapping[str, CameraReading]: ...
     def stages(self) -> Mapping[str, SenderStages]: ...
     def sent_frames(self) -> Mapping[str, Iterable[SentFrame]]: ...
+    def sent(self) -> Mapping[str, Mapping[str, UplinkSent]]: ...
     def give_control(self, operator: str) -> None: ...
     def send_key_frames(self, cameras: Iterable[str]) -> None: ...
 
@@ -395,12 +396,18 @@ class ControlLoop:
         self._replies.settle(self._run, self._cameras, now)
 
     def _publish_measured(self, t: float) -> None:
-        uplinks = {name: _addresses(each) for name, each in self.setup.uplinks.items()}
+        addresses = {name: _addresses(each) for name, each in self.setup.uplinks.items()}
+        sent = self.applier.sent() if addresses else {}
         telemetry = self._publisher.telemetry(
-            self._run, t, self._cameras, self.applier.stages(), self.refusals.count, self.errors, uplinks
+            self._run, t, self._cameras, self.applier.stages(), self.refusals.count, self.errors, addresses, sent
         )
         self.listener.record(telemetry)
-        self.publish(telemetry)
+        self.publish(replace(telemetry, cameras=dict(_unsent(telemetry))) if sent else telemetry)
+
+
+def _unsent(telemetry: Telemetry) -> Iterator[tuple[str, CameraTelemetry]]:
+    """The cameras of telemetry without what only the log needs: each message takes from a limited link."""
+    return ((name, replace(each, sent=UNSET)) for name, each in telemetry.cameras.items())
 
 
 def _addresses(uplink: Uplink) -> tuple[str, ...]:

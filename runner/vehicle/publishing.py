@@ -6,13 +6,14 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
-from msgspec import UNSET
+from msgspec import UNSET, UnsetType
 
-from runner.core.events import Attention, PositionReported, SteeringReported
+from runner.core.events import Attention, LinkMeasured, PositionReported, SteeringReported
 from runner.core.model import plain
 from runner.core.step import Run
 from runner.records import combined
-from runner.records.decisions import applied_to_json
+from runner.records.decisions import applied_to_json, uplinks_decided
+from runner.records.reception import UplinkSent
 from runner.records.vehicle import (
     CameraReading,
     CameraState,
@@ -22,6 +23,8 @@ from runner.records.vehicle import (
     SpeedAdvice,
     SteeringAngle,
     Telemetry,
+    UplinkMeasured,
+    UplinkTelemetry,
     VehicleState,
 )
 from runner.settings import LatencyLimit
@@ -88,21 +91,29 @@ class Publisher:
         stages: Mapping[str, SenderStages],
         refused: int,
         errors: int,
-        uplinks: Mapping[str, tuple[str, ...]],
+        addresses: Mapping[str, tuple[str, ...]],
+        sent: Mapping[str, Mapping[str, UplinkSent]],
     ) -> Telemetry:
         """What was read back from the elements, and what the encoders have output so far.
 
-        uplinks  addresses by uplink
+        addresses  by uplink
+        sent       by camera and uplink
         """
         measured = {
             name: combined(
-                CameraTelemetry, camera.encoded, stages.get(name), applied=applied_to_json(name, camera.applied)
+                CameraTelemetry,
+                camera.encoded,
+                stages.get(name),
+                applied=applied_to_json(name, camera.applied),
+                sent=sent.get(name, UNSET),
             )
             for name, camera in cameras.items()
         }
         prediction = run.state.prediction
         predicted = plain(prediction.kbps) if prediction else None
         position, factor = self._current_position(t), self._speed_factor(run, t)
+        links = run.state.links
+        uplinks = {name: UplinkTelemetry(own, _measured(links.get(name))) for name, own in addresses.items()}
         return Telemetry(t, predicted, position, measured, refused, errors, factor, uplinks or UNSET)
 
     def _current_position(self, t: float) -> Position | None:
@@ -152,9 +163,14 @@ def vehicle_state(
         attention=run.state.attention or UNSET,
         operator=operator or UNSET,
         believed=decision.believed or UNSET,
+        uplinks=uplinks_decided(decision),
     )
 
 
 def _without_reasons(state: VehicleState) -> VehicleState:
     cameras = {name: replace(camera, reason="") for name, camera in state.cameras.items()}
-    return replace(state, cameras=cameras, believed=UNSET)
+    return replace(state, cameras=cameras, believed=UNSET, uplinks=UNSET)
+
+
+def _measured(link: LinkMeasured | None) -> UplinkMeasured | UnsetType:
+    return UplinkMeasured.of(link) if link else UNSET

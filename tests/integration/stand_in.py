@@ -11,7 +11,7 @@ from typing import Any
 from runner.apply import Reception
 from runner.core.commands import Command, KnobValue
 from runner.graph import Plan
-from runner.records.reception import Arrivals, SentFrame
+from runner.records.reception import Arrivals, SentFrame, UplinkReceived, UplinkSent
 from runner.records.vehicle import CameraReading, EncoderCounts, SenderStages
 
 FRAMES = 5  # delivered by a sending camera between two samples
@@ -74,6 +74,9 @@ class RecordingVehicle:
     def sent_frames(self) -> dict[str, list[SentFrame]]:
         return {}
 
+    def sent(self) -> dict[str, dict[str, UplinkSent]]:
+        return {}
+
     def send_key_frames(self, cameras: Iterable[str]) -> None:
         self.key_frames += cameras
 
@@ -103,6 +106,9 @@ class RecordingOperator:
             size = (640, 480) if frames else (0, 0)
             self._received[name] = Reception(frames, FRAME_BYTES * frames, frames, 0, 0, *size)
         return dict(self._received)
+
+    def received(self) -> dict[str, dict[str, UplinkReceived]]:
+        return {}
 
     def take_arrivals(self) -> Arrivals:
         return Arrivals({}, {})

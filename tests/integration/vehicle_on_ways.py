@@ -16,6 +16,7 @@ from runner import apply
 from runner.configuration.config import configuration
 from runner.graph import Plan
 from runner.plans import compile_plans
+from runner.records import to_json
 from runner.security.exposure import vehicle_keyring
 from runner.settings import Uplink
 
@@ -43,8 +44,7 @@ def main(given: str) -> None:
     for line in sys.stdin:
         wanted = json.loads(line)
         side.carry(wanted.get("carry", {}))
-        sent = {camera: {name: each._asdict() for name, each in by.items()} for camera, by in side.sent().items()}
-        print(json.dumps({"sent": sent, "reported": reported}), flush=True)
+        print(json.dumps({"sent": to_json(side.sent()), "reported": reported}), flush=True)
     side.stop()
 
 

@@ -31,6 +31,8 @@ export interface CameraState {
   height: number;
   /** why, in words */
   reason: string;
+  /** that carry it, its own first; absent: there is one */
+  uplinks?: (string)[];
   /** in the allocation */
   weight: number;
   /** by knob, the value read back; empty for a camera without a pipeline */
@@ -61,6 +63,16 @@ export interface Believed {
   policer_kbps: number | null;
 }
 
+/** What one of several uplinks is to carry, see `runner.core.decision.UplinkShare` */
+export interface UplinkDecision {
+  /** of all cameras and copies on it, kbit/s */
+  total_kbps: number;
+  /** whether nothing arrives over it */
+  stalled: boolean;
+  /** absent: no rule believes anything of it */
+  believed?: Believed;
+}
+
 /** State of a vehicle that is online */
 export interface VehicleState {
   /** s since the start of the run, or of the log that contains this */
@@ -86,6 +98,8 @@ export interface VehicleState {
   certificate_ends?: number;
   /** of the uplink; absent: nothing */
   believed?: Believed;
+  /** by uplink; absent: no rule shares the total among several */
+  uplinks?: Record<string, UplinkDecision>;
 }
 
 /** Position of the vehicle; None: unknown */
@@ -112,6 +126,18 @@ export interface LatencyStages {
   buffer: number | null;
   /** from the complete access unit to its picture */
   decode: number | null;
+}
+
+/** RTP packets of a camera that have come by an uplink */
+export interface UplinkReceived {
+  /** all of them, also those that were requested again */
+  packets: number;
+  /** missing among them: what this uplink alone would have lost. A gap of more than 1 s is none: by then the camera was carried by others alone, or nothing arrived */
+  lost: number;
+  /** came after their copies by other uplinks */
+  twins: number;
+  /** came more than 1 s after newer ones, and were dropped */
+  late: number;
 }
 
 /** Reception of one camera. Rates cover the last second, counters run since the start */
@@ -150,6 +176,22 @@ export interface CameraSample {
   foreign: number;
   /** how long a picture waits for retransmitted packets, ms; null: no retransmission */
   buffer_ms: number | null;
+  /** by uplink, since the pipeline was built; absent: there is one */
+  received?: Record<string, UplinkReceived>;
+}
+
+/** What the operator in control receives over one of several uplinks, as in `runner.core.events.LinkMeasured` */
+export interface UplinkMeasured {
+  /** in the last 0.5 s, with packet headers, kbit/s */
+  kbps: number;
+  /** standing queue in front of it, ms */
+  queue_ms: number;
+  /** share of the packets of the last second that was lost */
+  loss: number;
+  /** stalled: nothing arrives */
+  state: "clear" | "filling" | "draining" | "stalled";
+  /** round trip of the control link, ms */
+  rtt_ms: number;
 }
 
 /** What the operator's side measures a few times a second */
@@ -175,4 +217,6 @@ export interface Sample {
   clock_bound_ms: number | null;
   /** as in `SpeedAdvice`; null: not advised */
   speed_factor: number | null;
+  /** by uplink; absent: there is one */
+  uplinks?: Record<string, UplinkMeasured>;
 }
