@@ -9,7 +9,7 @@ import pytest
 
 from runner.core.events import EVENTS
 from runner.mqtt.messages import read_state
-from runner.operator.notes import CAUSES, decision_note
+from runner.operator.notes import CAUSES, change_notes, decision_note
 from runner.records.vehicle import VehicleState
 
 FULL = {"x": 0, "y": 0, "width": 1280, "height": 720}
@@ -23,9 +23,12 @@ def camera(scaling: float | None = 0.5, **more: Any) -> dict[str, Any]:
     return decided | {"roi": FULL, "reason": WHY, "weight": 1, "applied": {}} | more
 
 
-def state(cause: str = "start", mode: str = "automatic", total: int = 3000, **cameras: Any) -> VehicleState:
+def state(
+    cause: str = "start", mode: str = "automatic", total: int = 3000, uplinks: Any = None, **cameras: Any
+) -> VehicleState:
     known = {name: camera() for name in ("front", "rear", "mast")}
     decided = {"cause": cause, "mode": mode, "total_kbps": total, "asked_kbps": total, "cameras": known | cameras}
+    decided |= {"uplinks": uplinks} if uplinks else {}
     read = read_state(json.dumps({"online": True, "t": 1.0, **decided}).encode())
     assert read
     return read
@@ -80,3 +83,27 @@ def test_a_decision_is_one_phrase(after: VehicleState, text: str | None) -> None
 
 def test_phrases_are_of_events() -> None:
     assert CAUSES.keys() <= EVENTS.keys()
+
+
+def over(*stalled: str, **cameras: str) -> VehicleState:
+    """A vehicle with two uplinks, and cameras that go over them."""
+    uplinks = {name: {"total_kbps": 1500, "stalled": name in stalled, "reason": ""} for name in "ab"}
+    decided = {name: camera(uplinks=list(each)) for name, each in cameras.items()}
+    return state(uplinks=uplinks, **decided)
+
+
+@pytest.mark.parametrize(
+    "after, notes",
+    [
+        (over(front="ab", rear="a", mast="b"), []),
+        (over(front="ab", rear="ba", mast="b"), ["rear goes over b"]),  # both carry it for a moment
+        (over("a", front="ab", rear="b", mast="b"), ["uplink a: nothing arrives; rear goes over b"]),
+        (over("b", front="ab", rear="a", mast="ab"), ["uplink b: nothing arrives; mast goes over a"]),
+        (over("a", "b", front="ab", rear="a", mast="b"), [f"uplink {name}: nothing arrives" for name in "ab"]),
+    ],
+)
+def test_notes_say_where_cameras_go(after: VehicleState, notes: list[str]) -> None:
+    before = over(front="ab", rear="a", mast="b")
+    assert list(change_notes(before, after)) == notes
+    back = [note for note in change_notes(after, before) if note.startswith("uplink")]
+    assert back == [f"uplink {name}: works again" for name in "ab" if after.uplinks[name].stalled]

@@ -12,7 +12,7 @@ from helpers import Drive, carries
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runner.core.placement import MOVES, MOVES_S, Carries, Placement, Wanted, place, shared
+from runner.core.placement import MOVES, MOVES_S, Carries, Placement, Wanted, in_words, place, shared
 from runner.core.step import start
 from runner.records.decisions import DecisionMade
 from runner.records.lines import line_from_json, line_to_json
@@ -41,6 +41,9 @@ class Rides:
             self.now = place(self.now, self.cameras, uplinks, self.t, CLEAR_S)
             self.t += 0.1
         return self.now.uplinks
+
+    def words(self) -> dict[str, str]:
+        return {name: in_words(on, self.now.why.get(name)) for name, on in self.now.uplinks.items()}
 
 
 def test_a_redundant_camera_is_on_both_and_the_others_where_there_is_room() -> None:
@@ -74,6 +77,25 @@ def test_cameras_return_one_at_a_time_once_it_has_been_clear_for_long_enough() -
     assert moves and all(len(changed) == 1 for _, changed in moves)
     assert all(len(on) == 1 for name, on in before.items() if name != "front")
     assert all(later - earlier >= 2 for (earlier, _), (later, _) in pairwise(moves))
+
+
+def test_a_camera_says_why_it_goes_where_it_does() -> None:
+    ride = Rides()
+    ride.over(a=A, b=B)
+    assert ride.words() == {
+        "front": "over a and b: redundant",
+        **dict.fromkeys(("left", "rear", "mast"), "over a"),
+        "right": "over b",
+    }
+    ride.over(2, a=A, b=DEAD)
+    assert ride.words()["right"] == "over a: b stalled at 0.1 s"
+    ride.over(7, a=A, b=B)
+    assert "over b: moved from a at 7.2 s, which gives less" in ride.words().values()
+    ride.over(a=A, b=Carries(1500))
+    assert ride.words()["front"] == "over a: redundant, but b carries too little"
+    alone = Rides({"left": Wanted(3000), "mast": Wanted(500)})
+    alone.over(a=A, b=DEAD)
+    assert alone.words()["mast"] == "over a and b: a copy keeps b measured"
 
 
 def test_if_all_uplinks_stall_every_camera_stays() -> None:

@@ -69,11 +69,13 @@ class UplinkShare:
     total     kbit/s of all cameras and copies on it
     stalled   whether nothing arrives over it
     believed  as in `Decision`
+    reason    what limits the total, for the operator; "": nothing
     """
 
     total: Kbps
     stalled: bool = False
     believed: Believed | None = None
+    reason: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,6 +116,7 @@ class Draft(NamedTuple):
     believed   of the uplink; None: nothing
     uplinks    what each uplink that has a name is to carry; their sum is the total
     placed     by camera that is on, the uplinks that carry it, its own first; empty: all go over the first uplink
+    placed_words  the same with the reason, for the operator
     notes      reasons that concern all cameras
     reasons    reason by camera
     """
@@ -129,6 +132,7 @@ class Draft(NamedTuple):
     believed: Believed | None = None
     uplinks: Mapping[str, UplinkShare] = NOTHING
     placed: Mapping[str, tuple[str, ...]] = NOTHING
+    placed_words: Mapping[str, str] = NOTHING
     notes: tuple[str, ...] = ()
     reasons: Mapping[str, str] = NOTHING
 

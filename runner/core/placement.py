@@ -53,11 +53,13 @@ class Carries(NamedTuple):
 class Placement:
     """Which uplinks carry which camera, and what limits its next change.
 
-    uplinks  by camera: names, its own uplink first, then those that carry a copy
+    uplinks  by camera: names, its own uplink first, then those that carry a copy; of a redundant one the living first
     moved    by camera: times of its moves in the last MOVES_S, except those from a stalled uplink, s
     last     time of the last move, s
     left     by camera that moves: the uplink that it leaves, and until when that carries it too, s
     clear    by uplink: since when it has not been stalled, s; inf while it is
+    came     by camera that is on another uplink than at first: why, in words
+    why      by camera: why these uplinks, in words; none where each is as good
     """
 
     uplinks: Mapping[str, tuple[str, ...]] = field(default_factory=lambda: NOTHING)
@@ -65,6 +67,8 @@ class Placement:
     last: float = -inf
     left: Mapping[str, tuple[str, float]] = field(default_factory=lambda: NOTHING)
     clear: Mapping[str, float] = field(default_factory=lambda: NOTHING)
+    came: Mapping[str, str] = field(default_factory=lambda: NOTHING)
+    why: Mapping[str, str] = field(default_factory=lambda: NOTHING)
 
 
 def place(
@@ -91,40 +95,64 @@ def place(
         name: times for name, old in before.moved.items() if (times := tuple(at for at in old if t - at < MOVES_S))
     }
     last, left = before.last, {name: each for name, each in before.left.items() if name in own and t < each[1]}
+    came = {name: why for name, why in before.came.items() if name in own}
     homeless = single.keys() - own.keys()
     for name in sorted(homeless, key=lambda name: (-_importance(single[name]), name)):
         own[name], last = max(ready, key=lambda uplink: problem.value({**own, name: uplink})), t
+        if name in before.uplinks:
+            came[name] = f"{before.uplinks[name][0]} stalled at {t:.1f} s"
     if not homeless and t - last >= SETTLE_S:
         free = [name for name in single if len(moved.get(name, ())) < MOVES]
         if move := problem.best_move(own, free, ready):
             name = move[0]
+            came[name] = f"moved from {own[name]} at {t:.1f} s, which gives less"
             left[name], own[name] = (own[name], t + OVERLAP_S), move[1]
             moved[name], last = (*moved.get(name, ()), t), t
     everywhere = (*carriers, *(name for name in uplinks if name not in living))
-    at = {name: everywhere if name in redundant else (own[name],) for name in cameras}
+    at = {name: (own[name],) if name in own else _as_before(everywhere, before, name, living) for name in cameras}
     at |= {name: (*at[name], uplink) for name, (uplink, _) in left.items() if uplink not in at[name]}
-    return Placement(_all_measured(at, cameras, uplinks), moved, last, left, clear)
+    copied = _copied(at, cameras, uplinks)
+    at |= {name: (*at[name], *copies) for name, copies in copied.items()}
+    narrow = [name for name in living if name not in carriers]
+    why = came | dict.fromkeys(
+        redundant, f"redundant, but {_and(narrow)} carries too little" if narrow else "redundant"
+    )
+    for name, copies in copied.items():
+        why[name] = ", ".join(filter(None, (why.get(name), f"a copy keeps {_and(copies)} measured")))
+    return Placement(at, moved, last, left, clear, came, why)
+
+
+def in_words(uplinks: Sequence[str], why: str | None) -> str:
+    """Over which uplinks a camera goes, and why."""
+    over = f"over {_and(uplinks)}"
+    return f"{over}: {why}" if why else over
+
+
+def _and(uplinks: Sequence[str]) -> str:
+    return " and ".join(uplinks)
 
 
 def _carriers(redundant: Mapping[str, Wanted], kbps: Mapping[str, float], before: Placement) -> tuple[str, ...]:
-    """Those of the living uplinks that carry the redundant cameras, the best first."""
+    """Those of the living uplinks that carry the redundant cameras."""
     wanted = sum(each.kbps for each in redundant.values())
     given = {name: min(own, wanted) for name, own in kbps.items()}
     best = max(given.values())
     had = {name for camera in redundant for name in before.uplinks.get(camera, ())}
-    enough = [name for name, own in given.items() if own >= best * (KEPT if name in had else COPIED)]
-    return tuple(sorted(enough, key=lambda name: (-kbps[name], name)))
+    return tuple(name for name, own in given.items() if own >= best * (KEPT if name in had else COPIED))
 
 
-def _all_measured(
+def _as_before(carriers: Sequence[str], before: Placement, camera: str, living: Sequence[str]) -> tuple[str, ...]:
+    """The living first, otherwise in the order of before: a redundant camera's knob need not turn at every change."""
+    had = (name for name in before.uplinks.get(camera, ()) if name in carriers)
+    return tuple(sorted(dict.fromkeys((*had, *carriers)), key=lambda name: name not in living))
+
+
+def _copied(
     at: Mapping[str, tuple[str, ...]], cameras: Mapping[str, Wanted], uplinks: Iterable[str]
-) -> Mapping[str, tuple[str, ...]]:
-    """With a copy of the smallest camera on each uplink that would carry nothing."""
-    if not at:
-        return at
+) -> Mapping[str, list[str]]:
+    """The smallest camera, with the uplinks that would carry nothing."""
     unused = [name for name in uplinks if not any(name in carriers for carriers in at.values())]
-    smallest = min(at, key=lambda name: (cameras[name].kbps, name))
-    return {**at, smallest: (*at[smallest], *unused)}
+    return {min(at, key=lambda name: (cameras[name].kbps, name)): unused} if at and unused else {}
 
 
 def shared(

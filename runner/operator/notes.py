@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+
+from msgspec import UNSET
 
 from runner.core.events import EVENTS
 from runner.records.vehicle import CameraState, VehicleState
@@ -25,9 +27,10 @@ CAUSES = {
 
 
 def change_notes(before: VehicleState, state: VehicleState) -> Iterator[str]:
-    """That the rules fail or decide again, and a decision."""
+    """That the rules fail or decide again, that uplinks stall or cameras move to another, and a decision."""
     if state.fault != before.fault:
         yield f"{state.fault}; the previous decision stays in force" if state.fault else "the rules decide again"
+    yield from _uplink_notes(before, state)
     if text := decision_note(before, state):
         yield text
 
@@ -61,6 +64,35 @@ def decision_note(before: VehicleState, state: VehicleState) -> str | None:
         names_by_change.setdefault(change, []).append(name)
     listed = "; ".join(f"{', '.join(names)} {change}" for change, names in names_by_change.items())
     return f"{cause}: {listed} ({reasons[0]})"
+
+
+def _uplink_notes(before: VehicleState, state: VehicleState) -> Iterator[str]:
+    """Which uplinks stall or work again, and which cameras go over another one.
+
+    uplink a: nothing arrives; rear, mast go over b
+    rear goes over b
+    """
+    if before.uplinks is UNSET or state.uplinks is UNSET:
+        return
+    moved: dict[tuple[str, str], list[str]] = {}
+    for name, camera in state.cameras.items():
+        was, now = (_own_uplink(each) for each in (before.cameras.get(name, camera), camera))
+        if was and now and was != now:
+            moved.setdefault((was, now), []).append(name)
+    for uplink, own in state.uplinks.items():
+        if uplink in before.uplinks and before.uplinks[uplink].stalled != own.stalled:
+            away = [_go(moved.pop(way), way[1]) for way in list(moved) if own.stalled and way[0] == uplink]
+            yield "; ".join((f"uplink {uplink}: {'nothing arrives' if own.stalled else 'works again'}", *away))
+    yield from (_go(names, to) for (_, to), names in moved.items())
+
+
+def _own_uplink(camera: CameraState) -> str | None:
+    """The first of those that carry a camera; None: nothing is said of that."""
+    return None if camera.uplinks is UNSET else camera.uplinks[0]
+
+
+def _go(names: Sequence[str], uplink: str) -> str:
+    return f"{', '.join(names)} {'go' if names[1:] else 'goes'} over {uplink}"
 
 
 def _cause(described: str) -> str:

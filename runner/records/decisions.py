@@ -49,11 +49,12 @@ class UplinkDecision:
 
     total_kbps: Annotated[Amount, "of all cameras and copies on it, kbit/s"]
     stalled: Annotated[bool, "whether nothing arrives over it"]
+    reason: Annotated[str, "what limits the total, in words; empty: nothing"]
     believed: Annotated[Believed | UnsetType, "absent: no rule believes anything of it"] = UNSET
 
     @classmethod
     def of(cls, share: UplinkShare) -> UplinkDecision:
-        return cls(plain(share.total), share.stalled, share.believed or UNSET)
+        return cls(plain(share.total), share.stalled, share.reason, share.believed or UNSET)
 
 
 UplinkDecisions = Annotated[

@@ -37,7 +37,7 @@ from runner.errors import ArgumentError, MissingBindings
 from runner.graph import Plan, may_lack_parameter_sets
 from runner.plans import compile_plans
 from runner.records import to_json
-from runner.records.decisions import CameraDecision
+from runner.records.decisions import CameraDecision, uplinks_decided
 from runner.redact import redacted
 from runner.verbs import Arguments
 
@@ -142,14 +142,20 @@ def as_json(plans: Sequence[Plan], decision: Decision, uplinks: Uplinks) -> dict
         }
         for plan in plans
     }
-    ways = {"uplinks": uplinks} if uplinks else {}
-    return {"mode": decision.mode.value, "total_kbps": plain(decision.total), **ways, "cameras": cameras}
+    document = {"mode": decision.mode.value, "total_kbps": plain(decision.total), "cameras": cameras}
+    if not uplinks:
+        return document
+    shares = to_json(uplinks_decided(decision)) if decision.uplinks else {}
+    return {**document, "uplinks": {name: {**way, **shares.get(name, {})} for name, way in uplinks.items()}}
 
 
 def as_text(vehicle: Vehicle, plans: Sequence[Plan], decision: Decision, uplinks: Uplinks) -> str:
     lines = [f"# {vehicle.name}, mode {decision.mode}, total {plain(decision.total)} kbit/s"]
     for name, way in uplinks.items():
-        lines.append(f"# uplink {name}: {', '.join(f'{key} {value}' for key, value in way.items())}")
+        words = [f"{key} {value}" for key, value in way.items()]
+        if share := decision.uplinks.get(name):
+            words += filter(None, (f"{plain(share.total)} kbit/s", share.reason))
+        lines.append(f"# uplink {name}: {', '.join(words)}")
     lines += [f"# {note}" for note in _notes(plans, uplinks)]
     for plan in plans:
         setting = decision.settings[plan.camera.name]

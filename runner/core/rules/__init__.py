@@ -141,11 +141,10 @@ def _setting(on: bool, lost: str | None, roi: Roi, draft: Draft, name: str) -> S
     kbps, factor = whole(draft.bitrate[name]), draft.scaling[name]
     sending = draft.sending and kbps >= 1
     width, height = scaling.output_size(roi, factor)
-    uplinks = draft.placed.get(name, ())
-    reason = draft.reasons.get(name, "") + (f", over {' and '.join(uplinks)}" if uplinks else "")
+    reason = ", ".join(filter(None, (draft.reasons.get(name), draft.placed_words.get(name))))
     if draft.sending and not sending:
         reason += ", below 1 kbit/s: not sending"
     if draft.notes:
         reason = "; ".join((reason, *draft.notes))
     video = (kbps if sending else 0, kbps, factor, roi, width, height)
-    return Setting(True, sending, draft.demand[name], *video, reason, uplinks)
+    return Setting(True, sending, draft.demand[name], *video, reason, draft.placed.get(name, ()))

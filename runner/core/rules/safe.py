@@ -257,11 +257,13 @@ def _together(draft: Draft, alone: Mapping[str, Draft], stalled: Collection[str]
     lasting = sum((own.sized_for or own.total or allocation.ZERO for own in alone.values()), allocation.ZERO)
     return draft.replaced(
         total=total,
-        uplinks={name: UplinkShare(totals[name], name in stalled, own.believed) for name, own in alone.items()},
+        uplinks={
+            name: UplinkShare(totals[name], name in stalled, own.believed, "; ".join(own.notes))
+            for name, own in alone.items()
+        },
         measured=all(own.measured for own in alone.values()),
         uncapped=sum((own.uncapped or own.total or allocation.ZERO for own in alone.values()), allocation.ZERO),
         sized_for=None if lasting == total else lasting,
-        notes=(*draft.notes, *(f"{name}: {note}" for name, own in alone.items() for note in own.notes)),
     )
 
 

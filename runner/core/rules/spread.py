@@ -6,7 +6,7 @@ from fractions import Fraction
 
 from runner.core.decision import Draft
 from runner.core.model import Vehicle
-from runner.core.placement import Carries, Placement, Wanted, place
+from runner.core.placement import Carries, Placement, Wanted, in_words, place
 from runner.core.rules.registry import Memory, Step, rule
 from runner.core.state import State
 
@@ -31,4 +31,5 @@ def spread_over_uplinks(
     }
     uplinks = {name: Carries(float(share.total), share.stalled) for name, share in draft.uplinks.items()}
     placement = place(memory.get("placement", Placement()), cameras, uplinks, state.t, float(clear_s))
-    return draft.replaced(placed=placement.uplinks), {"placement": placement}
+    words = {name: in_words(on, placement.why.get(name)) for name, on in placement.uplinks.items()}
+    return draft.replaced(placed=placement.uplinks, placed_words=words), {"placement": placement}

@@ -69,6 +69,8 @@ export interface UplinkDecision {
   total_kbps: number;
   /** whether nothing arrives over it */
   stalled: boolean;
+  /** what limits the total, in words; empty: nothing */
+  reason: string;
   /** absent: no rule believes anything of it */
   believed?: Believed;
 }
