@@ -6,11 +6,13 @@ import json
 from typing import Any
 
 import pytest
+from msgspec import UNSET
 
-from runner.core.events import EVENTS
+from runner.core.events import EVENTS, LinkState
 from runner.mqtt.messages import read_state
 from runner.operator.notes import CAUSES, change_notes, decision_note
-from runner.records.vehicle import VehicleState
+from runner.operator.uplinks import uplink_rows
+from runner.records.vehicle import UplinkMeasured, VehicleState
 
 FULL = {"x": 0, "y": 0, "width": 1280, "height": 720}
 PART = {"x": 8, "y": 4, "width": 640, "height": 360}
@@ -107,3 +109,13 @@ def test_notes_say_where_cameras_go(after: VehicleState, notes: list[str]) -> No
     assert list(change_notes(before, after)) == notes
     back = [note for note in change_notes(after, before) if note.startswith("uplink")]
     assert back == [f"uplink {name}: works again" for name in "ab" if after.uplinks[name].stalled]
+
+
+def test_an_uplink_in_words() -> None:
+    now = over("b", front="ab", rear="a", mast="b")
+    known = UplinkMeasured(2950.2, 12.4, 0.003, LinkState.FILLING, 30)
+    assert [(row.is_stalled, row.words) for row in uplink_rows(now, {"a": known})] == [
+        (False, "uplink a: 1500 kbit/s allowed, 2950 received, queue 12 ms, loss 0.3 %, carries front, rear"),
+        (True, "uplink b: STALLED, nothing arrives; carries front, mast"),
+    ]
+    assert uplink_rows(state(), UNSET) == []

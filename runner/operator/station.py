@@ -35,6 +35,7 @@ from runner.operator.meter import MeasuredRates, ReceptionMeter
 from runner.operator.notes import change_notes
 from runner.operator.reception import ReceptionReports
 from runner.operator.requests import OnReply, Requests
+from runner.operator.uplinks import UplinkRow, uplink_rows
 from runner.records import combined, to_json
 from runner.records.lines import Note
 from runner.records.operator import CameraSample, Sample
@@ -273,6 +274,11 @@ class Station:
         clock = self.latency.clock
         latencies = f"latencies ± {1000 * clock.bound_s:.1f} ms" if clock else "latencies still unknown"
         return f"{self._vehicle.name}, mode {state.mode}, total {state.total_words} kbit/s, {latencies}"
+
+    def uplinks(self) -> list[UplinkRow]:
+        """One for each of several uplinks; none while the vehicle is offline."""
+        state = self.state  # another thread may replace it
+        return uplink_rows(state, _uplinks(self._telemetry)) if state else []
 
     def _sample(self, over: Mapping[str, Mapping[str, UplinkReceived]]) -> Sample:
         telemetry, clock = self._telemetry if self.state else None, self.latency.clock

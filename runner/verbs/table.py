@@ -20,6 +20,7 @@ from rich.text import Text
 
 from runner.operator.meter import ReceptionMeter, middle, percentile
 from runner.operator.station import CameraRow, Listener
+from runner.operator.uplinks import UplinkRow
 from runner.records.lines import Note
 from runner.redact import printable
 from runner.system.signals import urgent
@@ -59,17 +60,18 @@ class LiveTable(Listener):
         """Add one line below the table, shown with its next update. May be called from any thread."""
         self._pending.append(f"{time.strftime('%H:%M:%S', time.localtime(note.t))} {printable(note.text)}")
 
-    def show(self, rows: Sequence[CameraRow], headline: str) -> None:
+    def show(self, rows: Sequence[CameraRow], headline: str, uplinks: Sequence[UplinkRow] = ()) -> None:
         while self._pending:
             line = self._pending.popleft()
             self._notes.append(line)
             if not self._live:
                 self._console.print(line, markup=False, highlight=False)
+        title = Text("\n").join((Text(headline), *map(_uplink, uplinks)))
         if self._live:
-            self._live.update(Group(_table(rows, headline, self._console.width), *map(Text, self._notes)), refresh=True)
+            self._live.update(Group(_table(rows, title, self._console.width), *map(Text, self._notes)), refresh=True)
         elif time.monotonic() - self._shown >= PLAIN_EVERY_S:
             self._shown = time.monotonic()
-            self._console.print(_table(rows, headline, self._console.width))
+            self._console.print(_table(rows, title, self._console.width))
 
 
 def _console() -> Console:
@@ -82,11 +84,15 @@ def _show_cursor() -> None:
         os.write(sys.stdout.fileno(), b"\x1b[?25h\n")
 
 
-def _table(rows: Sequence[CameraRow], headline: str, width: int) -> RichTable:
+def _uplink(row: UplinkRow) -> Text:
+    return Text(row.words, style="bold red" if row.is_stalled else "")
+
+
+def _table(rows: Sequence[CameraRow], title: Text, width: int) -> RichTable:
     """Cameras by row, in so many columns of the terminal: a narrow one shows what was received, not why."""
     cells = {row.name: _cells(row) for row in rows}
     shown = NARROW if width < WHOLE else HEADINGS
-    table = RichTable(title=headline, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    table = RichTable(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     table.add_column("camera", overflow="fold", min_width=min(MOST_NAME, max(map(len, cells), default=0)))
     for heading in shown:
         table.add_column(

@@ -258,7 +258,7 @@ def _together(draft: Draft, alone: Mapping[str, Draft], stalled: Collection[str]
     return draft.replaced(
         total=total,
         uplinks={
-            name: UplinkShare(totals[name], name in stalled, own.believed, "; ".join(own.notes))
+            name: UplinkShare(totals[name], name in stalled, own.believed, "; ".join(map(_why, own.notes)))
             for name, own in alone.items()
         },
         measured=all(own.measured for own in alone.values()),
@@ -281,6 +281,11 @@ def _limited(draft: Draft, limit: Kbps, *, shares: bool) -> Draft:
         uplinks = {name: replace(each, total=each.total * limit / total) for name, each in uplinks.items()}
     lasting = None if draft.sized_for is None or draft.sized_for >= limit else draft.sized_for
     return draft.replaced(total=limit, uplinks=uplinks, uncapped=None, sized_for=lasting)
+
+
+def _why(note: str) -> str:
+    """A note without the total, which differs from that of all uplinks: see `Draft.limited`."""
+    return note.partition(": ")[2] or note
 
 
 def sent_cameras(vehicle: Vehicle, state: State) -> tuple[Camera, ...]:
