@@ -110,8 +110,8 @@ class RecordingOperator:
     def received(self) -> dict[str, dict[str, UplinkReceived]]:
         return {}
 
-    def take_arrivals(self) -> Arrivals:
-        return Arrivals({}, {})
+    def take_arrivals(self) -> dict[str, Arrivals]:
+        return {"": Arrivals({}, {})}
 
     def stop(self) -> None:
         self._received = {}

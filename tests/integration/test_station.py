@@ -192,7 +192,7 @@ def report_until(station, vehicle, done):
 
     def is_done():
         vehicle.publish("telemetry", TELEMETRY)  # or it would be offline
-        station.report_reception(Arrivals({}, {}))
+        station.report_reception({"": Arrivals({}, {})})
         station.take(fresh())
         return done()
 
@@ -229,8 +229,8 @@ def test_frames_are_reported_with_what_arrived_of_all_cameras(both):
     front = Arrival(now + 0.015, 1000.0, 1500, True, now + 0.010)
     rear = Arrival(now + 0.021, 1000.0, 801, False, now + 0.012)
     mast = Arrival(now + 0.021, 1000.0, 999, True)
-    station.report_reception(Arrivals({"front": [front]}, {}, arrived=arrived[:4]))
-    station.report_reception(Arrivals({"rear": [rear], "mast": [mast]}, {}, arrived=arrived[4:]))
+    station.report_reception({"": Arrivals({"front": [front]}, {}, arrived=arrived[:4])})
+    station.report_reception({"": Arrivals({"rear": [rear], "mast": [mast]}, {}, arrived=arrived[4:])})
     units = until(lambda: (seen := [u for report in vehicle.reports for u in report["units"]]) and seen[2:] and seen)
     assert [(unit[0], *unit[4:]) for unit in units] == [
         ("front", True, pytest.approx(0.005), 2, 1600, 3, 2500),
@@ -281,7 +281,7 @@ def test_the_slowest_camera_that_should_send_is_reported(both):
         """The latency that is reported when all cameras but the silent ones have just sent a picture."""
         now, captured = time.monotonic(), time.time() + 3.7 - ms / 1000
         newest.update({name: Arrival(now, captured, 1000) for name in STATE["cameras"] if name not in silent})
-        station.report_reception(Arrivals({name: [arrival] for name, arrival in newest.items()}, newest))
+        station.report_reception({"": Arrivals({name: [arrival] for name, arrival in newest.items()}, newest)})
         station.take(fresh())
         vehicle.publish("telemetry", TELEMETRY)
         return vehicle.reports[-1].get("latency_ms", 0) if vehicle.reports else 0
@@ -304,7 +304,7 @@ def test_the_latency_of_a_source_without_capture_times_is_unknown(both):
             vehicle.publish("telemetry", TELEMETRY)
             now = time.monotonic()
             newest = {name: Arrival(now, time.time() + 3.7 - 0.04, 1000) for name in STATE["cameras"]}
-            station.report_reception(Arrivals({}, newest))
+            station.report_reception({"": Arrivals({}, newest)})
             station.take(fresh())
             return done()
 
