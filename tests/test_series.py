@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,9 @@ from runner.drive.panels import panels
 from runner.drive.read import read_drive
 from runner.drive.series import series
 from runner.drive.statistics import statistics
-from runner.drive.tables import camera_rows
+from runner.drive.tables import camera_rows, uplink_rows
 from runner.drive.time_series import TimeSeries, counted, held, mean_held, rate, spans
+from runner.drive.uplink_figure import uplinks
 from runner.errors import UserError
 
 NAN = float("nan")
@@ -336,3 +338,49 @@ def test_a_whole_number_may_be_written_as_a_float(tmp_path: Path) -> None:
     path = write_drive(tmp_path / "drive", seconds=5)
     as_floats = write_drive(tmp_path / "floats", seconds=5, change=rewritten)
     assert read_drive(as_floats).sides["operator"].lines == read_drive(path).sides["operator"].lines
+
+
+def over_two_uplinks(side: str, lines: Lines) -> Lines:
+    """What a vehicle with two uplinks logs: b stalls from 5 s to 8 s, and every other camera goes over a meanwhile."""
+    found = []
+    for line in lines:
+        stalled = 5 <= line["t"] + (OPERATOR_LATER_S if side == "operator" else 0) < 8
+        measured = {"kbps": 2000, "queue_ms": 10, "loss": 0, "state": "clear", "rtt_ms": 20}
+        silent = {**measured, "kbps": 0, "queue_ms": 700, "state": "stalled"} if stalled else {**measured, "kbps": 1000}
+        if line.get("log") in ("decision", "state") and "cameras" in line:
+            own = [["a"], ["a" if stalled else "b"]]
+            cameras = {name: each | {"uplinks": own[n % 2]} for n, (name, each) in enumerate(line["cameras"].items())}
+            shares = {name: {"total_kbps": 3000 if name == "a" else 1500, "reason": ""} for name in "ab"}
+            line |= {"cameras": cameras, "uplinks": {n: each | {"stalled": False} for n, each in shares.items()}}
+        if line.get("log") == "telemetry":
+            for name, each in (("a", measured), ("b", silent)):
+                found.append({"t": line["t"], "event": "link_measured", "uplink": name, "evidence": {}, **each})
+        if line.get("log") == "sample":
+            counts = {"packets": int(100 * line["t"]), "lost": 0, "twins": 0, "late": 0}
+            received = {"a": counts, "b": counts | {"lost": int(25 * line["t"])}}
+            line |= {"cameras": {name: each | {"received": received} for name, each in line["cameras"].items()}}
+            line["uplinks"] = {"a": measured, "b": silent}
+        found.append(line)
+    return found
+
+
+@pytest.mark.parametrize("sides", [["vehicle", "operator"], ["vehicle"], ["operator"]])
+def test_uplinks_over_time_and_in_figures(tmp_path: Path, sides: list[str]) -> None:
+    drive = statistics(series(read_drive(write_drive(tmp_path / "drive", sides, seconds=20, change=over_two_uplinks))))
+    a, b = (drive.uplinks[name] for name in "ab")
+    assert (a.allowed, b.allowed) == (3000, 1500)
+    assert (a.stalls, b.stalls, b.stalled_s) == (0, 1, pytest.approx(3, abs=0.3))
+    assert (a.received, b.received) == (2000, pytest.approx(1000 * 17 / 20, rel=0.03))
+    assert a.queue_p95_ms == b.queue_p95_ms == 10  # what stood in front of a stalled one is unknown
+    moved = len(drive.cameras) // 2
+    assert (a.came, a.left, b.came, b.left) == (moved, moved, moved, moved)
+    if "operator" in sides:
+        assert (a.share, a.lost, b.lost) == (0.5, 0, pytest.approx(0.2, rel=0.02))
+    else:
+        assert math.isnan(a.share)
+    (rates,), (queues,) = uplinks([drive]) or ()
+    assert [curve.label for curve in rates.curves] == ["a allowed", "a received", "b allowed", "b received"]
+    assert queues.shades[1].spans == drive.series.uplinks["b"].stalls
+    (described,) = to_json([drive], {}, [], [])["drives"]
+    assert described["uplinks"]["b"]["stalls"] == 1
+    assert [row[0] for row in uplink_rows(drive)[1]] == ["a", "b"]

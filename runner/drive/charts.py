@@ -46,7 +46,7 @@ class Curve:
 
 
 class Bars(NamedTuple):
-    """Spans of time of one camera: (start, duration), s."""
+    """Spans of time of one camera or uplink: (start, duration), s."""
 
     label: str
     colour: int
@@ -80,6 +80,7 @@ class Chart:
 
     drive   its index among the drives, None for a chart of all of them, or one that is not over time
     unit_s  unit of a time axis, s
+    shades  spans that are shaded over the whole height
     hover   plotly's format of a value
     """
 
@@ -91,6 +92,7 @@ class Chart:
     part: int = 0
     unit_s: float = 1.0
     strip: Strip | None = None
+    shades: tuple[Bars, ...] = ()
     track: MapTrack | None = None
     hover: str = ""
 

@@ -16,6 +16,7 @@ from runner.drive.latency import Latency
 from runner.drive.predictions import Worth
 from runner.drive.series import LinkSeries, Series
 from runner.drive.statistics import CameraStatistics, DriveStatistics
+from runner.drive.uplink_statistics import UplinkDocument, UplinkStatistics
 
 FORMAT_VERSION: Literal[1] = 1
 
@@ -248,6 +249,7 @@ class DriveDocument(TypedDict):
     refused       requests
     link          None where it was not limited, or has lanes
     lanes         of the limited link, by name; absent where it has none
+    uplinks       of the vehicle, by name; absent where it has one
     quality       mean of the cameras; None where there is no model, or models are of different metrics
     delivered     None where it was not measured
     warnings      notes on the logs
@@ -283,6 +285,7 @@ class DriveDocument(TypedDict):
     refused: Count
     link: Link | None
     lanes: NotRequired[Mapping[str, Link]]
+    uplinks: NotRequired[Mapping[str, UplinkDocument]]
     quality: Quality | None
     delivered: Delivered | None
     warnings: list[str]
@@ -396,7 +399,25 @@ def _drive(drive: DriveStatistics, checks: Sequence[ClaimCheck]) -> DriveDocumen
     }
     if lanes:
         document["lanes"] = lanes
+    if drive.uplinks:
+        document["uplinks"] = {name: _uplink(each) for name, each in drive.uplinks.items()}
     return document
+
+
+def _uplink(uplink: UplinkStatistics) -> UplinkDocument:
+    return {
+        "allowed_kbps": number(uplink.allowed, 1),
+        "received_kbps": number(uplink.received, 1),
+        "share": number(uplink.share),
+        "lost": number(uplink.lost),
+        "twins": number(uplink.twins),
+        "queue_p95_ms": number(uplink.queue_p95_ms, 2),
+        "stalls": uplink.stalls,
+        "stalled_s": rounded(uplink.stalled_s, 3),
+        "longest_s": rounded(uplink.longest_s, 3),
+        "came": uplink.came,
+        "left": uplink.left,
+    }
 
 
 def _predictions(found: Worth) -> Predictions:

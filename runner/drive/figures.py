@@ -15,13 +15,14 @@ import numpy as np
 from runner.drive.camera_series import CameraSeries
 from runner.drive.charts import Axis, Bars, Chart, Curve, Figure, MapTrack, Strip
 from runner.drive.latency import SECOND_S, latencies, per_second, to_arrival
+from runner.drive.over_time import KBPS, Drives, Rows, drive_label, link_rates, over_time, steps, top
 from runner.drive.panels import Panel
 from runner.drive.predictions import EVERY_S, Compared, compared
 from runner.drive.series import Positions, Series
 from runner.drive.statistics import DriveStatistics
 from runner.drive.time_series import FloatSeries, TimeSeries, held
+from runner.drive.uplink_figure import uplinks
 
-MINUTES_FROM_S = 900.0
 STEP_OFFSET = 0.014  # of the largest factor, between steps that would overlap
 WIDE = 8.0  # latencies that spread over more than this ratio get a logarithmic axis
 DECADES = 50.0  # above this ratio fewer values are labelled
@@ -31,14 +32,14 @@ FLATTEST = 0.4  # shorter side of a map over the longer
 SMALLEST_TRACK_M = 20.0  # around a stationary vehicle
 METRICS = {"psnr": "PSNR in dB", "mssim": "MSSIM", "vmaf": "VMAF", "brisque": "BRISQUE (lower is better)"}
 
-Drives = Sequence[DriveStatistics]
-
 
 def figures(drives: Drives) -> tuple[list[Figure], list[str]]:
-    """Every figure for which the drives have data, and why others were left out."""
+    """Every figure for which the drives have data, and why others were left out, except those of what they lack."""
     made, left_out = [], []
     for name, (heading, define) in FIGURES.items():
         rows = define(drives)
+        if rows is None:
+            continue
         if isinstance(rows, str):
             left_out.append(f"{name}: left out, {rows}")
         else:
@@ -47,8 +48,6 @@ def figures(drives: Drives) -> tuple[list[Figure], list[str]]:
 
 
 # --- the figures ------------------------------------------------------------------------------------------------------
-
-Rows = list[list[Chart]]
 
 
 def bitrate_on_track(drives: Drives) -> Rows | str:
@@ -70,27 +69,15 @@ def totals(drives: Drives) -> Rows:
     """Predicted, allocated and actual total."""
 
     def curves(series: Series) -> Iterable[Curve]:
-        yield from _link_rates(series)
-        yield _steps("allocated", series.allocated, series, "allocated", width=1.6)
-        yield _steps("predicted", series.predicted, series, "predicted", dash=1)
+        yield from link_rates(series)
+        yield steps("allocated", series.allocated, series, "allocated", width=1.6)
+        yield steps("predicted", series.predicted, series, "predicted", dash=1)
         if series.measured:
             yield Curve(series.measured, *series.actual, "actual", width=0.8)
 
     found = [tuple(curves(drive.series)) for drive in drives]
-    y = Axis("total in kbit/s", 0.0, _top(found))
-    return [[_over_time(drives, at, _label(drives, at), y, each, hover=KBPS)] for at, each in enumerate(found)]
-
-
-def _link_rates(series: Series) -> Iterable[Curve]:
-    """The rate of a limited link; of one with lanes their total, and each of them."""
-    rates = {lane: TimeSeries(link.t, link.kbps) for lane, link in series.links.items()}
-    if rates:
-        t = np.unique(np.concatenate([rate.t for rate in rates.values()]))
-        total = np.sum([held(rate, t) for rate in rates.values()], axis=0)
-        yield _steps("link's rate", TimeSeries(t, total), series, "link", filled=True)
-    for number, (lane, rate) in enumerate(rates.items()):
-        if lane:
-            yield _steps(f"lane {lane}", rate, series, "text", dash=2 + number, width=0.7)
+    y = Axis("total in kbit/s", 0.0, top(found))
+    return [[over_time(drives, at, drive_label(drives, at), y, each, hover=KBPS)] for at, each in enumerate(found)]
 
 
 def predictions(drives: Drives) -> Rows | str:
@@ -126,7 +113,7 @@ def _calibration(drives: Drives, at: int, both: Compared, most: float) -> Chart:
         Curve("each second", both.predicted[each], both.carried[each], "allocated", points=True),
     )
     x, y = Axis("predicted in kbit/s", 0.0, most), Axis("carried in kbit/s", 0.0, most)
-    return Chart(_label(drives, at), x, y, curves, drive=None, hover=f"{KBPS} carried, %{{x:,.0f}} predicted:")
+    return Chart(drive_label(drives, at), x, y, curves, drive=None, hover=f"{KBPS} carried, %{{x:,.0f}} predicted:")
 
 
 def _errors(drives: Drives, at: int, both: Compared, limits: tuple[float, float]) -> Chart:
@@ -141,7 +128,7 @@ def _errors(drives: Drives, at: int, both: Compared, limits: tuple[float, float]
     low_end, high_end = min(0.5, 0.9 * limits[0]), max(2.0, 1.1 * limits[1])
     marks = tuple(mark for mark in (0.1, 0.25, 0.5, 1.0, 2.0, 4.0, 10.0) if low_end <= mark <= high_end)
     y = Axis(RATIO, low_end, high_end, marks, log=True, percent=True)
-    return _over_time(drives, at, _label(drives, at), y, curves, hover="%{y:.0%}")
+    return over_time(drives, at, drive_label(drives, at), y, curves, hover="%{y:.0%}")
 
 
 def _learned(drives: Drives, at: int) -> Chart:
@@ -150,11 +137,11 @@ def _learned(drives: Drives, at: int) -> Chart:
     believed = series.believed
     assert believed is not None
     curves = (
-        _steps("share of changes that come true", TimeSeries(believed.t, believed.gain), series, "allocated"),
-        _steps("kept free", TimeSeries(believed.t, 1 - np.exp(-believed.margin)), series, "late", dash=1),
+        steps("share of changes that come true", TimeSeries(believed.t, believed.gain), series, "allocated"),
+        steps("kept free", TimeSeries(believed.t, 1 - np.exp(-believed.margin)), series, "late", dash=1),
     )
     y = Axis("share", 0.0, 1.05, (0.0, 0.25, 0.5, 0.75, 1.0), percent=True)
-    return _over_time(drives, at, _label(drives, at), y, curves, hover="%{y:.0%}")
+    return over_time(drives, at, drive_label(drives, at), y, curves, hover="%{y:.0%}")
 
 
 def bitrates(drives: Drives) -> Rows:
@@ -169,10 +156,10 @@ def bitrates(drives: Drives) -> Rows:
                 yield _mean(_named(names, panel, ": mean and range"), lines, _place(drive, names), dash)
             else:
                 line = drive.series.cameras[names[0]].allocated
-                yield _steps(_named(names, panel), line, drive.series, _place(drive, names), dash=dash)
+                yield steps(_named(names, panel), line, drive.series, _place(drive, names), dash=dash)
 
     kind = "allocated" if not actual else kinds.pop() if len(kinds) == 1 else "actual"
-    return _by_panel(drives, curves, lambda _, found: Axis(f"{kind} bitrate in kbit/s", 0.0, _top(found)), KBPS)
+    return _by_panel(drives, curves, lambda _, found: Axis(f"{kind} bitrate in kbit/s", 0.0, top(found)), KBPS)
 
 
 def scaling(drives: Drives) -> Rows:
@@ -188,7 +175,7 @@ def scaling(drives: Drives) -> Rows:
             camera = drive.series.cameras[names[0]]
             offset = ((len(groups) - 1) / 2 - dash) * STEP_OFFSET * reach * meet
             label = _named(names, panel) + (f" (offset {offset:+.3f})" if offset else "")
-            curve = _steps(label, TimeSeries(*_factor(camera)), drive.series, _place(drive, names), dash=dash)
+            curve = steps(label, TimeSeries(*_factor(camera)), drive.series, _place(drive, names), dash=dash)
             reasons = tuple(_step_reasons(names, camera, drive.series.end))
             yield replace(curve, y=curve.y + offset, reasons=reasons)
 
@@ -210,8 +197,8 @@ def latency(drives: Drives) -> Rows | str:
     rows: Rows = []
     for at, each in seconds.items():
         curves = (Curve("95th percentile", each.t, each.p95, "late"), Curve("median", each.t, each.median, "allocated"))
-        title = _label(drives, at) or "each second" + (", all cameras" if len(drives[at].cameras) > 1 else "")
-        rows.append([_over_time(drives, at, title, y, curves, _freezes(drives[at]), hover="%{y:.0f} ms")])
+        title = drive_label(drives, at) or "each second" + (", all cameras" if len(drives[at].cameras) > 1 else "")
+        rows.append([over_time(drives, at, title, y, curves, _freezes(drives[at]), hover="%{y:.0f} ms")])
     return [*rows, [_distribution(drives, list(seconds))]]
 
 
@@ -261,9 +248,10 @@ def _quality_axis(title: str) -> Callable[[int, Sequence[Sequence[Curve]]], Axis
 
 
 # Heading and definition by name, in the order of the page.
-FIGURES: dict[str, tuple[str, Callable[[Drives], Rows | str]]] = {
+FIGURES: dict[str, tuple[str, Callable[[Drives], Rows | str | None]]] = {
     "bitrate_on_track": ("Total bitrate on the track", bitrate_on_track),
     "totals": ("Predicted, allocated and actual total", totals),
+    "uplinks": ("Uplinks over time", uplinks),
     "predictions": ("What predictions were worth", predictions),
     "bitrates": ("Camera bitrates over time", bitrates),
     "scaling": ("Resolution factors over time", scaling),
@@ -274,8 +262,6 @@ FIGURES: dict[str, tuple[str, Callable[[Drives], Rows | str]]] = {
 
 
 # --- cameras and panels -----------------------------------------------------------------------------------------------
-
-KBPS = "%{y:,.0f} kbit/s"
 
 
 def coinciding(
@@ -351,51 +337,9 @@ def _by_panel(
     rows: Rows = [[] for _ in drives]
     for (at, part), each in found.items():
         y = axis(part, [those for (_, other), those in found.items() if shared or other == part])
-        title = ": ".join(filter(None, (_label(drives, at), drives[at].series.panels[part].title)))
-        rows[at].append(_over_time(drives, at, title, y, each, part=part, hover=hover))
+        title = ": ".join(filter(None, (drive_label(drives, at), drives[at].series.panels[part].title)))
+        rows[at].append(over_time(drives, at, title, y, each, part=part, hover=hover))
     return rows
-
-
-# --- time -------------------------------------------------------------------------------------------------------------
-
-
-def _label(drives: Drives, at: int) -> str:
-    """The label that distinguishes a drive from others."""
-    return drives[at].series.label if len(drives) > 1 else ""
-
-
-def _unit(drives: Drives) -> tuple[float, str]:
-    """Unit of the time axis in s, and its label."""
-    long = max(drive.series.end for drive in drives) > MINUTES_FROM_S
-    return (60.0, "time in min") if long else (1.0, "time in s")
-
-
-def _over_time(
-    drives: Drives, at: int, title: str, y: Axis, curves: Iterable[Curve], strip: Strip | None = None, **more: Any
-) -> Chart:
-    """A chart of one drive, from curves and bars over s."""
-    unit, label = _unit(drives)
-    x = Axis(label, 0.0, max(drive.series.end for drive in drives) / unit)
-    if strip:
-        bars = (each._replace(spans=tuple((t / unit, s / unit) for t, s in each.spans)) for each in strip.bars)
-        strip = strip._replace(bars=tuple(bars))
-    scaled = tuple(replace(curve, x=curve.x / unit) for curve in curves)
-    return Chart(title, x, y, scaled, drive=at, unit_s=unit, strip=strip, **more)
-
-
-def _steps(label: str, line: TimeSeries, series: Series, colour: int | str, **more: Any) -> Curve:
-    """A step curve, extended to the end of the drive."""
-    t, y = line
-    if t.size and t[-1] < series.end:
-        t, y = np.append(t, series.end), np.append(y, y[-1])
-    return Curve(label, t, y, colour, steps=True, **more)
-
-
-def _top(found: Iterable[Iterable[Curve]]) -> float:
-    """The largest value of curves of all drives, with some room."""
-    tops = [each.around[1] if each.around else each.y for curves in found for each in curves]
-    known = np.concatenate([np.zeros(1), *tops])
-    return float(np.nanmax(known)) * 1.05 or 1.0
 
 
 # --- latency ----------------------------------------------------------------------------------------------------------
@@ -456,7 +400,7 @@ def _on_map(drives: Drives, at: int, line: TimeSeries, limits: tuple[float, floa
     east, north = (np.interp(line.t, places.t, each) for each in way)
     track = MapTrack(way, line.t, east, north, line.y, *limits, title, tuple(_arrows(*way)))
     x, y = Axis("m east of the start", *xlim), Axis("m north", *ylim)
-    return Chart(_label(drives, at), x, y, drive=at, track=track, hover=hover)
+    return Chart(drive_label(drives, at), x, y, drive=at, track=track, hover=hover)
 
 
 def on_track(drive: Series) -> TimeSeries:

@@ -18,7 +18,7 @@ from runner.drive.colours import DAY, NIGHT
 from runner.drive.document import number, rules, when
 from runner.drive.series import Series
 from runner.drive.statistics import DriveStatistics
-from runner.drive.tables import LEGEND, VERDICTS, camera_rows, drive_rows, shown
+from runner.drive.tables import LEGEND, UPLINKS, VERDICTS, camera_rows, drive_rows, shown, uplink_rows
 from runner.drive.time_series import FloatSeries
 from runner.system.files import plotly_script
 
@@ -93,6 +93,9 @@ def _body(
     yield "</div>"
     for drive in drives:
         yield _section(f"Cameras{_suffix(drive, several)}", _table("Statistics by camera", camera_rows(drive)))
+        if drive.uplinks:
+            table = _table("Statistics by uplink", uplink_rows(drive))
+            yield _section(f"Uplinks{_suffix(drive, several)}", f'{table}<p class="muted">{escape(UPLINKS)}</p>')
     yield f'<p class="muted">{escape(LEGEND)}</p>'
     yield from (_reasons(drive, _suffix(drive, several)) for drive in drives)
     named = ((each, f"{side}{_suffix(drive, several)}") for drive in drives for side, each in _versions(drive))
@@ -219,6 +222,7 @@ def _chart(chart: Chart) -> dict[str, Any]:
         "unit_s": chart.unit_s,
         "hover": chart.hover,
         "curves": [_curve(curve) for curve in chart.curves],
+        "shades": [shade._asdict() for shade in chart.shades],
         "strip": chart.strip and {"bars": [bars._asdict() for bars in chart.strip.bars], "none": chart.strip.none},
         "track": chart.track and _track(chart.track),
     }

@@ -68,6 +68,7 @@ STYLE: dict[Any, Any] = {
 CHART_IN, LINE_IN = 1.15, 0.115  # height of a chart without its labels, and of a line of text
 LEGEND_IN = 0.38  # under the panel: below the numbers and label of the axis
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.2)), (0, (1.4, 0.9)), (0, (5, 1, 1.2, 1)))
+SHADE = 0.16  # opacity
 MIN_VISIBLE = 0.006  # of the axis: the smallest visible width of a freeze
 LINE_CHARACTERS = 70  # that fit into a legend line of column width
 
@@ -141,6 +142,9 @@ def _height(chart: Chart) -> float:
 
 
 def _draw(axes: Axes, chart: Chart) -> None:
+    for shade in chart.shades:
+        for t, seconds in shade.spans:
+            axes.axvspan(t, t + seconds, color=_colour(shade.colour), alpha=SHADE, lw=0)
     for curve in chart.curves:
         _draw_curve(axes, curve)
     if chart.track:

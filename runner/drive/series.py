@@ -23,6 +23,7 @@ from runner.drive.log import FILES
 from runner.drive.panels import Panel, panels
 from runner.drive.read import Drive, Side
 from runner.drive.time_series import EMPTY, FloatSeries, TimeSeries, settled
+from runner.drive.uplink_series import UplinkSeries, uplink_series
 from runner.errors import UserError
 from runner.pqos.bandwidth_map import EARTH_M
 from runner.records.decisions import CameraDecision, DecisionMade
@@ -102,6 +103,7 @@ class Series:
     measured_t when the vehicle measured the link, s
     held_up    (from s, to s), when a side's process was held up, or the vehicle sent frames late
     links      the limited link by lane; "": it has none; empty: it was not limited
+    uplinks    of the vehicle, by name; none if there is one
     modes      (from s, mode)
     notes      (s, text)
     refused    number of requests
@@ -125,6 +127,7 @@ class Series:
     measured_t: FloatSeries
     held_up: tuple[tuple[float, float], ...]
     links: Mapping[str, LinkSeries]
+    uplinks: Mapping[str, UplinkSeries]
     positions: Positions | None
     modes: tuple[tuple[float, str], ...]
     reasons: tuple[Reason, ...]
@@ -189,6 +192,7 @@ def _series(drive: Drive, label: str) -> Series:
         measured_t=np.array([t for t, _ in vehicle.of(LinkMeasured)], dtype=float),
         held_up=tuple(_held_up(vehicle, samples)),
         links=_links([at for at in link.of(LinkSample) if 0 <= at[0] <= end]),
+        uplinks=uplink_series(decisions, vehicle.of(LinkMeasured), samples),
         positions=_positions(_Shifted(leading.lines, 0.0), samples),
         modes=tuple(_modes(decisions)),
         reasons=tuple(_reasons(decisions)),

@@ -18,7 +18,8 @@ from runner.drive.latency import NAN, UNKNOWN, Freeze, Latency, concatenated, fr
 from runner.drive.predictions import Worth, compared, worth
 from runner.drive.quality_file import DeliveredQuality
 from runner.drive.series import Series
-from runner.drive.time_series import RATE_WINDOW_S, Flags, FloatSeries, TimeSeries, held, mean_held, spans
+from runner.drive.time_series import RATE_WINDOW_S, Flags, FloatSeries, TimeSeries, held, mean, mean_held, ratio, spans
+from runner.drive.uplink_statistics import UplinkStatistics, uplink_statistics
 from runner.rate_quality.curves import interpolated
 from runner.records.vehicle import SLOW, SLOW_S
 
@@ -107,6 +108,7 @@ class DriveStatistics:
     """A drive: its cameras, and all of them together.
 
     predictions  what they were worth; None: nothing was predicted, or believed of the link, for long enough
+    uplinks      by name; none if there is one
     """
 
     series: Series
@@ -130,6 +132,7 @@ class DriveStatistics:
     delivered: float
     delivered_worst: float
     predictions: Worth | None
+    uplinks: Mapping[str, UplinkStatistics]
     notes: tuple[str, ...]
 
 
@@ -183,6 +186,7 @@ def statistics(
         delivered=mean(means),
         delivered_worst=float(means.min()) if means.size else NAN,
         predictions=known_worth,
+        uplinks=uplink_statistics(drive.uplinks, drive.end),
         notes=tuple(_notes(drive, cameras, known_worth)),
     )
 
@@ -381,20 +385,10 @@ def _hold_quality(quality: FloatSeries, moving: Flags, t: FloatSeries, freeze: F
 # --- helpers ----------------------------------------------------------------------------------------------------------
 
 
-def mean(values: FloatSeries) -> float:
-    """Mean of the known values; nan if there are none."""
-    known = values[np.isfinite(values)]
-    return float(known.mean()) if known.size else NAN
-
-
 def sum_known(values: Iterable[float]) -> float:
     """Sum of the known values; nan if there are none."""
     known = [value for value in values if not math.isnan(value)]
     return sum(known) if known else NAN
-
-
-def ratio(part: float, whole: float) -> float:
-    return part / whole if whole > 0 else NAN
 
 
 def _sum(values: Iterable[int | None]) -> int | None:

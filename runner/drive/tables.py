@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from runner.drive.latency import Latency
 from runner.drive.statistics import CameraStatistics, DriveStatistics
+from runner.drive.uplink_statistics import UplinkStatistics
 
 TableRow = tuple[str, ...]
 VERDICTS: Mapping[bool | None, str] = {True: "yes", False: "no", None: "-"}
@@ -18,6 +19,10 @@ LEGEND = (
     " Quality is estimated from the bitrate: a frozen picture keeps its last estimate, so read it together with the"
     " share of time frozen. Delivered: MSSIM of the displayed picture, twice a second, against the scene at that time;"
     " for sources that are not rendered, against the stream as sent."
+)
+UPLINKS = (
+    "Share: of the packets that arrived, copies included. Lost alone: what this uplink without the others would have"
+    " lost. Copies: packets that had already arrived by another. Received is counted with packet headers."
 )
 SIZES = 3  # number of picture sizes listed, those received longest
 
@@ -49,6 +54,30 @@ def drive_rows(drives: Sequence[DriveStatistics]) -> tuple[TableRow, list[TableR
         "damaged",
     )
     return (*headings, "of allocated", "mean kbit/s"), [_drive(drive) for drive in drives]
+
+
+def uplink_rows(drive: DriveStatistics) -> tuple[TableRow, list[TableRow]]:
+    """Headings, and a row for each uplink."""
+    headings: TableRow = ("uplink", "allowed kbit/s", "received kbit/s", "share", "lost alone", "copies")
+    headings += ("queue ms, p95", "stalls", "stalled s", "longest s", "cameras\ncame", "cameras\nleft")
+    return headings, [_uplink(name, each) for name, each in drive.uplinks.items()]
+
+
+def _uplink(name: str, uplink: UplinkStatistics) -> TableRow:
+    return (
+        name,
+        shown(uplink.allowed),
+        shown(uplink.received),
+        percent(uplink.share),
+        NOTHING if math.isnan(uplink.lost) else f"{uplink.lost:.1%}",
+        percent(uplink.twins),
+        shown(uplink.queue_p95_ms),
+        str(uplink.stalls),
+        shown(uplink.stalled_s, 1),
+        shown(uplink.longest_s, 1),
+        str(uplink.came),
+        str(uplink.left),
+    )
 
 
 def _camera(camera: CameraStatistics) -> TableRow:

@@ -68,3 +68,13 @@ def rate(t: FloatSeries, sizes: FloatSeries) -> FloatSeries:
     first = np.maximum(before, 0)
     seconds = np.where(known, t - t[first], 1.0)
     return np.where(known, (sizes - sizes[first]) * 8 / 1000 / seconds, np.nan)
+
+
+def mean(values: FloatSeries) -> float:
+    """Mean of the known values; nan if there are none."""
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if known.size else float("nan")
+
+
+def ratio(part: float, whole: float) -> float:
+    return part / whole if whole > 0 else float("nan")

@@ -12,12 +12,13 @@ const byId = (id) => /** @type {HTMLElement} */ (document.getElementById(id));
  * @typedef {{way: number[][], t: number[], east: number[], north: number[], values: number[], low: number, high: number,
  *   title: string, arrows: number[][]}} Track
  * @typedef {{x: Axis, y: Axis, drive: number|null, unit_s: number, hover: string, curves: Curve[],
- *   strip: {bars: Bars[], none: string}|null, track: Track|null}} Chart
+ *   shades: Bars[], strip: {bars: Bars[], none: string}|null, track: Track|null}} Chart
  * @type {{day: string[], night: string[], charts: Chart[]}}
  */
 const data = JSON.parse(byId("data").textContent ?? "");
 const KEY = "tod-report-theme";
 const DASHES = ["solid", "6px,2px", "2px,2px", "7px,2px,2px,2px"];
+const SHADE = 0.2; // opacity
 const MIN_VISIBLE = 0.004; // of the axis: the smallest visible width of a freeze
 const VIRIDIS = ["#440154", "#482878", "#3e4a89", "#31688e", "#26828e", "#1f9e89", "#35b779", "#6ece58", "#b5de2b", "#fde725"];
 
@@ -112,6 +113,15 @@ function axisOf({ title, low, high, marks, log, percent }) {
   };
 }
 
+/** Spans over the whole height. @param {Chart} chart */
+function shapesOf({ shades }) {
+  const shade = ({ colour, spans }) => spans.map(([t, s]) => ({
+    type: "rect", xref: "x", yref: "paper", x0: t, x1: t + s, y0: 0, y1: 1, layer: "below", opacity: SHADE,
+    fillcolor: colourOf(colour), line: { width: 0 },
+  }));
+  return shades.flatMap(shade);
+}
+
 /** Layout of the freezes, which have their own rows below the curves. @param {Chart} chart */
 function stripOf({ strip, x, y }) {
   if (!strip) return {};
@@ -151,7 +161,7 @@ function draw(element) {
     hoverlabel: { font: { size: 12, color: themed("text") }, bgcolor: themed("raised"), bordercolor: themed("line"), align: "left" },
     showlegend: true, legend: { orientation: "h", x: 0, y: 1, xanchor: "left", yanchor: "bottom", font: { size: 12 } },
     modebar: { color: themed("muted"), activecolor: themed("accent"), bgcolor: "rgba(0,0,0,0)", orientation: "v" },
-    xaxis: axisOf(x), yaxis: { ...axisOf(y), ...(track ? { scaleanchor: "x" } : {}) }, ...stripOf(chart),
+    xaxis: axisOf(x), yaxis: { ...axisOf(y), ...(track ? { scaleanchor: "x" } : {}) }, shapes: shapesOf(chart), ...stripOf(chart),
   };
   Plotly.react(element, drawn, layout, config);
   if (element.dataset.drawn) return;
