@@ -254,7 +254,7 @@ def live_operator(
         logged = log is not None
         return apply.OperatorSide(
             plans,
-            station.report,
+            lambda camera, what: station.note(f"{camera}: {what}"),
             on_unit,
             publish if pictures else None,
             arrivals=logged,

@@ -208,10 +208,6 @@ class Station:
         for listener in self.listeners:
             listener.on_note(note)
 
-    def report(self, camera: str, what: str) -> None:
-        """An event of a camera, as `OperatorSide` reports it."""
-        self.note(f"{camera}: {what}")
-
     def _cameras(self) -> Mapping[str, CameraState]:
         """The vehicle's cameras by its state; none while it is offline."""
         state = self.state  # another thread may replace it
