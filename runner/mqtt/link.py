@@ -208,6 +208,7 @@ class ControlLink:
         if not self._listening.is_set():
             return False
         self._listening.clear()
+        self._is_explained = True  # paho states the end of a silent connection twice; the next attempt shows why
         self._on_connected(False)
         self._brief = self._brief + 1 if time.monotonic() - self._listened < BRIEF_S else 0
         if self._brief >= MOST_BRIEF:  # such as one that does not allow what this side sends
