@@ -16,6 +16,8 @@ from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode
 
 from runner.errors import RunError, UserError
 from runner.mqtt.login import Login
+from runner.settings import Uplink
+from runner.system.interfaces import addresses_of
 
 CONNECT_S = 1.0  # one attempt to connect
 RETRY_S = (0.25, 0.5)  # between attempts, initially and at most: after an outage the vehicle waits for its operator
@@ -30,15 +32,18 @@ class BrokerClient(Client):
 
     login      credentials of this side; None: the broker does not authenticate
     on_broken  called with a violation
+    uplink     by which it connects; None: the system's routes decide
     """
 
     _heard = b""  # the first bytes that arrived over the connection
     _error: OSError | None = None  # of its socket before it was in use; None: none occurred
 
-    def __init__(self, login: Login | None, on_broken: Callable[[Exception], None]) -> None:
+    def __init__(
+        self, login: Login | None, on_broken: Callable[[Exception], None], uplink: Uplink | None = None
+    ) -> None:
         # With a fixed id, a new connection ends the old one, whose will the broker would otherwise publish later.
         super().__init__(CallbackAPIVersion.VERSION2, client_id=f"tod{uuid.uuid4().hex[:20]}")
-        self._login, self._on_broken = login, on_broken
+        self._login, self._on_broken, self._uplink = login, on_broken, uplink
         self.connect_timeout = CONNECT_S
         self.reconnect_delay_set(*RETRY_S)  # type: ignore[arg-type]  # s; fractions work
         self.on_socket_open = self._on_opened
@@ -109,6 +114,11 @@ class BrokerClient(Client):
                 with suppress(Exception):  # the loop tries again, and reports what fails
                     self.reconnect()
 
+    def _create_socket_connection(self) -> socket.socket:
+        if self._uplink is None:
+            return super()._create_socket_connection()
+        return connected_by(self._uplink, self._host, self._port)
+
     def _recv_first(self, bufsize: int) -> bytes:
         try:
             data = super()._sock_recv(bufsize)
@@ -133,3 +143,36 @@ class BrokerClient(Client):
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(1000 * STALLED_S))
             # A socket that is behind becomes writable again when half of this is left.
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, 2 * UNSENT_BYTES)
+
+
+def connected_by(uplink: Uplink, host: str, port: int) -> socket.socket:
+    """A connection that leaves by an uplink, whatever the routes say.
+
+    raises  OSError, also if the uplink has no address to reach the host from
+    """
+    failed = OSError(errno.ENETUNREACH, f"{host} has no address")
+    for family, kind, _, _, address in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM):
+        own = socket.socket(family, kind)
+        try:
+            own.settimeout(CONNECT_S)
+            if uplink.interface:
+                own.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, uplink.interface.encode())
+            own.bind((_source(uplink, family), 0))  # by which rules of routes may choose
+            own.connect(address)
+            return own
+        except OSError as error:
+            own.close()
+            failed = error
+    raise failed
+
+
+def _source(uplink: Uplink, family: int) -> str:
+    """The address of an uplink in a family.
+
+    raises  OSError
+    """
+    addresses = [uplink.address] if uplink.address else addresses_of(uplink.interface or "")
+    for address in addresses:
+        if (":" in address) == (family == socket.AF_INET6):
+            return address
+    raise OSError(errno.EADDRNOTAVAIL, f"{uplink.interface or uplink.address} has no address to reach it from")

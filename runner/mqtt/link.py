@@ -16,7 +16,7 @@ from paho.mqtt.client import Client, MQTTMessage, MQTTMessageInfo
 from runner.mqtt.client import RETRY_S, BrokerClient
 from runner.mqtt.login import Login
 from runner.mqtt.messages import JsonObject, MqttMessage
-from runner.settings import Endpoint
+from runner.settings import Endpoint, Uplink
 from runner.system.reports import LimitedReports
 
 KEEPALIVE_S = 1  # s without a message before a ping; the broker publishes a will after one and a half of these
@@ -36,6 +36,7 @@ class ControlLink:
     on_connected  called with True once this side receives its messages, with False when the connection is lost
     on_report     called with one line when the broker is unreachable, once per reason, and when it is back
     login         credentials of this side; None: the broker does not authenticate
+    uplink        name and way of this connection, if it is one of several; None: the system's routes decide
 
     A message whose callback raises is reported and counted in `dropped`; the link continues.
     """
@@ -48,8 +49,11 @@ class ControlLink:
         on_connected: Callable[[bool], None],
         on_report: Callable[[str], None],
         login: Login | None = None,
+        uplink: tuple[str, Uplink] | None = None,
     ) -> None:
-        self._login = login
+        self._login, self._uplink = login, uplink
+        self._by = f" by uplink {uplink[0]}" if uplink else ""
+        self._most_reasons = 1 if uplink else MOST_REASONS  # whether there is one at all matters more than why
         self._broker, self._will, self._listen = broker, will, listen
         self._on_connected, self._on_report = on_connected, on_report
         self.fault: str | None = None  # why there is no connection; None: there is one, or none was lost or tried yet
@@ -93,7 +97,7 @@ class ControlLink:
         """
         if self.check() or not self._listening.is_set():
             return True
-        if not behind and _is_one_of(SUPERSEDED, topic) and self._client.is_behind():
+        if not behind and is_one_of(SUPERSEDED, topic) and self._client.is_behind():
             return False
         self._send(topic, message)
         return True
@@ -134,7 +138,7 @@ class ControlLink:
         return self._client.is_behind()
 
     def _new_client(self) -> BrokerClient:
-        client = BrokerClient(self._login, self._on_broken)
+        client = BrokerClient(self._login, self._on_broken, self._uplink[1] if self._uplink else None)
         if self._will:
             topic, message = self._will
             client.will_set(topic, json.dumps(message), qos=1, retain=_is_retained(topic))
@@ -167,7 +171,7 @@ class ControlLink:
         self._report_fault(f"a message on {message.topic} was dropped: {why}", message.topic)
 
     def _send(self, topic: str, message: JsonObject) -> MQTTMessageInfo:
-        qos = 0 if _is_one_of(PERIODIC, topic) else 1
+        qos = 0 if is_one_of(PERIODIC, topic) else 1
         return self._client.publish(topic, json.dumps(message), qos=qos, retain=_is_retained(topic))
 
     def _on_connect(self, _client: Client, _data: object, _flags: object, code: Any, _properties: object) -> None:
@@ -200,7 +204,7 @@ class ControlLink:
     def _report_connected(self) -> None:
         if self._reported:
             self._reported.clear()
-            self._on_report(f"connected to the MQTT broker at {self._broker}")
+            self._on_report(f"connected to the MQTT broker at {self._broker}{self._by}")
         self.fault = None
 
     def _lose(self) -> bool:
@@ -235,13 +239,13 @@ class ControlLink:
             return
         if perhaps_keys and self._login:
             why = self._login.invalid() or why
-        self.fault = f"no control link: MQTT broker at {self._broker}: {why}"
-        if why not in self._reported and len(self._reported) < MOST_REASONS:
+        self.fault = f"no control link{self._by}: MQTT broker at {self._broker}: {why}"
+        if why not in self._reported and len(self._reported) < self._most_reasons:
             self._reported.add(why)
             self._on_report(f"{self.fault}{remedy}; retrying")
 
 
-def _is_one_of(kinds: set[str], topic: str) -> bool:
+def is_one_of(kinds: set[str], topic: str) -> bool:
     return bool(kinds.intersection(topic.split("/")[2:3]))
 
 

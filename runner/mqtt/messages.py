@@ -14,7 +14,9 @@ Topics of a vehicle, below tod/<vehicle>/:
     configuration        from the vehicle, retained: what both sides must agree on
 
 Last wills announce that a side is offline: the vehicle's state is {"online": false}, the operator's request is
-operator_disconnected. schemas/control.schema.json describes the vehicle's messages and reception reports.
+operator_disconnected. A vehicle with several uplinks has a connection by each of them, and sends and receives
+everything by all of them; the will of each names it: {"online": false, "uplink": NAME}.
+schemas/control.schema.json describes the vehicle's messages and reception reports.
 """
 
 from __future__ import annotations
@@ -27,7 +29,15 @@ from typing import Any, NamedTuple
 
 from runner.records import from_json
 from runner.records.reception import ReceptionReport
-from runner.records.vehicle import ClockAnswer, Reply, Settings, SteeringAngle, Telemetry, VehicleState
+from runner.records.vehicle import (
+    ClockAnswer,
+    Reply,
+    Settings,
+    SteeringAngle,
+    Telemetry,
+    UplinkLost,
+    VehicleState,
+)
 from runner.schema import message_problem, read_json, shortened
 
 OFFLINE = {"online": False}
@@ -40,7 +50,7 @@ LARGEST = {"kbps": 1e9, "lower_kbps": 1e9, "valid_s": 3600.0}  # a larger number
 LARGEST_WEIGHT = 1e6  # ... or would outlast its sender
 MAX_ID = 128  # characters of a request's id, which its reply repeats
 MAX_REQUEST_BYTES = 65_536  # the longest event is a hundredth of it
-MAX_OFFLINE_BYTES = 64  # a longer state is of a vehicle that is online
+MAX_OFFLINE_BYTES = 256  # a longer state is of a vehicle that is online
 MAX_MESSAGE_BYTES = 1_048_576  # state and configuration grow with the number of cameras
 APPLY_S = 1.0  # a request whose commands are not read back from the elements by then has timed out
 SILENT_S = 0.7  # a vehicle that sends nothing for this long is offline; it sends telemetry five times a second
@@ -121,13 +131,15 @@ def is_online(payload: bytes) -> bool:
 
     raises  ValueError with the problem
     """
-    return len(payload) > MAX_OFFLINE_BYTES or read_message(payload) != OFFLINE
+    return len(payload) > MAX_OFFLINE_BYTES or read_message(payload).get("online") is not False
 
 
-def read_state(payload: bytes) -> VehicleState | None:
+def read_state(payload: bytes) -> VehicleState | UplinkLost | None:
     """A vehicle's state; None: it is offline. Like the five below, raises ValueError with the problem."""
     document = _checked("state", payload)
-    return from_json(VehicleState, document) if document["online"] else None
+    if document["online"]:
+        return from_json(VehicleState, document)
+    return from_json(UplinkLost, document) if "uplink" in document else None
 
 
 def read_telemetry(payload: bytes) -> Telemetry:

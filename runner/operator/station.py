@@ -13,6 +13,7 @@ from msgspec import UNSET, UnsetType
 from runner.configuration import agreement
 from runner.core.decision import NOTHING
 from runner.core.events import Attention
+from runner.mqtt.copies import Newest
 from runner.mqtt.link import ControlLink
 from runner.mqtt.login import Login
 from runner.mqtt.messages import (
@@ -45,6 +46,7 @@ from runner.records.vehicle import (
     CameraState,
     CameraTelemetry,
     Telemetry,
+    UplinkLost,
     UplinkMeasured,
     VehicleState,
 )
@@ -143,6 +145,8 @@ class Station:
         self.attention: Attention | None = None  # of the driver, as the page detects it
         self._telemetry: Telemetry | None = None
         self.addresses: Mapping[str, tuple[str, ...]] = {}  # that the vehicle sends from, by uplink, as it last said
+        self._newest, self._newest_steering = Newest(), Newest()
+        self._uplinks_lost: set[str] = set()  # by their wills, since the vehicle was last heard
         self._signed_off = False  # the vehicle, by itself or through its last will
         self._last_message = 0.0
         self._known = _KnownVehicles()
@@ -300,10 +304,17 @@ class Station:
     def _on_any_state(self, message: MqttMessage) -> None:
         """The state of any vehicle at the broker; of other vehicles only the name is used."""
         name = message.topic.split("/")[1]
-        is_own = name == self._vehicle.name
-        state = read_state(message.payload) if is_own else None
-        self._known.add(name, state is not None if is_own else is_online(message.payload))
-        if not is_own:
+        if name != self._vehicle.name:
+            self._known.add(name, is_online(message.payload))
+            return
+        state = read_state(message.payload)
+        if isinstance(state, UplinkLost):
+            self._uplinks_lost |= {state.uplink} & self.addresses.keys()
+            if self._published and self._uplinks_lost < self.addresses.keys():
+                return  # it has others
+            state = None
+        self._known.add(name, state is not None)
+        if state and not self._newest.takes("state", state.t, time.monotonic()):
             return
         self._published = state
         self._signed_off = state is None
@@ -334,9 +345,11 @@ class Station:
 
     def _on_telemetry(self, message: MqttMessage) -> None:
         telemetry = read_telemetry(message.payload)
-        if message.retained:  # old: no heartbeat, and not the vehicle's current time
-            return
-        self._requests.vehicle_time = (telemetry.t, time.monotonic())
+        arrived = time.monotonic()
+        if message.retained or not self._newest.takes("telemetry", telemetry.t, arrived):
+            return  # old: no heartbeat, and not the vehicle's current time
+        self._requests.vehicle_time = (telemetry.t, arrived)
+        self._uplinks_lost.clear()
         self._telemetry = telemetry
         if telemetry.uplinks is not UNSET:
             self.addresses = {name: each.addresses for name, each in telemetry.uplinks.items()}
@@ -345,7 +358,7 @@ class Station:
     def _on_steering(self, message: MqttMessage) -> None:
         steering = read_steering(message.payload)
         at = None if message.retained else self.latency.own_time(steering.at)
-        if at is not None:
+        if at is not None and self._newest_steering.takes("steering", steering.at, time.monotonic()):
             for listener in self.listeners:
                 listener.on_steering(at, steering.rad)
 
@@ -376,6 +389,7 @@ class Station:
     def _on_connected(self, connected: bool) -> None:
         self._known.connected_at = time.monotonic() if connected else None
         if not connected:
+            self._newest.forget()  # what the broker has kept is said again
             self._published = None
             self._vehicle_lost("the control link is lost")
 

@@ -97,6 +97,14 @@ class VehicleState:
 
 
 @dataclass(frozen=True, slots=True)
+class UplinkLost:
+    """A vehicle's state by the last will of one of its connections: it is offline unless another one works."""
+
+    uplink: Annotated[str, "of an offline vehicle with several: by which its connection to the broker was lost"]
+    online: bool = False
+
+
+@dataclass(frozen=True, slots=True)
 class Offline:
     """Operator log line: the vehicle is offline."""
 

@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from runner.graph import rtsp_url
+from runner.mqtt.copies import Newest
 from runner.mqtt.link import ControlLink
 from runner.mqtt.login import Login
 from runner.mqtt.messages import (
@@ -26,6 +27,7 @@ from runner.mqtt.messages import (
     read_telemetry,
     topic,
 )
+from runner.records.vehicle import UplinkLost, VehicleState
 from runner.ros.inputs import PRESENCE, OperatorInput, check_names, input_services, input_topics, ros_name
 from runner.ros.process import Message, NodeProcess
 from runner.security.keyring import Keyring
@@ -68,6 +70,7 @@ class Bridge:
         self._state = OFFLINE  # the newest from the vehicle
         self._is_shown = True  # whether it was published last; OFFLINE is, once the vehicle has been silent
         self._state_time = -math.inf  # when it arrived by time.monotonic
+        self._newest = Newest()
         self._requests = topic(vehicle.name, "request", self.identity)
         listen = {
             topic(vehicle.name, "state"): self._on_state,
@@ -76,7 +79,7 @@ class Bridge:
         }
         # With keys an operator's side may have the same name; after a crash its silence shows that it is gone.
         will = None if self._has_keys else (self._requests, OPERATOR_GONE)
-        self._link = ControlLink(setup.control, will, listen, lambda here: None, on_report, login)
+        self._link = ControlLink(setup.control, will, listen, self._on_connected, on_report, login)
         inputs = {REQUEST: "text", **{name: operator_input.kind for name, operator_input in self._topics.items()}}
         if not self._reports:
             inputs[PRESENCE] = "sign"
@@ -120,8 +123,7 @@ class Bridge:
         self._link.check()
         now = time.monotonic()
         with self._lock:
-            is_silent = now - max(self._state_time, self._vehicle_time[1]) > SILENT_S
-            if self._is_shown and is_silent and self._state != OFFLINE:
+            if self._is_shown and self._is_silent() and self._state != OFFLINE:
                 self._node.publish(STATE, OFFLINE)
                 self._is_shown = False
         for identity in [identity for identity, until in tuple(self._pending.items()) if now > until]:
@@ -130,17 +132,27 @@ class Bridge:
 
     # --- from the vehicle, in the link's thread -----------------------------------------------------------------------
 
+    def _on_connected(self, connected: bool) -> None:
+        if not connected:
+            self._newest.forget()  # what the broker has kept is said again
+
     def _on_state(self, message: MqttMessage) -> None:
-        state = OFFLINE if read_state(message.payload) is None else message.payload.decode()
+        said = read_state(message.payload)
+        if isinstance(said, UplinkLost) and not self._is_silent():
+            return  # it has others
+        if isinstance(said, VehicleState) and not self._newest.takes("state", said.t, time.monotonic()):
+            return
+        state = message.payload.decode() if isinstance(said, VehicleState) else OFFLINE
         with self._lock:
             self._node.publish(STATE, state)
             self._state, self._is_shown, self._state_time = state, True, time.monotonic()
 
     def _on_telemetry(self, message: MqttMessage) -> None:
         telemetry = read_telemetry(message.payload)
-        if not message.retained:
+        arrived = time.monotonic()
+        if not message.retained and self._newest.takes("telemetry", telemetry.t, arrived):
             with self._lock:
-                self._vehicle_time = (telemetry.t, time.monotonic())
+                self._vehicle_time = (telemetry.t, arrived)
                 if not self._is_shown:
                     self._node.publish(STATE, self._state)
                     self._is_shown = True
@@ -221,6 +233,9 @@ class Bridge:
             self._send(f"{event} {uuid.uuid4().hex[:8]}", {"event": event, **values})
 
     # ------------------------------------------------------------------------------------------------------------------
+
+    def _is_silent(self) -> bool:
+        return time.monotonic() - max(self._state_time, self._vehicle_time[1]) > SILENT_S
 
     def _is_online(self) -> bool:
         return time.monotonic() - self._vehicle_time[1] <= SILENT_S

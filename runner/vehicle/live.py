@@ -31,6 +31,7 @@ from runner.mqtt.link import ControlLink
 from runner.mqtt.login import Login
 from runner.mqtt.messages import (
     OFFLINE,
+    JsonObject,
     MqttMessage,
     is_will,
     read_reception,
@@ -57,6 +58,7 @@ from runner.vehicle.loop import ControlLoop
 
 if TYPE_CHECKING:
     from runner.apply import VehicleSide
+    from runner.mqtt.ways import ControlLinks
     from runner.ros.cameras import RosCameras, SharedPicture
 
 PictureFormat = Literal["i420", "bgr", "rgb", "grey"]
@@ -220,9 +222,8 @@ class _VehicleControl:
             self._topic("state"): self._on_state,
             self._topic("configuration"): self._on_configuration,
         }
-        login = Login(keyring, on_report) if keyring else None
         will = (self._topic("state"), OFFLINE)
-        self.link = ControlLink(setup.control, will, listen, self._on_connected, on_report, login)
+        self.link = _link(setup, will, listen, self._on_connected, on_report, keyring)
 
     def connect(self, live: LiveVehicle) -> None:
         self._live = live
@@ -244,11 +245,12 @@ class _VehicleControl:
         return topic(self._name, *parts)
 
     def _on_connected(self, connected: bool) -> None:
-        if self._announce_timer:
+        if self._announce_timer and not connected:
             self._announce_timer.cancel()  # it has not listened for long enough
-        if connected and self._is_name_free.is_set():
+            self._announce_timer = None
+        elif connected and self._is_name_free.is_set():
             self._announce()
-        elif connected:
+        elif connected and not self._announce_timer:
             self._announce_timer = threading.Timer(NAME_CHECK_S, self._announce)
             self._announce_timer.daemon = True
             self._announce_timer.start()
@@ -302,8 +304,8 @@ class _VehicleControl:
             self._live.fail(RunError(f"a vehicle named {self._name} is already connected to the broker; {rule}"))
 
     def _on_state(self, message: MqttMessage) -> None:
-        """Correct a last will that the broker publishes late, when the vehicle is already back."""
-        if self._is_name_free.is_set() and read_state(message.payload) is None:
+        """Correct a last will: of another uplink, or one that the broker publishes late, when the vehicle is back."""
+        if self._is_name_free.is_set() and not isinstance(read_state(message.payload), VehicleState):
             self._live.loop.publish_again()
 
     def _on_configuration(self, message: MqttMessage) -> None:
@@ -312,6 +314,24 @@ class _VehicleControl:
         if self._is_name_free.is_set() and not message.retained and not own and run not in self._others:
             self._others.add(run)
             self._on_report(f"another vehicle named {self._name} connected to the broker: operators see both")
+
+
+def _link(
+    setup: Setup,
+    will: tuple[str, JsonObject],
+    listen: Mapping[str, Callable[[MqttMessage], None]],
+    on_connected: Callable[[bool], None],
+    on_report: Callable[[str], None],
+    keyring: Keyring | None,
+) -> ControlLink | ControlLinks:
+    """The control link, over each of several uplinks."""
+    if len(setup.uplinks) > 1:
+        from runner.mqtt.ways import ControlLinks, ways_to
+
+        if len(ways := ways_to(setup.control, setup.uplinks)) > 1:
+            return ControlLinks(setup.control, ways, will, listen, on_connected, on_report, keyring)
+    login = Login(keyring, on_report) if keyring else None
+    return ControlLink(setup.control, will, listen, on_connected, on_report, login)
 
 
 def _check_ros(setup: Setup) -> None:

@@ -22,8 +22,9 @@ from runner.configuration.config import configuration
 from runner.mqtt.broker import find_mosquitto, private_broker
 from runner.mqtt.link import ControlLink
 from runner.mqtt.messages import MAX_ROUND_TRIP_S, OFFLINE, topic
+from runner.mqtt.ways import ControlLinks
 from runner.operator.station import Station
-from runner.settings import Endpoint
+from runner.settings import Endpoint, Uplink
 from runner.vehicle.operators import SILENT_S
 
 
@@ -486,11 +487,12 @@ def test_no_message_is_queued_while_the_broker_is_away():
 
 
 class Stalling:
-    """Forwards connections to a broker, one after the other, with a small buffer."""
+    """Forwards connections to a broker, with a small buffer."""
 
     def __init__(self, broker, stack):
         self.endpoint, self.carries = Endpoint("127.0.0.1", free_port()), threading.Event()
         self.carries.set()
+        self.only = ""  # the address whose connections it stalls; "": all
         self._broker = (broker.host, broker.port)
         self._listening = socket.socket()
         self._listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
@@ -503,15 +505,19 @@ class Stalling:
     def _serve(self):
         with suppress(OSError):
             while True:
-                near, _ = self._listening.accept()
-                with near, socket.create_connection(self._broker) as far:
-                    threading.Thread(target=self._pass, args=(far, near), daemon=True).start()
-                    self._pass(near, far)
+                near, (address, _) = self._listening.accept()
+                threading.Thread(target=self._connect, args=(near, address), daemon=True).start()
 
-    def _pass(self, one, other):
+    def _connect(self, near, address):
+        with near, socket.create_connection(self._broker) as far:
+            threading.Thread(target=self._pass, args=(far, near, address), daemon=True).start()
+            self._pass(near, far, address)
+
+    def _pass(self, one, other, address):
         with suppress(OSError):
             while data := one.recv(1024):
-                self.carries.wait()
+                if self.only in ("", address):
+                    self.carries.wait()
                 other.sendall(data)
 
 
@@ -540,3 +546,27 @@ def test_periodic_messages_are_not_queued_on_a_stalled_link(broker, stack):
     link_there.carries.set()
     until(lambda: publish(1000) or 1000 in seen)
     assert len([number for number in seen if 0 < number < 1000]) < 20
+
+
+def test_the_broker_keeps_the_newest_state_though_one_uplink_was_behind(broker, stack):
+    """What waited for that uplink arrives after what came by the other one."""
+    there, seen, made = Stalling(broker, stack), [], []
+    there.only = "127.0.0.2"
+    uplinks = {"a": Uplink(address=there.only), "b": Uplink(address="127.0.0.3")}
+    will, own = (topic("x", "state"), OFFLINE), {topic("x", "request", "+"): lambda message: None}
+    links = ControlLinks(there.endpoint, uplinks, will, own, made.append, print)
+    listen = {topic("x", "+"): lambda message: seen.append(json.loads(message.payload)["number"])}
+    watcher = ControlLink(broker, None, listen, lambda here: None, print)
+    for side in (watcher, links):
+        side.connect()
+        stack.callback(side.close)
+    until(lambda: watcher.is_connected and made == [True, True])
+    there.carries.clear()
+    number, end = 0, time.monotonic() + 0.8  # a longer stall would end the connection
+    while time.monotonic() < end or number <= 40:
+        links.publish(topic("x", "state"), {"number": (number := number + 1), "rest": 4000 * "."})
+        time.sleep(0.005)
+    there.carries.set()
+    until(lambda: links.publish(topic("x", "telemetry"), {"number": 0}) and seen.count(number) == 2, every_s=0.1)
+    assert [each for each in seen if each][-1] == number
+    assert made == [True, True]

@@ -56,6 +56,7 @@ class Vehicle:
     def __init__(self, broker):
         self.requests = []
         self.operator = ""  # sender of the last message
+        self._began = time.monotonic()
         self.clock_ahead_s, self.states_clock = 0.0, True
         self.answers, self.reports = [], []  # about its clock; of reception
         listen = {
@@ -81,6 +82,8 @@ class Vehicle:
             self.publish("clock", self.answers[-1])
 
     def publish(self, kind, message):
+        if kind in ("state", "telemetry") and message != OFFLINE:  # each is newer than all before
+            message = {**message, "t": time.monotonic() - self._began}
         parts = (kind, self.operator) if kind in ("reply", "clock") else (kind,)
         self.link.publish(topic("delivery_robot", *parts), message)
 
@@ -292,7 +295,7 @@ def test_the_slowest_camera_that_should_send_is_reported(both):
     until(lambda: reported(silent=["rear"]) > 500, every_s=0.05)  # the longer it sends nothing
     until(lambda: 40 <= reported() < 60, every_s=0.05)
     cameras = {name: {**camera, "fault": "it repeats"} for name, camera in STATE["cameras"].items()}
-    vehicle.publish("state", {**STATE, "t": 2.0, "cameras": cameras})
+    vehicle.publish("state", {**STATE, "cameras": cameras})
     until(lambda: reported() == 0, every_s=0.05)  # pictures arrive whose age is unknown
 
 
@@ -315,7 +318,7 @@ def test_the_latency_of_a_source_without_capture_times_is_unknown(both):
     reach(lambda: "latency_ms" in vehicle.reports[-1])
     assert station.latency.captured("rear", 1003.7) is not None
     rear = {**STATE["cameras"]["rear"], "untimed": True}
-    vehicle.publish("state", {**STATE, "t": 2.0, "cameras": {**STATE["cameras"], "rear": rear}})
+    vehicle.publish("state", {**STATE, "cameras": {**STATE["cameras"], "rear": rear}})
     reach(lambda: station.latency.untimed("rear") and "latency_ms" not in vehicle.reports[-1])
     shown = listener.received[-1][1].cameras
     assert shown["rear"].latency_ms is None
@@ -356,9 +359,9 @@ def test_a_decision_is_one_note_however_many_cameras_it_changes(both):
         for kbps, (name, camera) in enumerate(STATE["cameras"].items(), 300)
     }
     totals = {"total_kbps": 900, "asked_kbps": 900}
-    state = {**STATE, "t": 2.0, "cause": "bitrate_predicted kbps 900", **totals, "cameras": cameras}
+    state = {**STATE, "cause": "bitrate_predicted kbps 900", **totals, "cameras": cameras}
     vehicle.publish("state", state)
-    vehicle.publish("state", {**state, "t": 3.0, "cause": "bitrate_predicted kbps 880", "total_kbps": 880})
+    vehicle.publish("state", {**state, "cause": "bitrate_predicted kbps 880", "total_kbps": 880})
     until(lambda: station.state.total_kbps == 880)
     text = "Prediction 900 kbit/s: front, rear, mast 0.5 -> 0.25 (3 of 3 cameras, total 900 kbit/s)"
     assert listener.notes[1:] == [text]
