@@ -10,6 +10,8 @@ import subprocess
 import sys
 import urllib.error
 import urllib.request
+from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -17,18 +19,29 @@ import pytest
 import yaml
 
 from rig import CHECKOUT, free_port
-from runner.core.decision import Believed
-from runner.core.model import Mode
+from runner.core.decision import Believed, Setting
+from runner.core.events import LinkState
+from runner.core.model import Mode, Roi
 from runner.errors import RunError
 from runner.metrics.side import SideMetrics
 from runner.mqtt.link import ControlLink
-from runner.records.vehicle import CameraTelemetry, Telemetry, VehicleState
+from runner.records.decisions import UplinkDecision
+from runner.records.vehicle import (
+    CameraReading,
+    CameraState,
+    CameraTelemetry,
+    Telemetry,
+    UplinkMeasured,
+    UplinkTelemetry,
+    VehicleState,
+)
 from runner.settings import Endpoint
 
 pytest.importorskip("prometheus_client")
 
 CAMERA = CameraTelemetry(applied={}, frames=10, bytes=2000, encode_ms=4.0)
 BELIEVED = Believed(2431, 0.1, 0.05, bias=-0.2, error=0.1, gain=None, policer_kbps=None)
+READING = CameraReading()
 TELEMETRY = Telemetry(1.0, None, None, {"front": CAMERA, "rear": CAMERA}, refused=3)
 
 
@@ -58,6 +71,7 @@ def test_a_side_serves_its_figures_and_its_health() -> None:
         assert 'tod_prediction_bias{vehicle="car"} -0.2' in text
         assert "tod_predicted_kbps{" not in text  # unknown
         assert "tod_prediction_gain{" not in text
+        assert "tod_uplink" not in text
         assert fetch(port, "/health") == (200, "ok\n")
         assert 'tod_healthy{vehicle="car"} 1.0' in text
         problems.append("the control loop hangs in a rule")
@@ -68,6 +82,34 @@ def test_a_side_serves_its_figures_and_its_health() -> None:
         figures.close()
     with pytest.raises(urllib.error.URLError):
         fetch(port, "/health")
+
+
+def test_each_of_several_uplinks_has_figures() -> None:
+    pytest.importorskip("prometheus_client")
+    from prometheus_client import CollectorRegistry, generate_latest
+
+    from runner.metrics.prometheus import Metrics
+
+    metrics, registry = Metrics("car"), CollectorRegistry(auto_describe=False)
+    registry.register(metrics)
+    setting = Setting(True, True, 900, 900, 900, Fraction(1), Roi(0, 0, 640, 480), 640, 480, "", ("a", "b"))
+    decided = {"a": UplinkDecision(1500, False, ""), "b": UplinkDecision(300, True, "")}
+    state = VehicleState(1.0, "", Mode.AUTOMATIC, 1800, 1800, {"front": CameraState.at(setting, 1, "front", READING)})
+    metrics.take(replace(state, uplinks=decided))
+    measured = UplinkMeasured(1480.5, 12.0, 0.01, LinkState.CLEAR, 30.0)
+    metrics.take(replace(TELEMETRY, uplinks={"a": UplinkTelemetry(("10.0.0.1",), measured), "b": UplinkTelemetry(())}))
+    found = dict(line.rsplit(" ", 1) for line in generate_latest(registry).decode().splitlines() if "uplink=" in line)
+    assert found == {
+        'tod_uplink_allowed_kbps{uplink="a",vehicle="car"}': "1500.0",
+        'tod_uplink_allowed_kbps{uplink="b",vehicle="car"}': "300.0",
+        'tod_uplink_stalled{uplink="a",vehicle="car"}': "0.0",
+        'tod_uplink_stalled{uplink="b",vehicle="car"}': "1.0",
+        'tod_uplink_cameras{uplink="a",vehicle="car"}': "1.0",
+        'tod_uplink_cameras{uplink="b",vehicle="car"}': "1.0",
+        'tod_uplink_received_kbps{uplink="a",vehicle="car"}': "1480.5",
+        'tod_uplink_queue_seconds{uplink="a",vehicle="car"}': "0.012",
+        'tod_uplink_loss{uplink="a",vehicle="car"}': "0.01",
+    }
 
 
 def test_another_host_name_is_refused() -> None:

@@ -13,7 +13,7 @@ from runner.drive.captures import ReadVideo, RecordedVideo, files
 from runner.drive.read import Drive, Side
 from runner.errors import RunError
 from runner.records import Json
-from runner.records.lines import KINDS, Note, Record, line_to_json
+from runner.records.lines import KINDS, LinkSample, Note, Record, line_to_json
 from runner.records.operator import Sample
 from runner.records.vehicle import Position
 from runner.system.clocks import SECOND_NS
@@ -115,7 +115,8 @@ def _writers(
     """The messages of one line."""
     if isinstance(line, Event):
         event = NAMES[type(line)]
-        yield lambda: target.write_line(f"/events/{event}", "event", event, event_to_json(line), ns)
+        topic = _topic(f"/events/{event}", getattr(line, "uplink", ""))
+        yield lambda: target.write_line(topic, "event", event, event_to_json(line), ns)
         if isinstance(line, PositionReported):
             yield lambda: target.write_position(Position.of(line), ns)
         return
@@ -123,9 +124,15 @@ def _writers(
     if isinstance(line, Note):
         yield lambda: target.note(name, line, ns)
     elif kind in TOPICS:
-        yield lambda: target.write_line(TOPICS[kind], "drive", kind, line_to_json(line), ns)
+        topic = _topic(TOPICS[kind], (line.lane or "") if isinstance(line, LinkSample) else "")
+        yield lambda: target.write_line(topic, "drive", kind, line_to_json(line), ns)
     if isinstance(line, Sample) and positions and (position := line.position):
         yield lambda: target.write_position(position, ns)
+
+
+def _topic(topic: str, name: str) -> str:
+    """A topic, with the name of the uplink or lane that its lines are about, if there are several."""
+    return f"{topic}/{name}" if name else topic
 
 
 def _pictures(
@@ -155,7 +162,12 @@ def _pictures(
 
 
 def cameras_of(drive: Drive) -> list[str]:
-    named = (camera for side in drive.sides.values() for camera in side.began.config.get("cameras", {}))
+    return names_of(drive, "cameras")
+
+
+def names_of(drive: Drive, key: str) -> list[str]:
+    """What the configuration names under a key, on either side."""
+    named = (name for side in drive.sides.values() for name in side.began.config.get(key) or {})
     return list(dict.fromkeys(named))
 
 

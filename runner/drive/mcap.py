@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from msgspec import UNSET
 
 from runner.drive.captures import ReadVideo
-from runner.drive.exported import NOTE_TOPIC, POSITION_TOPIC, cameras_of, write_all
+from runner.drive.exported import NOTE_TOPIC, POSITION_TOPIC, names_of, write_all
 from runner.drive.read import Drive
 from runner.errors import RunError, reason
 from runner.records import Json
@@ -21,6 +21,9 @@ from runner.system.clocks import SECOND_NS
 
 if TYPE_CHECKING:
     from runner.apply import Unit
+
+
+BY_UPLINK = ("uplinks", "sent", "received")  # properties whose keys are uplinks
 
 
 def write_mcap(
@@ -45,7 +48,8 @@ def write_mcap(
     context, out = foxglove.Context(), _Out(file)
     options = MCAPWriteOptions(compression=MCAPCompression.Zstd, profile="tod-runner")
     with foxglove.open_mcap(out, context=context, writer_options=options) as writer:
-        channels = _Channels(context, cameras_of(drive))
+        cameras, uplinks = (names_of(drive, key) for key in ("cameras", "uplinks"))
+        channels = _Channels(context, {"cameras": cameras, **dict.fromkeys(BY_UPLINK, uplinks)})
         for name, side in drive.sides.items():
             writer.write_metadata(f"{name} began", _texts(line_to_json(side.first)))
         count = write_all(drive, channels, read_video, on_warning, on_progress, out.check)
@@ -86,8 +90,8 @@ class _Out:
 class _Channels:
     """The topics, each created with its first message."""
 
-    def __init__(self, context: Any, cameras: Iterable[str]) -> None:
-        self._context, self._cameras = context, list(cameras)
+    def __init__(self, context: Any, names: Mapping[str, Iterable[str]]) -> None:
+        self._context, self._names = context, names
         self._made: dict[str, Any] = {}
 
     def write_line(self, topic: str, schema: str, definition: str, line: Json, ns: int) -> None:
@@ -137,27 +141,28 @@ class _Channels:
     def _json_channel(self, topic: str, schema: str, definition: str) -> Any:
         import foxglove
 
-        text = json.dumps(standalone({"$ref": f"#/$defs/{definition}"}, schema, self._cameras))
+        text = json.dumps(standalone({"$ref": f"#/$defs/{definition}"}, schema, self._names))
         known = foxglove.Schema(name=f"tod_runner.{definition}", encoding="jsonschema", data=text.encode())
         return foxglove.Channel(topic, schema=known, message_encoding="json", context=self._context)
 
 
-def standalone(schema: Any, home: str, cameras: Iterable[str]) -> Any:
-    """A schema without references, and with the cameras by name, so that Foxglove offers each number for plots.
+def standalone(schema: Any, home: str, names: Mapping[str, Iterable[str]]) -> Any:
+    """A schema without references, and with cameras and uplinks by name, so that Foxglove offers each number for plots.
 
-    home  name of the schema that it is a part of
+    home   name of the schema that it is a part of
+    names  by the property whose keys they are
     """
     if isinstance(schema, list):
-        return [standalone(part, home, cameras) for part in schema]
+        return [standalone(part, home, names) for part in schema]
     if not isinstance(schema, dict):
         return schema
     if "$ref" in schema:
-        return standalone(*referred(schema["$ref"], home), cameras)
-    whole = {key: standalone(part, home, cameras) for key, part in schema.items()}
-    by_camera = whole.get("properties", {}).get("cameras")
-    if by_camera and isinstance(by_camera.get("additionalProperties"), dict):
-        each = by_camera["additionalProperties"]
-        by_camera |= {"properties": dict.fromkeys(cameras, each), "additionalProperties": False}
+        return standalone(*referred(schema["$ref"], home), names)
+    whole = {key: standalone(part, home, names) for key, part in schema.items()}
+    properties = whole.get("properties", {})
+    for key in names.keys() & properties.keys():
+        if isinstance(each := properties[key].get("additionalProperties"), dict):
+            properties[key] |= {"properties": dict.fromkeys(names[key], each), "additionalProperties": False}
     return whole
 
 

@@ -70,7 +70,7 @@ class _Topics:
         self._made: dict[str, Any] = {}
 
     def write_line(self, topic: str, _schema: str, _definition: str, line: Json, ns: int) -> None:
-        self._write(topic, TEXT, ns, data=json.dumps(line, ensure_ascii=False))
+        self._write(ros_name(topic), TEXT, ns, data=json.dumps(line, ensure_ascii=False))
 
     def note(self, _side: str, line: Note, ns: int) -> None:
         self._write(NOTE_TOPIC, TEXT, ns, data=json.dumps(line_to_json(line), ensure_ascii=False))

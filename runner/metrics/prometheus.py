@@ -60,8 +60,21 @@ def _believed(key: str) -> Reading:
     return lambda state: getattr(state.believed, key, None)
 
 
-# By record, metrics of the whole vehicle, and of each camera. A name that ends in _total is a counter.
-METRICS: dict[type, tuple[tuple[_Metric, ...], tuple[_Metric, ...]]] = {
+class _Uplink(NamedTuple):
+    """One of several uplinks: its entry in a record, and the record."""
+
+    name: str
+    own: Any
+    record: Any
+
+
+def _cameras_on(uplink: _Uplink) -> int:
+    return sum(uplink.name in (camera.uplinks or ()) for camera in uplink.record.cameras.values())
+
+
+# By record, metrics of the whole vehicle, of each camera, and of each of several uplinks. A name that ends in _total is
+# a counter.
+METRICS: dict[type, tuple[tuple[_Metric, ...], tuple[_Metric, ...], tuple[_Metric, ...]]] = {
     VehicleState: (
         (
             _Metric("decided_kbps", "Total bitrate of all cameras", lambda s: s.total_kbps),
@@ -80,6 +93,11 @@ METRICS: dict[type, tuple[tuple[_Metric, ...], tuple[_Metric, ...]]] = {
             _Metric("camera_sending", "1 while the camera should be sent", lambda c: c.sending),
             _Metric("camera_source_failing", "1 while the source has failed", lambda c: c.fault is not None),
         ),
+        (
+            _Metric("uplink_allowed_kbps", "Bitrate that an uplink is to carry", lambda u: u.own.total_kbps),
+            _Metric("uplink_stalled", "1 while nothing arrives over an uplink", lambda u: u.own.stalled),
+            _Metric("uplink_cameras", "Cameras that an uplink carries, copies included", _cameras_on),
+        ),
     ),
     Telemetry: (
         (
@@ -92,6 +110,11 @@ METRICS: dict[type, tuple[tuple[_Metric, ...], tuple[_Metric, ...]]] = {
             _Metric("camera_encoded_frames_total", "Frames that the encoder has output", lambda c: c.frames),
             _Metric("camera_encoded_bytes_total", "Bytes that the encoder has output", lambda c: c.bytes),
             _Metric("camera_encode_seconds", "Time in the encoder", lambda c: _ms(c.encode_ms)),
+        ),
+        (
+            _Metric("uplink_received_kbps", "Received over an uplink, with packet headers", lambda u: u.own.kbps),
+            _Metric("uplink_queue_seconds", "Standing queue in front of an uplink", lambda u: _ms(u.own.queue_ms)),
+            _Metric("uplink_loss", "Share of packets that an uplink has lost", lambda u: u.own.loss),
         ),
     ),
     Sample: (
@@ -110,6 +133,7 @@ METRICS: dict[type, tuple[tuple[_Metric, ...], tuple[_Metric, ...]]] = {
             _Metric("camera_rebuilds_total", "Receivers that were rebuilt", lambda c: c.rebuilt),
             _Metric("camera_latency_seconds", "Capture to decode", lambda c: _ms(c.latency_ms)),
         ),
+        (),
     ),
 }
 
@@ -155,11 +179,13 @@ class Metrics(Collector):
                 values = [((whose,), at) for whose, at in ends.items()]
                 yield self._family("certificate_expiry_timestamp_seconds", text, values, ("whose",))
         for kind, record in list(self._newest.items()):
-            of_all, of_camera = METRICS[kind]
+            of_all, of_camera, of_uplink = METRICS[kind]
             for metric in of_all:
                 yield from self._values(metric, {(): record}, ())
             for metric in of_camera:
                 yield from self._values(metric, {(name,): each for name, each in record.cameras.items()}, ("camera",))
+            for metric in of_uplink:
+                yield from self._values(metric, {(each.name,): each for each in _uplinks(record)}, ("uplink",))
 
     def _values(
         self, metric: _Metric, records: Mapping[tuple[str, ...], Any], labels: tuple[str, ...]
@@ -176,6 +202,13 @@ class Metrics(Collector):
         for own, value in values:
             metric.add_metric([self._vehicle, *own], value)
         return metric
+
+
+def _uplinks(record: Any) -> Iterator[_Uplink]:
+    """Those about which a record says something; none if the vehicle has one."""
+    for name, each in (record.uplinks or {}).items():
+        if own := each.measured if isinstance(record, Telemetry) else each:
+            yield _Uplink(name, own, record)
 
 
 def _free(directory: Path) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import secrets
 import time
 import uuid
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 from msgspec import UNSET, UnsetType
@@ -157,6 +157,7 @@ class Station:
         self.meters = {name: ReceptionMeter(each) for name, each in fps.items()}
         self.samples: Mapping[str, Reception] = {}
         self._rates: dict[str, MeasuredRates] = {}
+        self.uplinks: Sequence[UplinkRow] = ()  # none while the vehicle is offline
         self._late = LateCheck()
         self.latency = Latency(fps, self._cameras)
         self._run = secrets.randbits(32)  # identifies the reports of this process
@@ -246,7 +247,8 @@ class Station:
         for name, received in samples.items():
             self._rates[name] = self.meters[name].add(now, received, cameras.get(name))
         self.samples = samples
-        sample = self._sample(over)
+        sample, state = self._sample(over), self.state
+        self.uplinks = uplink_rows(state, sample.uplinks) if state else []
         for listener in self.listeners:
             listener.on_sample(sample)
 
@@ -274,11 +276,6 @@ class Station:
         clock = self.latency.clock
         latencies = f"latencies ± {1000 * clock.bound_s:.1f} ms" if clock else "latencies still unknown"
         return f"{self._vehicle.name}, mode {state.mode}, total {state.total_words} kbit/s, {latencies}"
-
-    def uplinks(self) -> list[UplinkRow]:
-        """One for each of several uplinks; none while the vehicle is offline."""
-        state = self.state  # another thread may replace it
-        return uplink_rows(state, _uplinks(self._telemetry)) if state else []
 
     def _sample(self, over: Mapping[str, Mapping[str, UplinkReceived]]) -> Sample:
         telemetry, clock = self._telemetry if self.state else None, self.latency.clock

@@ -54,7 +54,7 @@ def run(arguments: Arguments) -> int:
                 running = True
                 while running:  # once more after the end, to show the last notes
                     running = operator.runs(SHOW_S)
-                    table.show(station.rows(), station.headline(), station.uplinks())
+                    table.show(station.rows(), station.headline(), station.uplinks)
     show_summary(station.meters, station.samples)
     return stop.status
 

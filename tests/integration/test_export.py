@@ -337,7 +337,7 @@ def test_lines_become_messages_with_their_schemas_on_one_clock(tod, tmp_path):
     write(drive, "drive.jsonl", began("vehicle"), *VEHICLE, ENDED)
     write(drive, "operator.jsonl", began("operator", BEGAN + 1), SAMPLE, {"t": 0.5, "log": "note", "text": "hm"}, ENDED)
     link = {"t": 0.1, "log": "link", "kbps": 3000, "queue_ms": 4.5, "bytes": 1, "packets": 1, "dropped": 0}
-    write(drive, "link.jsonl", began("link"), link, ENDED)
+    write(drive, "link.jsonl", began("link"), link, link | {"lane": "b"}, ENDED)
     done = tod("export", str(drive))
     assert (done.status, done.err) == (0, "")
     topics = messages(drive / "drive.mcap")
@@ -351,6 +351,7 @@ def test_lines_become_messages_with_their_schemas_on_one_clock(tod, tmp_path):
         "/telemetry",
         "/operator/sample",
         "/link",
+        "/link/b",
     }
     for topic, (schema, channel, found) in topics.items():
         if channel.message_encoding != "json":
