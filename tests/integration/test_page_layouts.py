@@ -14,6 +14,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
+from msgspec import UNSET
 
 from browser import (
     SCREENS,
@@ -35,6 +36,7 @@ from browser import (
 from rig import SMALL_ROBOT, WAIT_S, answers, free_port, needs_browser, passes, process
 from runner.configuration.config import configuration
 from runner.configuration.layout import HEADER, NOWHERE, Layouts
+from runner.core import events
 from runner.core.decision import Believed
 from runner.core.events import parse
 from runner.core.model import plain
@@ -43,8 +45,9 @@ from runner.h264.access_unit import read_unit
 from runner.operator.station import LinkState
 from runner.page.server import PageServer
 from runner.page.viewer import PageViewer
+from runner.records.decisions import UplinkDecision
 from runner.records.operator import CameraSample, LatencyStages, Sample
-from runner.records.vehicle import CameraReading, CameraState, Outcome, Position, VehicleState
+from runner.records.vehicle import CameraReading, CameraState, Outcome, Position, UplinkMeasured, VehicleState
 
 pytestmark = [pytest.mark.gst, needs_browser]
 aiohttp = pytest.importorskip("aiohttp")
@@ -74,6 +77,14 @@ class Station(SimpleNamespace):
     def ask(self, document, on_reply):
         self.requests.append(document)
         on_reply(Outcome(0.0, "applied", ""))
+
+
+def over_two_uplinks(state):
+    """The state of a vehicle with two uplinks, one of which has stalled."""
+    believed = "capacity of the link, believed to be 4321"
+    uplinks = {"modem_1": UplinkDecision(15999, False, believed), "modem_2": UplinkDecision(50, True, believed)}
+    cameras = {name: replace(each, uplinks=("modem_1", "modem_2")) for name, each in state.cameras.items()}
+    return replace(state, cameras=cameras, uplinks=uplinks, believed=UNSET)
 
 
 @pytest.fixture(scope="module")
@@ -596,10 +607,12 @@ LIMITED = """async () => {
 def wide(cameras):
     """A sample in which captions, stages and totals are as long as they get."""
     stages = LatencyStages(100.5, 100.5, 100.5, 100.5, 100.5)
-    rates = (40.0, 5999.0, 5999, 5999, 0.125, 1920, 1200)
+    rates = {"fps": 40.0, "kbps": 5999.0, "allocated_kbps": 5999, "demand_kbps": 5999, "scaling": 0.125}
+    size = {"width": 1920, "height": 1200}
     counted = {"lost": 12345, "rebuilt": 12, "frames": 0, "bytes": 0, "damaged": 0, "arrivals": ()}
-    one = CameraSample(*rates, latency_ms=1250.0, **counted, buffer_ms=120, stages_ms=stages)
+    one = CameraSample(**rates, **size, latency_ms=1250.0, **counted, buffer_ms=120, stages_ms=stages)
     figures = {"cameras": dict.fromkeys(cameras, one), "speed_factor": 0.85, "clock_bound_ms": 120.0}
+    figures["uplinks"] = {"modem_1": UplinkMeasured(15999.0, 1234.0, 0.125, events.LinkState.FILLING, 30.0)}
     return Sample(0.0, 31999, 31999, 31999.0, Position(49.0, 8.4, 100.0), 0, **figures)
 
 
@@ -626,6 +639,7 @@ cameras:
 """
 FITS = {"outside": [], "cut": [], "low": [], "scrolls": False}
 OWNERS = {"paper": ["vehicle=tum_q7"], "robot": ["vehicle=delivery_robot"], "truck": ["vehicle=truck"]}
+TWO_UPLINKS = ("paper", "robot")  # those of the owners
 
 
 @pytest.mark.soak
@@ -638,6 +652,9 @@ def test_both_views_fit_every_screen(chromium, picture, tmp_path, owner):
         opened(chromium, server.url, 1920, 1080) as page,
     ):
         server.behind_s, server.sample = 1.25, wide(station.state.cameras)
+        if owner in TWO_UPLINKS:
+            station.state = over_two_uplinks(station.state)
+            server.on_state(station.state)
         controlling(page)
         all_live(page)
         front = next(name for name in station.state.cameras if name in ("front_center", "front", "cab"))
@@ -699,6 +716,8 @@ def test_eight_lost_pictures_are_named_in_full(chromium, picture):
             controlling(page)
             page.keyboard.press("v")
             until(lambda: page.inner_text("#worst-of") == "8 of 8 pictures not live")
+            server.on_state(over_two_uplinks(station.state))
+            until(lambda: page.locator("#drive-uplinks .uplink").count() == 2)
             page.evaluate(LIMITED)
             for width, height in ((1280, 720), (1024, 768), (1920, 1080)):
                 page.set_viewport_size({"width": width, "height": height})
@@ -972,9 +991,11 @@ STATES = [
 
 @pytest.mark.soak
 def test_every_text_is_readable_by_day_and_by_night(chromium, picture, tmp_path):
-    with served(picture, Layouts(tmp_path)) as (server, _), opened(chromium, server.url) as page:
+    with served(picture, Layouts(tmp_path)) as (server, station), opened(chromium, server.url) as page:
         all_live(page)
         controlling(page)
+        server.on_state(over_two_uplinks(station.state))
+        until(lambda: page.locator("#uplinks .uplink").count() == 2)
         found = []
 
         def look(view, root="body", on=page):

@@ -12,6 +12,7 @@ import { monitored, ownPictures } from "./monitored.js";
 import { showProblem } from "./requests.js";
 import { SHAPES } from "./tiles.js";
 import { limitReasons, pauseReason } from "./total.js";
+import { showUplinks, uplinkLines } from "./uplinks.js";
 import { byId, displayName, latency, setAttribute, setText, whole } from "./format.js";
 
 const MODES = { single: "Single", automatic: "Automatic", collective: "Collective" };
@@ -42,6 +43,7 @@ function refresh() {
   refreshLatency();
   refreshSpeed();
   setText(byId("line"), [MODES[mode() ?? ""] ?? "no mode", totalWords(), linkWords()].join(" · "));
+  showUplinks(byId("drive-uplinks"), isOnline() ? uplinkLines(store.state, store.sample) : []);
   refreshControl();
   for (const [part, before] of fitted) {
     const text = (part.textContent ?? "").replace(/\d/g, "0"); // all digits are equally wide

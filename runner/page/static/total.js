@@ -4,6 +4,7 @@ import { inControl, listen, mode, store } from "./store.js";
 import { pending, request, showProblem, whyNoControl } from "./requests.js";
 import { makeSlider } from "./slider.js";
 import { believedWords, furtherReasons } from "./believed.js";
+import { showUplinks, uplinkLines } from "./uplinks.js";
 import { byId, make, setText, whole } from "./format.js";
 
 const WHY = {
@@ -16,6 +17,7 @@ const requested = make("span", { class: "muted" }); // the total before rules lo
 const prediction = make("b", { class: "large" });
 const why = make("p", { class: "why" });
 const believed = make("p", { class: "why", id: "believed" });
+const uplinks = make("div", { id: "uplinks", "aria-label": "Uplinks" });
 const slider = makeSlider({
   label: "total bitrate",
   data: "total",
@@ -55,10 +57,13 @@ function refresh() {
   setText(requested, isLimited ? ` of ${whole(wanted)}` : "");
   setText(prediction, whole(store.sample?.predicted_kbps));
   const words = believedWords(mode() ? store.state?.believed : undefined);
-  const unlimited = mode() === "automatic" && words ? "" : reason ?? "shared among the cameras by demand and weight";
+  const lines = uplinkLines(store.state, store.sample);
+  const unlimited = mode() === "automatic" && (words || lines.length) ? "" : reason ?? "shared among the cameras by demand and weight";
   const reasons = limitReasons();
-  show(why, !isLimited ? unlimited : reasons.length ? furtherReasons(reasons, words).join("; ") : "limited by a rule");
+  const limit = lines.length ? "limited by the uplinks" : "limited by a rule";
+  show(why, !isLimited ? unlimited : reasons.length ? furtherReasons(reasons, words).join("; ") : limit);
   show(believed, words);
+  showUplinks(uplinks, lines);
   slider.update({ value: wanted, max: maxTotal(), why: reason });
 }
 
@@ -82,7 +87,7 @@ export function startTotal() {
   const unit = make("span", { class: "muted" }, " kbit/s");
   const predicted = make("div", { class: "prediction" }, make("span", {}, "Prediction "), prediction, unit);
   const inForce = make("div", {}, make("span", {}, "Total "), figure, requested, make("span", { class: "muted" }, " kbit/s"));
-  byId("total-panel").append(make("div", { class: "figures" }, inForce, predicted), slider.element, why, believed);
+  byId("total-panel").append(make("div", { class: "figures" }, inForce, predicted), slider.element, why, believed, uplinks);
   listen("hello state sample control requests socket", refresh);
   refresh();
 }
