@@ -265,10 +265,15 @@ class VehicleSide:
             if (pipeline := self._pipeline(name)) and pipeline.sent_frames
         }
 
-    def send_key_frames(self, cameras: Iterable[str]) -> None:
-        """Make the encoders of these cameras send key frames, as their graphs allow; unknown cameras are ignored."""
+    def send_key_frames(self, cameras: Iterable[str], *, begin_anew: bool = False) -> None:
+        """Make the encoders of these cameras send key frames, as their graphs allow; unknown cameras are ignored.
+
+        begin_anew  and send no earlier packet again
+        """
         for name in cameras:
             if name in self._wanted and (pipeline := self._pipeline(name)):
+                if begin_anew:
+                    pipeline.requests.begin_anew()
                 pipeline.send_key_frame()
 
     def stop(self) -> None:

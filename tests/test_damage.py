@@ -75,3 +75,11 @@ def test_units_missed_before_the_first_one_cause_damage() -> None:
         False,
     ]
     assert not Damage("vp8", is_damaged=True).is_damaged
+
+
+def test_a_key_picture_that_is_whole_heals_what_was_lost_before_it() -> None:
+    damage = Damage("h264")
+    assert damage.add(True, lambda: DELTA, whole=True)
+    assert not damage.add(True, lambda: KEY, whole=True)
+    assert not damage.is_damaged
+    assert damage.add(True, lambda: KEY, whole=False)

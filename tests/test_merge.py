@@ -7,8 +7,8 @@ from collections.abc import Iterable
 
 import pytest
 
-from runner.gst.arriving import NUMBERS, RTP_HZ, read_packet
-from runner.gst.merge import PAUSE_S, Merge
+from runner.gst.arriving import NUMBERS, RTP_HZ, Packet, read_packet
+from runner.gst.merge import PAUSE_S, TAKING_OVER_S, Merge, WholeFrames
 from runner.records.reception import UplinkReceived
 
 pytestmark = pytest.mark.gst  # the package runner.gst loads it
@@ -33,9 +33,10 @@ class Ways:
         for number in numbers:
             now, stamp = number / PER_S + delay_s, round(number * RTP_HZ / PER_S) % 2**32
             header = struct.pack("!BBHII", 0x80, kind, (FIRST + number) % NUMBERS, stamp, stream)
-            if self.merge.passes(header, read_packet(header, 1012), uplink, now, None):
+            packet = read_packet(header, 1012)
+            if self.merge.passes(header, packet, uplink, now, None):
                 passed.append(number)
-                self.merge.note_passed(stamp, now)
+                self.merge.note_passed(packet, now)
         return passed
 
 
@@ -103,3 +104,24 @@ def test_an_uplink_that_no_longer_carries_the_camera_is_not_awaited() -> None:
     ways.come(range(10), "b", 0.2)
     ways.come(range(10, 150), "a", 0.02)
     assert ways.merge.difference_s == 0
+
+
+def test_an_uplink_takes_over_from_one_that_has_failed() -> None:
+    ways = Ways()
+    ways.come(range(100), "a", 0.02)
+    ways.come(range(105, 110), "b", 0.03)
+    assert not ways.merge.has_taken_over(1.14), "too short a pause"
+    ways.come(range(130, 140), "b", 0.03)
+    assert not ways.merge.has_taken_over(1.43), "it had carried the stream before"
+    ways.come(range(220, 221), "a", 0.02)
+    assert ways.merge.has_taken_over(2.23)
+    assert not ways.merge.has_taken_over(2.25 + TAKING_OVER_S)
+
+
+def test_frames_of_which_all_packets_have_come() -> None:
+    frames = WholeFrames()
+    packets = [(5, 1.0, False), (6, None, True), (7, 1.1, True), (9, None, True), (10, 1.3, False)]
+    for number, captured, last in [*packets, (20, 1.5, False), (21, None, True), (24, None, True)]:
+        frames.add(Packet(number, 0, last, 1000, captured))
+    assert [frames.captured(stated) for stated in (1.0, 1.1, 1.2, 1.5)] == [1.0, 1.1, None, 1.5]
+    assert frames.captured(1.3) == 1.5, "its end has not come: the next one is output with its beginning"

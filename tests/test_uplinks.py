@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from fractions import Fraction
 from itertools import pairwise
+from math import inf
 from typing import Any
 
 from helpers import Drive, carries
@@ -17,6 +18,7 @@ from runner.core.step import start
 from runner.records.decisions import DecisionMade
 from runner.records.lines import line_from_json, line_to_json
 from runner.schema import log_problem
+from runner.vehicle.repair import cut_off
 
 CAMERAS = {
     "front": Wanted(6000, 4, redundant=True),
@@ -96,6 +98,15 @@ def test_a_camera_says_why_it_goes_where_it_does() -> None:
     alone = Rides({"left": Wanted(3000), "mast": Wanted(500)})
     alone.over(a=A, b=DEAD)
     assert alone.words()["mast"] == "over a and b: a copy keeps b measured"
+
+
+def test_what_takes_over_cameras_of_a_stalled_uplink_carries_little_more_than_before_at_first() -> None:
+    ride = Rides({"front": Wanted(800, redundant=True), "left": Wanted(1500), "right": Wanted(2500)})
+    ride.now = Placement({"front": ("a", "b"), "left": ("a",), "right": ("a",)})
+    ride.t = 100.0
+    assert ride.over(0.1, a=DEAD, b=B)["left"] == ("b",)
+    assert [ride.now.most("b", 100 + after) for after in (0, 0.2, 0.25, 0.5, 2.1)] == [1600, 1600, 3200, 6400, inf]
+    assert ride.now.most("a", 100) == inf
 
 
 def test_if_all_uplinks_stall_every_camera_stays() -> None:
@@ -220,6 +231,28 @@ def test_a_stalled_uplink_takes_nothing_from_the_redundant_camera() -> None:
     assert all(each.uplinks == ("a",) for name, each in ride.run.decision.settings.items() if name != "front")
     assert ride["front"].kbps > 0.6 * before
     assert ride.load("a") <= float(ride.run.decision.uplinks["a"].total)
+
+
+def test_cameras_that_get_less_than_their_stalled_uplink_gave_them_are_cut_off() -> None:
+    ride = Vehicle()
+    ride.drive(20, a=3000, b=1000)
+    before = ride.run.decision
+    moved = [name for name, each in before.settings.items() if each.uplinks == ("a",)]
+    assert moved
+    ride.measured(ride.run.state.t + 0.1, "a", 0, state="stalled", evidence={"silent_s": 0.1})
+    after = ride.run.decision
+    assert cut_off(before, after) == moved
+    assert sum(after.settings[name].kbps for name in before.settings) <= 1000
+    assert cut_off(after, after) == []
+    louder = {name: replace(each, kbps=9999) for name, each in after.settings.items()}
+    assert cut_off(before, replace(after, settings=louder)) == []
+
+
+def test_with_both_uplinks_stalled_the_redundant_camera_gets_what_the_worse_would_give_it() -> None:
+    ride = Vehicle()
+    ride.drive(20, a=3000, b=1500)
+    ride.drive(0.2, a=None, b=None)
+    assert ride["front"].kbps <= ride.run.decision.uplinks["b"].total
 
 
 def test_an_uplink_that_the_vehicle_does_not_have_is_refused() -> None:

@@ -18,6 +18,10 @@ from runner.core.model import Kbps
 MOVES, MOVES_S = 2, 60.0  # a camera moves at most so often in that time, unless its uplink stalls
 SETTLE_S = 2.0  # between two moves, so that the beliefs can follow
 OVERLAP_S = 0.4  # both uplinks carry a camera that moves, longer than any jitter buffer waits: nothing is missing
+# An uplink that takes over cameras of a stalled one has carried less until now, and may carry less than is believed. At
+# first it is to carry so many times as much as before, then again so many times as much after each GROWTH_S, until
+# GROWN_S have passed.
+GROWTH, GROWTH_S, GROWN_S = 2.0, 0.25, 2.0
 GAIN = 0.05  # by how much a move raises the weighted mean of ln(b_alloc / b_dem) at least
 LEAST = 1e-3  # share of its demand that a camera without any bitrate counts as having
 # An uplink carries copies of redundant cameras from this share of what the best uplink would give them, and then down
@@ -60,6 +64,7 @@ class Placement:
     clear    by uplink: since when it has not been stalled, s; inf while it is
     came     by camera that is on another uplink than at first: why, in words
     why      by camera: why these uplinks, in words; none where each is as good
+    taken    by uplink: when it took over cameras of a stalled one, s, and what it may have carried until then, kbit/s
     """
 
     uplinks: Mapping[str, tuple[str, ...]] = field(default_factory=lambda: NOTHING)
@@ -69,6 +74,12 @@ class Placement:
     clear: Mapping[str, float] = field(default_factory=lambda: NOTHING)
     came: Mapping[str, str] = field(default_factory=lambda: NOTHING)
     why: Mapping[str, str] = field(default_factory=lambda: NOTHING)
+    taken: Mapping[str, tuple[float, float]] = field(default_factory=lambda: NOTHING)
+
+    def most(self, uplink: str, t: float) -> float:
+        """What an uplink may carry at time t at most, kbit/s."""
+        since, kbps = self.taken.get(uplink, (-inf, inf))
+        return inf if t - since > GROWN_S else kbps * GROWTH ** (1 + int((t - since) / GROWTH_S))
 
 
 def place(
@@ -108,6 +119,10 @@ def place(
             came[name] = f"moved from {own[name]} at {t:.1f} s, which gives less"
             left[name], own[name] = (own[name], t + OVERLAP_S), move[1]
             moved[name], last = (*moved.get(name, ()), t), t
+    taken = {name: each for name, each in before.taken.items() if t - each[0] <= GROWN_S}
+    for name in {own[camera] for camera in homeless if camera in before.uplinks} - taken.keys():
+        had = sum(each.kbps for camera, each in cameras.items() if name in before.uplinks.get(camera, ()))
+        taken[name] = t, min(had, uplinks[name].kbps)
     everywhere = (*carriers, *(name for name in uplinks if name not in living))
     at = {name: (own[name],) if name in own else _as_before(everywhere, before, name, living) for name in cameras}
     at |= {name: (*at[name], uplink) for name, (uplink, _) in left.items() if uplink not in at[name]}
@@ -119,7 +134,7 @@ def place(
     )
     for name, copies in copied.items():
         why[name] = ", ".join(filter(None, (why.get(name), f"a copy keeps {_and(copies)} measured")))
-    return Placement(at, moved, last, left, clear, came, why)
+    return Placement(at, moved, last, left, clear, came, why, taken)
 
 
 def in_words(uplinks: Sequence[str], why: str | None) -> str:

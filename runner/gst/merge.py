@@ -6,7 +6,9 @@ Before the RTP session: twins of equal delay would never get through it, others 
 from __future__ import annotations
 
 from array import array
+from collections import deque
 from dataclasses import dataclass, field
+from math import inf
 
 from runner.gst.arriving import NUMBERS, RTP_HZ, ArrivingFrames, MediaClock, Packet, ShortestTransit, signed
 from runner.records.reception import UplinkReceived
@@ -16,8 +18,12 @@ from runner.records.reception import UplinkReceived
 # started anew.
 LATE_S, RESTART_S = 1.0, 2.0
 PAUSE_S = 1.0  # of media time
+SILENT_S = 0.1  # once the uplink that carried a stream has delivered nothing for so long, it is taken to be cut
+TAKING_OVER_S = 0.2  # what a camera's former uplink has swallowed is awaited for less, which takes at most so long
 CURRENT_S = 1.0  # an uplink carries a stream this long after its last packet
 LOOK_S = 0.02  # between two looks at how far the uplinks differ
+FRAMES = 64  # of which it is remembered that all packets have come
+SAME_S = 0.001  # two capture times of one frame, which are rounded differently
 MOST_STREAMS = 4  # whose numbers are remembered; a camera has two, that of repeated packets included
 
 
@@ -48,6 +54,37 @@ class _Uplink:
         self.frames.add(packet, now, arrived)
 
 
+class WholeFrames:
+    """Which frames have come without a gap, from their first packet, which states the capture time, to their last."""
+
+    def __init__(self) -> None:
+        self._captured: float | None = None  # of the frame whose packets have come so far; None: not all have
+        self._open: float | None = None  # capture time of the frame that has begun and not ended
+        self._next = 0  # number of its next packet
+        # Capture times of whole frames, with that of the frame before, if its end has not come: the depayloader then
+        # outputs a frame with what it has of that one, and with its time.
+        self._found: deque[tuple[float, float]] = deque(maxlen=FRAMES)
+        self._joined = 0.0
+
+    def add(self, packet: Packet) -> None:
+        """Add a packet that is newer than all earlier ones."""
+        if packet.captured is not None:
+            self._joined = packet.captured if self._open is None else self._open
+            self._captured = self._open = packet.captured
+        elif packet.number != self._next:
+            self._captured = None
+        self._next = (packet.number + 1) % NUMBERS
+        if packet.last:
+            if self._captured is not None:
+                self._found.append((self._captured, self._joined))
+            self._open = None
+
+    def captured(self, stated: float) -> float | None:
+        """Capture time of the whole frame in a unit that states a time; None: there is none. From any thread."""
+        found = (own for own, joined in tuple(self._found) if min(abs(stated - own), abs(stated - joined)) < SAME_S)
+        return next(found, None)
+
+
 class Merge:
     """Decides which packets of a camera go on. The thread in which packets arrive uses it; any other one reads counts.
 
@@ -55,6 +92,7 @@ class Merge:
                   replace the true one with its number: twins are only counted, and dropped there
 
     payload_type  of the camera's packets; others are repeated on request. None: not known yet
+    whole         frames of which all packets have come
     difference_s  how much longer packets take by the slowest uplink that carries the stream than by the fastest one
     """
 
@@ -65,7 +103,9 @@ class Merge:
         self._seen: dict[int, array[int]] = {}  # by stream (SSRC), and by number, the timestamp of the last packet
         self._clock = MediaClock(1 / RTP_HZ)
         self._newest: tuple[int, float] | None = None  # timestamp, and when it came
+        self.whole = WholeFrames()
         self._looked = self.difference_s = 0.0
+        self._taken_over = -inf  # when an uplink last began to carry the stream after a pause
 
     def passes(self, header: bytes, packet: Packet, uplink: str | None, now: float, arrived: float | None) -> bool:
         """Count a packet; returns whether it goes on.
@@ -85,17 +125,24 @@ class Merge:
         return not (is_late or (is_twin and self._is_authentic))
 
     def _add(self, own: _Uplink, packet: Packet, now: float, arrived: float | None, *, is_late: bool) -> None:
-        is_new = now - own.at > CURRENT_S
+        is_new, silent_s = now - own.at > CURRENT_S, now - max(each.at for each in self._uplinks.values())
         own.add(packet, now, arrived)
         if not is_late:
+            if is_new and silent_s > SILENT_S:
+                self._taken_over = now
             self._clock.tick(packet.stamp)
             own.transit.add((arrived or now) - self._clock.seconds, now)
         if is_new or now - self._looked > LOOK_S:
             self.look(now)
 
-    def note_passed(self, stamp: int, now: float) -> None:
+    def note_passed(self, packet: Packet, now: float) -> None:
         """A packet has passed, authentic and newer than all earlier ones."""
-        self._newest = stamp, now
+        self._newest = packet.stamp, now
+        self.whole.add(packet)
+
+    def has_taken_over(self, now: float) -> bool:
+        """Whether an uplink has just begun to carry the stream after a pause: its former one has failed."""
+        return now - self._taken_over < TAKING_OVER_S
 
     def look(self, now: float) -> None:
         """Find out how far the uplinks differ that carry the stream now."""

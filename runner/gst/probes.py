@@ -64,6 +64,7 @@ _extract = _function("gst_buffer_extract", c_size_t, c_void_p, c_size_t, c_char_
 _get_reference = _function("gst_buffer_get_reference_timestamp_meta", POINTER(_ReferenceTimestamp), c_void_p, c_void_p)
 _get_structure = _function("gst_event_get_structure", c_void_p, c_void_p)
 _get_name = _function("gst_structure_get_name", c_char_p, c_void_p)
+_get_uint = _function("gst_structure_get_uint", c_int, c_void_p, c_char_p, POINTER(c_uint))
 _pointer = ctypes.pythonapi.PyCapsule_GetPointer
 _pointer.restype, _pointer.argtypes = c_void_p, (ctypes.py_object, c_char_p)
 
@@ -249,10 +250,10 @@ class RequestProbe(_Probe):
     """Asks a method of its owner, which it does not keep alive, whether a custom event may go upstream.
 
     name        of the events; others pass
-    is_granted  called in a streaming thread for each
+    is_granted  called in a streaming thread for each, with the sequence number that it asks for; None: it has none
     """
 
-    def __init__(self, name: str, is_granted: Callable[[], bool]) -> None:
+    def __init__(self, name: str, is_granted: Callable[[int | None], bool]) -> None:
         super().__init__(Gst.PadProbeType.EVENT_UPSTREAM)
         self._name, self._is_granted = name.encode(), WeakMethod(is_granted)
 
@@ -262,8 +263,13 @@ class RequestProbe(_Probe):
         if is_granted is None or _Typed.from_address(address).type != _CUSTOM_UPSTREAM:
             return Gst.PadProbeReturn.OK
         structure = _get_structure(address)
-        dropped = structure and _get_name(structure) == self._name and not is_granted()
+        dropped = structure and _get_name(structure) == self._name and not is_granted(_number(structure))
         return Gst.PadProbeReturn.DROP if dropped else Gst.PadProbeReturn.OK
+
+
+def _number(structure: int) -> int | None:
+    number = c_uint()
+    return number.value if _get_uint(structure, b"seqnum", number) else None
 
 
 _CUSTOM_UPSTREAM = int(Gst.EventType.CUSTOM_UPSTREAM)

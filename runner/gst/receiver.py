@@ -310,6 +310,12 @@ class Receiver:
     def _on_arrival(self, pad: Gst.Pad, buffer: PassingBuffer) -> bool:
         """An access unit has arrived; page and log share its times."""
         arrived, monotonic, size, captured = time.time(), time.monotonic(), buffer.size, _captured(pad, buffer)
+        # The depayloader marks the very first unit, and each unit with missing packets.
+        incomplete, self._begun = self._begun and buffer.has_flags(Gst.BufferFlags.DISCONT), True
+        whole = self.rtp.whole(captured) if incomplete else None
+        damaged = self._damage.add(incomplete, lambda: buffer.extract(0, HEAD_BYTES), whole=whole is not None)
+        if not damaged and whole is not None:
+            captured = whole
         self._entered = (buffer.pts, monotonic)
         if captured is not None:
             self.newest = Arrival(monotonic, captured, size)
@@ -317,9 +323,6 @@ class Receiver:
             self._arrivals.append((arrived, captured))
         self._bytes += size
         self._frames += 1  # after its arrival is recorded: no sample counts a frame without one
-        # The depayloader marks the very first unit, and each unit with missing packets.
-        incomplete, self._begun = self._begun and buffer.has_flags(Gst.BufferFlags.DISCONT), True
-        damaged = self._damage.add(incomplete, lambda: buffer.extract(0, HEAD_BYTES))
         self._damaged += damaged
         if self._on_unit:
             unit = read_unit(buffer.extract(0, size), captured, arrived, damaged=incomplete, codec=self._codec)

@@ -83,12 +83,19 @@ class RepairBuffer:
 
     def adapt(self) -> int:
         """Adapt the wait for missing packets to the round trip; returns it, ms. A few times a second."""
-        round_trip_ms = self._buffer.get_property("stats").get_value("rtx-rtt") / Gst.MSECOND or INITIAL_RTT_MS
         self._update_congestion()
+        attempts = ATTEMPTS
         if self._merge:
-            self._merge.look(time.monotonic())
+            now = time.monotonic()
+            self._merge.look(now)
             self._await_others(self._merge)
-        wait_ms = self._reorder_ms + max(self._others_ms, 0 if self._congested else round(ATTEMPTS * round_trip_ms))
+            attempts = 1 if self._merge.has_taken_over(now) else ATTEMPTS
+        return self._wait(attempts)
+
+    def _wait(self, attempts: int) -> int:
+        """Wait until a packet can have been requested so often; returns for how long, ms."""
+        round_trip_ms = self._buffer.get_property("stats").get_value("rtx-rtt") / Gst.MSECOND or INITIAL_RTT_MS
+        wait_ms = self._reorder_ms + max(self._others_ms, 0 if self._congested else round(attempts * round_trip_ms))
         wait_ms = max(self._reorder_ms, min(LONGEST_MS, wait_ms))
         if self._buffer.get_property("latency") != wait_ms:
             self._buffer.set_property("latency", wait_ms)
@@ -171,8 +178,10 @@ class RepairBuffer:
         if not self.frames.add(packet, now, arrived, retransmitted=retransmitted):
             return False
         if self._merge:
-            self._merge.note_passed(packet.stamp, now)
+            self._merge.note_passed(packet, now)
             self._await_others(self._merge)
+            if self._merge.has_taken_over(now):  # the buffer sees what is missing in a moment
+                self._wait(1)
         if self._tail_requested and retransmitted:
             buffer.unset_flags(RETRANSMITTED)  # the buffer drops retransmissions that it has not requested itself
         if packet.last:
@@ -240,6 +249,10 @@ class RtpSession:
     def waited_ms(self) -> float | None:
         """How long the end of a recent frame waited; None: unknown. A few times a second."""
         return max((ms for buffer in self._buffers if (ms := buffer.waited_ms()) is not None), default=None)
+
+    def whole(self, captured: float | None) -> float | None:
+        """See `runner.gst.merge.WholeFrames.captured`; None if that is not known, as with one uplink."""
+        return None if captured is None or self.uplinks is None else self.uplinks.merge.whole.captured(captured)
 
     def request_tails(self) -> None:
         """Request missing packets at the end of a frame (tail loss); to be called a hundred times a second."""

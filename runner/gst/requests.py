@@ -17,6 +17,7 @@ from runner.gst.probes import RequestProbe
 REPEATED, SHARED = 0.5, 1 / 15
 AT_ONCE = 300  # packets resent at once, as after a short outage: 0.4 s of 8 Mbit/s
 SHARED_AT_ONCE = 50  # to each of several viewers
+STORED = 0x8000  # packets that may be asked for: an older number is that of a newer one
 REMEMBERED = 16  # viewers, the latest ones
 KEY_UNIT_S = 1.0  # between two requests for a key frame
 
@@ -58,6 +59,7 @@ class RequestLimit:
         self._asking = 0  # SSRC of the viewer whose request is being handled
         self._key_unit: float | None = None  # when the last one was granted
         self._reported = False
+        self._given_up: int | None = None  # number of the last packet that is not resent; None: there is none
         self._retransmissions = RequestProbe("GstRTPRetransmissionRequest", self._grant_retransmission)  # NACK
         self._key_units = RequestProbe("GstForceKeyUnit", self.grant_key_unit)  # PLI, FIR
         self._key_units.add_to(packets)
@@ -71,8 +73,15 @@ class RequestLimit:
         """The RTP session by which viewers request packets."""
         element.get_property("internal-session").connect("on-feedback-rtcp", _on_feedback, weakref.ref(self))
 
-    def _grant_retransmission(self) -> bool:
+    def begin_anew(self) -> None:
+        """Resend none of the packets that have been sent. From any thread."""
+        if self._has_payloader:
+            self._given_up = self._payloader.get_property("seqnum")
+
+    def _grant_retransmission(self, number: int | None) -> bool:
         sent: int = self._payloader.get_property("seqnum")
+        if self._is_given_up(number, sent):
+            return False
         share, most = (SHARED, SHARED_AT_ONCE) if self.viewers > 1 else (REPEATED, AT_ONCE)
         self._all.earn(sent, REPEATED)
         self._new.earn(sent, share)
@@ -86,6 +95,15 @@ class RequestLimit:
         viewer.packets -= 1
         return True
 
+    def _is_given_up(self, number: int | None, sent: int) -> bool:
+        given_up = self._given_up  # another thread may set it
+        if given_up is None or number is None:
+            return False
+        since = (sent - given_up) % 65536
+        if since > STORED:  # it is not stored any more; the numbers will come round again
+            self._given_up = None
+        return since <= (sent - number) % 65536 <= STORED
+
     def _admit(self, sent: int, most: int) -> _Allowance:
         """A new viewer."""
         first = min(most, self._new.packets)
@@ -94,7 +112,7 @@ class RequestLimit:
             self._by_viewer.popitem(last=False)
         return _Allowance(sent, first)
 
-    def grant_key_unit(self) -> bool:
+    def grant_key_unit(self, _number: int | None = None) -> bool:
         """Whether a viewer may have a key frame now, which all others receive too."""
         now = time.monotonic()
         if self._key_unit is not None and now - self._key_unit < KEY_UNIT_S:

@@ -24,12 +24,16 @@ class Damage:
         self.is_damaged = is_damaged and codec in CODECS  # until the picture is healed
         self._left: int | None = None  # remaining frames of the healing wave; None: none has begun since the loss
 
-    def add(self, incomplete: bool, head: Callable[[], bytes]) -> bool:
+    def add(self, incomplete: bool, head: Callable[[], bytes], *, whole: bool = False) -> bool:
         """Add the next access unit; returns whether its picture is damaged.
 
         incomplete  packets of it, or between it and the previous one, were lost
         head        returns its first HEAD_BYTES; called only while the picture is damaged
+        whole       whether all packets of its newest picture are known to have come nevertheless
         """
+        if incomplete and whole and self._codec in CODECS and starts(head(), self._codec)[0]:
+            self.is_damaged, self._left = False, None
+            return False
         if incomplete:
             self.is_damaged, self._left = self._codec in CODECS, None
             return True

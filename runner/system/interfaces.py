@@ -9,6 +9,8 @@ from fcntl import ioctl
 from ipaddress import IPv6Address
 from pathlib import Path
 
+from runner.settings import Uplink
+
 SIOCGIFADDR, IFREQ = 0x8915, "16s2xH4s16x"  # linux/sockios.h; struct ifreq with a struct sockaddr_in
 IF_INET6, GLOBAL = Path("/proc/self/net/if_inet6"), "00"  # scope there
 
@@ -27,6 +29,11 @@ def addresses_of(interface: str) -> tuple[str, ...]:
         answer = ioctl(probe, SIOCGIFADDR, struct.pack(IFREQ, interface.encode(), 0, bytes(4)))
         return (socket.inet_ntoa(struct.unpack(IFREQ, answer)[2]), *_ipv6_of(interface))
     return tuple(_ipv6_of(interface))
+
+
+def addresses_by(uplink: Uplink) -> tuple[str, ...]:
+    """From which packets may come that leave by an uplink: none while its device is missing or has none."""
+    return (uplink.address,) if uplink.address else addresses_of(uplink.interface or "")
 
 
 def _ipv6_of(interface: str) -> list[str]:

@@ -32,16 +32,16 @@ from runner.pqos import Predictions
 from runner.records.reception import ReceptionReport, ReceptionReported, SentFrame, UplinkSent
 from runner.records.vehicle import CameraReading, CameraTelemetry, Outcome, SenderStages, Telemetry
 from runner.schema import event_problem, shortened
-from runner.settings import Setup, Uplink
+from runner.settings import Setup
 from runner.system.held_up import LateCheck
-from runner.system.interfaces import addresses_of
+from runner.system.interfaces import addresses_by
 from runner.system.reports import LimitedReports, RepeatedReports
 from runner.vehicle.access import Access
 from runner.vehicle.inbox import MAX_QUEUED, Answer, Inbox, Item, QueuedReport, Request
 from runner.vehicle.operators import SILENT_S, Operators
 from runner.vehicle.publishing import Publish, Publisher
 from runner.vehicle.refusals import Refusals
-from runner.vehicle.repair import KeyFrames
+from runner.vehicle.repair import KeyFrames, cut_off
 from runner.vehicle.replies import Replies
 from runner.vehicle.sending import SendingTimes
 from runner.vehicle.uplink import MeasuredUplinks
@@ -62,7 +62,7 @@ class Applier(Protocol):
     def sent_frames(self) -> Mapping[str, Iterable[SentFrame]]: ...
     def sent(self) -> Mapping[str, Mapping[str, UplinkSent]]: ...
     def give_control(self, operator: str) -> None: ...
-    def send_key_frames(self, cameras: Iterable[str]) -> None: ...
+    def send_key_frames(self, cameras: Iterable[str], *, begin_anew: bool = False) -> None: ...
 
 
 class Listener(Protocol):
@@ -361,6 +361,8 @@ class ControlLoop:
         before, self._run = self._run, after
         try:
             self.applier.turn(after.commands)
+            if cameras := cut_off(before.decision, after.decision):
+                self.applier.send_key_frames(self._key_frames.due(cameras, event.t), begin_anew=True)
         except Exception:
             self._run = replace(after, commanded=before.commanded)  # the next event repeats the commands
             raise
@@ -396,7 +398,7 @@ class ControlLoop:
         self._replies.settle(self._run, self._cameras, now)
 
     def _publish_measured(self, t: float) -> None:
-        addresses = {name: _addresses(each) for name, each in self.setup.uplinks.items()}
+        addresses = {name: addresses_by(each) for name, each in self.setup.uplinks.items()}
         sent = self.applier.sent() if addresses else {}
         telemetry = self._publisher.telemetry(
             self._run, t, self._cameras, self.applier.stages(), self.refusals.count, self.errors, addresses, sent
@@ -408,11 +410,6 @@ class ControlLoop:
 def _unsent(telemetry: Telemetry) -> Iterator[tuple[str, CameraTelemetry]]:
     """The cameras of telemetry without what only the log needs: each message takes from a limited link."""
     return ((name, replace(each, sent=UNSET)) for name, each in telemetry.cameras.items())
-
-
-def _addresses(uplink: Uplink) -> tuple[str, ...]:
-    """From which packets may come that leave by it: none while its device is missing or has none."""
-    return (uplink.address,) if uplink.address else addresses_of(uplink.interface or "")
 
 
 def _changes(before: Run, after: Run, event: Event) -> Iterator[str]:

@@ -1,9 +1,11 @@
-"""Key frames that repair pictures after packet loss. Pure: time is passed in."""
+"""Key frames that repair pictures after packet loss, or after an uplink has failed. Pure: time is passed in."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+
+from runner.core.decision import Decision
 
 KEY_FRAME_S = 0.5  # between two of a camera: each costs bits of the next pictures
 
@@ -17,3 +19,19 @@ class KeyFrames:
         due = sorted(name for name in damaged if t - self._sent.get(name, -KEY_FRAME_S) >= KEY_FRAME_S)
         self._sent |= dict.fromkeys(due, t)
         return due
+
+
+def cut_off(before: Decision, after: Decision) -> list[str]:
+    """The cameras whose uplinks have all just stalled, and whose new one gives them less than they had.
+
+    What the stalled ones have swallowed would take longer to send again than it took to send, and delay what follows.
+    """
+    return [
+        name
+        for name, now in after.settings.items()
+        if (had := before.settings[name].uplinks)
+        and now.uplinks
+        and now.uplinks[0] not in had
+        and all(after.uplinks[uplink].stalled for uplink in had)
+        and now.kbps < before.settings[name].kbps
+    ]

@@ -77,7 +77,7 @@ class RecordingVehicle:
     def sent(self) -> dict[str, dict[str, UplinkSent]]:
         return {}
 
-    def send_key_frames(self, cameras: Iterable[str]) -> None:
+    def send_key_frames(self, cameras: Iterable[str], *, begin_anew: bool = False) -> None:
         self.key_frames += cameras
 
     def give_control(self, operator: str) -> None:

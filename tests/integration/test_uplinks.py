@@ -49,8 +49,8 @@ class Vehicle:
         assert self._process.stdout
         return json.loads(self._process.stdout.readline())
 
-    def carry(self, *uplinks: str) -> Any:
-        return self._ask(carry={CAMERA: uplinks})
+    def carry(self, *uplinks: str, anew: bool = False) -> Any:
+        return self._ask(carry={CAMERA: uplinks}, anew=[CAMERA] * anew)
 
     def _ask(self, **what: Any) -> Any:
         assert self._process.stdin
@@ -321,6 +321,26 @@ def test_an_uplink_whose_device_comes_back_with_another_address_is_used_again(tm
         check_every_picture(operator)
         assert operator.side.received()[CAMERA]["b"].packets > FPS
         assert vehicle.reported[2:] == ["uplink b: works again"]
+
+
+@needs_root
+def test_a_camera_whose_uplink_is_cut_goes_on_with_a_key_picture_by_the_other(tmp_path: Path) -> None:
+    """At once: what the other has swallowed is neither sent again, nor awaited for long. Nothing is shown damaged."""
+    with drive(tmp_path, keys=False) as (ways, vehicle, operator):
+        ways["a"].delay_s = ways["b"].delay_s = FAST_S
+        vehicle.carry("a")
+        operator.watch(1.5)
+        repeated: list[int] = []
+        ways["b"].seen = lambda packet: repeated.append(payload_type(packet)) or True  # type: ignore[func-returns-value]
+        ways["a"].is_cut = True
+        time.sleep(0.3)
+        shown = len(operator.units)
+        vehicle.carry("b", anew=True)
+        operator.watch(1)
+        first, *_ = (unit for unit in operator.units[shown:] if unit[1])
+        assert first[2] - (first[0] + time.monotonic() - time.time()) < 0.25
+        assert REPEATED not in repeated
+        assert operator.sample().damaged <= 1, "the picture that was being encoded at that moment"
 
 
 def payload_type(packet: bytes) -> int:

@@ -3,7 +3,7 @@
     python vehicle_on_ways.py '{"words": [OVERRIDE...], "uplinks": {NAME: {"interface": DEVICE}}, "number": FIRST}'
 
 `number` is the RTP sequence number of each camera's first packet. A line {"carry": {CAMERA: [UPLINK...]}} places
-cameras, {} does nothing. Each is answered: what was sent by camera and uplink, and what was reported so far.
+cameras, {"anew": [CAMERA...]} lets them begin anew with a key picture, {} does nothing. Each is answered: what was sent by camera and uplink, and what was reported so far.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from dataclasses import replace
 
 from runner import apply
 from runner.configuration.config import configuration
+from runner.core.commands import Command
 from runner.graph import Plan
 from runner.plans import compile_plans
 from runner.records import to_json
@@ -40,10 +41,13 @@ def main(given: str) -> None:
         keyring=keyring,
         uplinks=uplinks,
     )
+    cameras = setup.vehicle.cameras.values()
+    side.turn(Command(camera.name, "size", (camera.full_roi.width, camera.full_roi.height)) for camera in cameras)
     print(json.dumps({}), flush=True)
     for line in sys.stdin:
         wanted = json.loads(line)
         side.carry(wanted.get("carry", {}))
+        side.send_key_frames(wanted.get("anew", ()), begin_anew=True)
         print(json.dumps({"sent": to_json(side.sent()), "reported": reported}), flush=True)
     side.stop()
 

@@ -47,7 +47,9 @@ def _shared(vehicle: Vehicle, state: State, draft: Draft, wanted: Mapping[str, K
         for name, uplinks in draft.placed.items()
         if vehicle.cameras[name].redundant
     }
-    limits = {name: living.get(name) or uplinks[:1] for name, uplinks in draft.placed.items()}
+    limits = {
+        name: (living[name] or uplinks) if name in living else uplinks[:1] for name, uplinks in draft.placed.items()
+    }
     totals = {name: share.total for name, share in draft.uplinks.items()}
     return shared(limits, totals, wanted, partial(_shared_among, vehicle, state))
 
