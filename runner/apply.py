@@ -153,6 +153,7 @@ class VehicleSide:
     keyring    of this vehicle: viewers authenticate, and everything is encrypted; None: neither
     lost       by camera whose source does not open, why: it is tried again, and started once it does
     uplinks    by name, see `runner.gst.uplinks`; none: the system's routes decide
+    may_listen  whether viewers may also connect at an address of these
     raises     RunError if the port is in use, or a plugin that `video` needs is not installed
 
     `on_turned` is called, from any thread, after knobs were set and read back: `applied` may have changed.
@@ -167,9 +168,11 @@ class VehicleSide:
         keyring: Keyring | None = None,
         lost: Mapping[str, str] = NOTHING,
         uplinks: Mapping[str, Uplink] = NOTHING,
+        may_listen: Callable[[str], bool] = lambda address: False,
     ) -> None:
         self._on_report, self._video = on_report, video
-        self._uplinks = import_module("runner.gst.uplinks").VehicleUplinks(uplinks, on_report) if uplinks else None
+        kind = import_module("runner.gst.uplinks").VehicleUplinks if uplinks else None
+        self._uplinks = kind and kind(uplinks, on_report, may_listen)
         passphrase = keyring.watched_passphrase(lambda what: on_report("keys", what)).get if keyring else None
         plans = _with_clip_range(_with_video(plans, video, "vehicle"))
         self._lock = threading.Lock()

@@ -24,12 +24,13 @@ from runner.gst.connections import RtspConnection
 from runner.gst.left import LeftCameras
 from runner.gst.memory import give_back
 from runner.gst.opening import ServedCameras
+from runner.gst.other_servers import OtherServers
 from runner.gst.pipeline import Openings
 from runner.gst.rtsp_requests import camera_name, has_password, has_query, path
 from runner.gst.sessions import SessionPool, is_held, on_session_removed
 from runner.gst.timers import every
 from runner.gst.viewers import over_uplink
-from runner.settings import Media
+from runner.settings import Endpoint, Media
 from runner.system.ports import check_port_free, ip_address_of
 from runner.system.reports import LimitedReports
 
@@ -81,26 +82,36 @@ class CameraServer:
         self.pipelines = self._cameras.pipelines
         self.admission = Admission(self._cameras, self._clients, self._keys, media.max_viewers)
         self._left = LeftCameras(self._clients, self.pipelines)
-        self._server = GstRtspServer.RTSPServer()
-        self._server.set_address(ip_address_of(media.host))  # of a name with several, IPv4
-        self._server.set_service(str(media.port))
-        self._server.set_backlog(BACKLOG)
-        self._server.set_content_length_limit(MAX_BODY_BYTES)
-        self._server.set_thread_pool(self._cameras.threads)
-        if self._keys:
-            self._server.set_auth(self._keys.auth)
-        self._server.connect("client-connected", self._on_connected)
-        self._server.set_session_pool(SessionPool())
-        self._server.get_session_pool().connect("session-removed", on_session_removed)
+        self._sessions, self._mounts = SessionPool(), GstRtspServer.RTSPMountPoints()
+        self._sessions.connect("session-removed", on_session_removed)
         for name, camera in self._cameras.named.items():
             for mount in (name, f"{name}/{FEEDBACK}"):
-                self._server.get_mount_points().add_factory(f"/{mount}", camera.factory)
+                self._mounts.add_factory(f"/{mount}", camera.factory)
+        own = ip_address_of(media.host)  # of a name with several, IPv4
+        self._server = self._make_server(own)
         self._attached = self._server.attach(None)
         if not self._attached:
             raise RunError(f"the RTSP server cannot listen on {media}; choose another media.port")
+        others = openings.uplinks.listening if openings.uplinks else dict
+        self._others = OtherServers(self._make_server, others, Endpoint(own, media.port), on_report)
         watches = (self._watch_connections, *((self._watch_keys,) if self._keys else ()))
         self._watches = [every(WATCH_MS, watch, lambda what: on_report("viewers", what)) for watch in watches]
         threading.Thread(target=self._expire_sessions, name="rtsp-sessions", daemon=True).start()
+
+    def _make_server(self, address: str) -> GstRtspServer.RTSPServer:
+        """One that serves the same as all others, at an address of its own."""
+        server = GstRtspServer.RTSPServer()
+        server.set_address(address)
+        server.set_service(str(self._media.port))
+        server.set_backlog(BACKLOG)
+        server.set_content_length_limit(MAX_BODY_BYTES)
+        server.set_thread_pool(self._cameras.threads)
+        if self._keys:
+            server.set_auth(self._keys.auth)
+        server.set_session_pool(self._sessions)
+        server.set_mount_points(self._mounts)
+        server.connect("client-connected", self._on_connected)
+        return server
 
     def stop(self) -> None:
         """Accept no more clients, and end every connection in its own thread.
@@ -111,6 +122,7 @@ class CameraServer:
         self._stopped.set()
         for source in (*self._watches, self._attached):
             GLib.source_remove(source)
+        self._others.stop()
         self._clients.close()
 
     # --- clients ------------------------------------------------------------------------------------------------------
@@ -255,6 +267,7 @@ class CameraServer:
             endless = {each for _, each in connections if each.unanswered_bytes() > MAX_REQUEST_BYTES}
         now = time.monotonic()
         self._left.look(now)
+        self._others.look(now)
         for name, pipeline in tuple(self.pipelines.items()):
             viewers = [each for each in self._clients.watching(name) if over_uplink(each.viewer.address)]
             pipeline.requests.viewers = sum(not each.interleaved for each in viewers)
@@ -294,7 +307,7 @@ class CameraServer:
 
         In a separate thread, since the end of the last session tears the pipeline down.
         """
-        pool, given_back = self._server.get_session_pool(), time.monotonic()
+        pool, given_back = self._sessions, time.monotonic()
         while not self._stopped.wait(SESSIONS_EVERY_S):
             if time.monotonic() - given_back > GIVE_BACK_S:
                 give_back()

@@ -26,6 +26,7 @@ from runner.gst.uplink_sockets import device_of, open_socket, sharing_ports
 from runner.gst.viewers import over_uplink
 from runner.records.reception import UplinkSent
 from runner.settings import Uplink
+from runner.system.interfaces import addresses_by
 
 FAMILIES = {"socket": socket.AF_INET, "socket-v6": socket.AF_INET6}  # by property of a multiudpsink
 COPIED = ("qos-dscp", "buffer-size", "send-duplicates")  # of the library's sink
@@ -44,11 +45,17 @@ Sockets = Mapping[str, Gio.Socket]  # by property of a multiudpsink
 class VehicleUplinks:
     """The uplinks of a vehicle, and which of them carry each camera: all, until `carry` says otherwise.
 
+    may_listen  returns whether viewers may connect at an address
     on_report  called, from any thread, with an uplink that cannot be used, and why, and when it can be again
     """
 
-    def __init__(self, uplinks: Mapping[str, Uplink], on_report: Callable[[str, str], None]) -> None:
-        self._uplinks, self._on_report = uplinks, on_report
+    def __init__(
+        self,
+        uplinks: Mapping[str, Uplink],
+        on_report: Callable[[str, str], None],
+        may_listen: Callable[[str], bool] = lambda address: False,
+    ) -> None:
+        self._uplinks, self._on_report, self._may_listen = uplinks, on_report, may_listen
         self._faults, self._lock = dict.fromkeys(uplinks, ""), threading.Lock()
         self._looked = 0.0
         self._carrying: dict[str, frozenset[str]] = {}
@@ -75,6 +82,11 @@ class VehicleUplinks:
         for camera in placed:
             if made := self._cameras.get(camera):
                 made.turn()
+
+    def listening(self) -> dict[str, str]:
+        """The addresses at which viewers may connect now, each with its device; "": its uplink names none."""
+        found = ((address, each.interface or "") for each in self._uplinks.values() for address in addresses_by(each))
+        return {address: device for address, device in found if self._may_listen(address)}
 
     def look(self) -> None:
         """Make sockets anew for devices that have come back; many times a second, from one thread."""

@@ -33,6 +33,15 @@ def keyring_of(setup: Setup, *needed: str) -> Keyring | None:
     return None
 
 
+def may_listen(setup: Setup, address: str) -> bool:
+    """Whether the RTSP server may listen at an address of an uplink, too: under the conditions of `keyring_of`.
+
+    Where media.host is a loopback address, nothing is to reach it from elsewhere.
+    """
+    is_safe = setup.keys is not None or setup.insecure or is_loopback(address) or _is_private(address, setup)
+    return is_safe and not is_loopback(setup.media.host)
+
+
 def _check_server_name(setup: Setup) -> None:
     """GLib's TLS client states the host as server name (RFC 6066, section 3), and GnuTLS refuses an IPv6 address there.
 

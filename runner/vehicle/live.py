@@ -15,6 +15,7 @@ import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -45,7 +46,7 @@ from runner.mqtt.messages import (
 from runner.plans import as_offered, compile_plans, render_missing
 from runner.records import to_json
 from runner.records.vehicle import ClockAnswer, Outcome, Settings, SpeedAdvice, SteeringAngle, Telemetry, VehicleState
-from runner.security.exposure import vehicle_keyring
+from runner.security.exposure import may_listen, vehicle_keyring
 from runner.security.keyring import Keyring
 from runner.settings import Setup
 from runner.system.held_up import LateCheck
@@ -415,7 +416,14 @@ def live_vehicle(
             report(found)
         video = apply.VideoFiles(log, drive.video, drive.video_shift) if log and setup.log_video else None
         side = apply.VehicleSide(
-            plans, setup.media, lambda camera, what: report(f"{camera}: {what}"), video, keyring, lost, setup.uplinks
+            plans,
+            setup.media,
+            lambda camera, what: report(f"{camera}: {what}"),
+            video,
+            keyring,
+            lost,
+            setup.uplinks,
+            partial(may_listen, setup),
         )
         ending.callback(side.stop)
         control = _VehicleControl(setup, document, report, keyring)

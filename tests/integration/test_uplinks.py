@@ -111,16 +111,19 @@ class Operator:
 
 @contextmanager
 def drive(
-    tmp_path: Path, keys: bool, addresses: Mapping[str, str] = ADDRESSES
+    tmp_path: Path, keys: bool, addresses: Mapping[str, str] = ADDRESSES, host: str = "", cut: str = ""
 ) -> Iterator[tuple[Ways, Vehicle, Operator]]:
+    """host: media.host of the vehicle, "": any. cut: ways that are cut before the operator's side begins"""
     port = free_port()
-    everywhere = "'::'" if addresses is ADDRESSES_6 else "0.0.0.0"
-    words = [*small_robot(CAMERA), "source=test", f"media.host={everywhere}", f"media.port={port}", "page.serve=false"]
+    host = host or ("'::'" if addresses is ADDRESSES_6 else "0.0.0.0")
+    words = [*small_robot(CAMERA), "source=test", f"media.host={host}", f"media.port={port}", "page.serve=false"]
     holders = [issue(tmp_path / "keys") / name for name in (VEHICLE, CONTROLLER)] if keys else []
     own = [[f"keys={holder}"] for holder in holders] or [["insecure=true"]] * 2
     with two_ways(addresses) as ways:
         ways["a"].delay_s, ways["b"].delay_s = FAST_S, SLOW_S
         vehicle = Vehicle(ways, [*words, *own[0]])
+        for name in cut:
+            ways[name].is_cut = True
         operator = Operator([*words, *own[1]], addresses)
         try:
             with repeating(operator.sample, SAMPLES_S):
@@ -341,6 +344,14 @@ def test_a_camera_whose_uplink_is_cut_goes_on_with_a_key_picture_by_the_other(tm
         assert first[2] - (first[0] + time.monotonic() - time.time()) < 0.25
         assert REPEATED not in repeated
         assert operator.sample().damaged <= 1, "the picture that was being encoded at that moment"
+
+
+@needs_root
+def test_a_viewer_connects_by_another_uplink_if_the_first_is_cut(tmp_path: Path) -> None:
+    """The server's own address is that of the first one; it listens at that of each."""
+    with drive(tmp_path, keys=False, host=ADDRESSES["a"], cut="a") as (_ways, _vehicle, operator):
+        operator.watch(0.5)
+        assert operator.side.received()[CAMERA]["b"].packets > FPS
 
 
 def payload_type(packet: bytes) -> int:

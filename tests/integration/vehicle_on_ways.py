@@ -3,7 +3,8 @@
     python vehicle_on_ways.py '{"words": [OVERRIDE...], "uplinks": {NAME: {"interface": DEVICE}}, "number": FIRST}'
 
 `number` is the RTP sequence number of each camera's first packet. A line {"carry": {CAMERA: [UPLINK...]}} places
-cameras, {"anew": [CAMERA...]} lets them begin anew with a key picture, {} does nothing. Each is answered: what was sent by camera and uplink, and what was reported so far.
+cameras, {"anew": [CAMERA...]} lets them begin anew with a key picture, {} does nothing. Each is answered: what was sent
+by camera and uplink, and what was reported so far.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import json
 import sys
 from dataclasses import replace
+from functools import partial
 
 from runner import apply
 from runner.configuration.config import configuration
@@ -18,7 +20,7 @@ from runner.core.commands import Command
 from runner.graph import Plan
 from runner.plans import compile_plans
 from runner.records import to_json
-from runner.security.exposure import vehicle_keyring
+from runner.security.exposure import may_listen, vehicle_keyring
 from runner.settings import Uplink
 
 
@@ -40,6 +42,7 @@ def main(given: str) -> None:
         lambda camera, what: reported.append(f"{camera}: {what}"),
         keyring=keyring,
         uplinks=uplinks,
+        may_listen=partial(may_listen, setup),
     )
     cameras = setup.vehicle.cameras.values()
     side.turn(Command(camera.name, "size", (camera.full_roi.width, camera.full_roi.height)) for camera in cameras)
