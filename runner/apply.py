@@ -153,7 +153,7 @@ class VehicleSide:
     keyring    of this vehicle: viewers authenticate, and everything is encrypted; None: neither
     lost       by camera whose source does not open, why: it is tried again, and started once it does
     uplinks    by name, see `runner.gst.uplinks`; none: the system's routes decide
-    may_listen  whether viewers may also connect at an address of these
+    may_listen  whether viewers may connect at an address of an uplink, too
     raises     RunError if the port is in use, or a plugin that `video` needs is not installed
 
     `on_turned` is called, from any thread, after knobs were set and read back: `applied` may have changed.
@@ -171,8 +171,8 @@ class VehicleSide:
         may_listen: Callable[[str], bool] = lambda address: False,
     ) -> None:
         self._on_report, self._video = on_report, video
-        kind = import_module("runner.gst.uplinks").VehicleUplinks if uplinks else None
-        self._uplinks = kind and kind(uplinks, on_report, may_listen)
+        own = import_module("runner.gst.uplinks") if uplinks else None
+        self._uplinks = own and own.VehicleUplinks(uplinks, on_report, may_listen)
         passphrase = keyring.watched_passphrase(lambda what: on_report("keys", what)).get if keyring else None
         plans = _with_clip_range(_with_video(plans, video, "vehicle"))
         self._lock = threading.Lock()
@@ -275,9 +275,7 @@ class VehicleSide:
         """
         for name in cameras:
             if name in self._wanted and (pipeline := self._pipeline(name)):
-                if begin_anew:
-                    pipeline.requests.begin_anew()
-                pipeline.send_key_frame()
+                pipeline.send_key_frame(begin_anew=begin_anew)
 
     def stop(self) -> None:
         self._lost.stop()

@@ -247,8 +247,13 @@ class CameraPipeline:
         sinks = pipeline.iterate_all_by_element_factory_name("appsink")
         sinks.foreach(lambda sink: sink.emit("try-pull-sample", 0))
 
-    def send_key_frame(self) -> None:
-        """Make the encoder send a key frame next, if the graph states how."""
+    def send_key_frame(self, *, begin_anew: bool = False) -> None:
+        """Make the encoder send a key frame next, if the graph states how.
+
+        begin_anew  and send no earlier packet again
+        """
+        if begin_anew:
+            self.requests.begin_anew()
         match self._plan.camera.graph.key_frame:
             case "caps":
                 self.knobs.restart_encoder("size")
