@@ -7,8 +7,10 @@ from pathlib import Path
 from helpers import Command
 
 from runner.configuration.config import configuration
+from runner.configuration.experiment import lane_overrides
 from runner.core.events import BitratePredicted, ClockAdvanced, PositionReported
 from runner.link.limit import Limit
+from runner.settings import Uplink
 
 NARROW = ("vehicle=delivery_robot", "source=test")
 
@@ -79,25 +81,35 @@ def test_a_lane_without_a_rate_follows_the_predictions_of_its_uplink(tmp_path: P
     named = f"uplinks={{x: {{interface: b, {own}}}, y: {{interface: a}}}}"
     assert lanes(*words, "link=netns", "link.lanes={a: {}, b: {}}", named) == {"a": 700, "b": 3000}
     assert lanes(*words, "link=netns", "link.lanes={a: {}, b: {kbps: 50}}", named) == {"a": 700, "b": 50}
-    addressed = f"uplinks={{x: {{address: 127.0.1.2, {own}}}}}"
-    assert lanes(*words, "link=relay", "link.lanes={a: {}, b: {}}", addressed) == {"a": 700, "b": 3000}
+    addressed = named.replace("interface: b", "address: 127.0.1.2")
+    for uplinks in (named, addressed):
+        assert lanes(*words, "link=relay", "link.lanes={a: {}, b: {}}", uplinks) == {"a": 700, "b": 3000}
 
 
 def test_an_uplink_that_is_no_lane_is_a_problem(tod: Command) -> None:
     both = "uplinks={a: {interface: a}, b: {address: 127.0.1.2}}"
+    other = "must not be given: link=netns takes new addresses for each drive; interface names the lane"
 
     def found(*words: str) -> list[str]:
         return tod("demo", *NARROW, both, *words, "output=/nowhere").problems
 
     assert found("link=netns", "link.lanes={b: {}, c: {}}") == [
         "command line: uplinks.a.interface: a: no such lane: link.lanes has b, c",
-        "command line: uplinks.b.address: 127.0.1.2: must not be given: link=netns takes new addresses for each drive",
+        f"command line: uplinks.b.address: 127.0.1.2: {other}",
     ]
     assert found("link=netns")[0] == "command line: uplinks.a.interface: a: no such lane: link.lanes is null"
     assert found("link=relay", "link.lanes={b: {}}") == [
-        "command line: uplinks.a.interface: a: must not be given: link=relay has no devices, only addresses",
+        "command line: uplinks.a.interface: a: no such lane: link.lanes has b",
         "command line: uplinks.b.address: 127.0.1.2: no such lane: 127.0.1.1 is b",
     ]
+
+
+def test_uplinks_of_a_relay_send_from_the_addresses_of_its_lanes() -> None:
+    words = (*NARROW, "link=relay", "link.lanes={x: {}, y: {}}", "uplinks={b: {interface: y}, a: {address: 127.0.1.1}}")
+    config = configuration(words, runnable=False)
+    assert config.link()
+    for_vehicle = configuration([*words, *lane_overrides(config.document)], runnable=False).setup()
+    assert for_vehicle.uplinks == {"b": Uplink(address="127.0.1.2"), "a": Uplink(address="127.0.1.1")}
 
 
 def test_print_names_the_sources(tod: Command) -> None:

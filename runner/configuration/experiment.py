@@ -109,14 +109,26 @@ def _cuts(data: Mapping[str, Any], lane: str) -> tuple[Cut, ...]:
 
 
 def lane_of(document: Mapping[str, Any], uplink: str) -> str | None:
-    """The lane that an uplink sends by; None: none, or the link has no lanes."""
+    """The lane that an uplink sends by: its interface, or for a relay its address; None: it uses none."""
     from runner.link.relayed import lane_addresses
 
     link, way = document["link"], document["uplinks"][uplink]
     lanes = link.get("lanes") or {}
-    if link["kind"] == "relay":
-        return next((lane for lane, at in lane_addresses(lanes).items() if at == way.get("address")), None)
+    if link["kind"] == "relay" and "address" in way:
+        return next((lane for lane, at in lane_addresses(lanes).items() if at == way["address"]), None)
     return way["interface"] if way.get("interface") in lanes else None
+
+
+def lane_overrides(document: Mapping[str, Any]) -> tuple[str, ...]:
+    """Overrides of the vehicle for a relay, whose lanes are addresses and no devices."""
+    from runner.link.relayed import lane_addresses
+
+    if document["link"]["kind"] != "relay":
+        return ()
+    addresses = lane_addresses(document["link"].get("lanes") or {})
+    ways = {name: addresses.get(way.get("interface")) for name, way in document["uplinks"].items()}
+    words = ((f"~uplinks.{name}.interface", f"+uplinks.{name}.address={at}") for name, at in ways.items() if at)
+    return tuple(word for each in words for word in each)
 
 
 def unreachable_uplinks(document: Mapping[str, Any]) -> Iterator[ModelError]:
@@ -125,18 +137,16 @@ def unreachable_uplinks(document: Mapping[str, Any]) -> Iterator[ModelError]:
     from runner.link.relayed import lane_addresses
 
     link = document["link"]
-    lanes = link.get("lanes") or {}
-    if link["kind"] == "relay":
-        key, other, why = "address", "interface", "link=relay has no devices, only addresses"
-        known, device = [f"{at} is {lane}" for lane, at in lane_addresses(lanes).items()], None
-    else:
-        key, other, why = "interface", "address", "link=netns takes new addresses for each drive"
-        known, device = [f"link.lanes has {', '.join(lanes)}"] if lanes else ["link.lanes is null"], LINK
-    for name, way in (document.get("uplinks") or {}).items() if known else ():
-        if other in way:
-            yield ModelError(f"{name}.{other}", way[other], f"must not be given: {why}")
-        elif lane_of(document, name) is None and (lanes or way.get(key) != device):
-            yield ModelError(f"{name}.{key}", way.get(key), f"no such lane: {', '.join(known)}")
+    lanes, is_relay = link.get("lanes") or {}, link["kind"] == "relay"
+    by_name = f"no such lane: link.lanes has {', '.join(lanes)}" if lanes else "no such lane: link.lanes is null"
+    by_address = f"no such lane: {', '.join(f'{at} is {lane}' for lane, at in lane_addresses(lanes).items())}"
+    for name, way in (document.get("uplinks") or {}).items():
+        if "address" in way and not is_relay:
+            rule = "must not be given: link=netns takes new addresses for each drive; interface names the lane"
+            yield ModelError(f"{name}.address", way["address"], rule)
+        elif lane_of(document, name) is None and (lanes or way.get("interface", LINK) != LINK):
+            key = "address" if "address" in way else "interface"
+            yield ModelError(f"{name}.{key}", way[key], by_address if key == "address" else by_name)
 
 
 def lane_problems(data: Mapping[str, Any]) -> Iterator[ModelError]:

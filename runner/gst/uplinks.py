@@ -156,7 +156,7 @@ class CameraUplinks:
 def _on_viewer(sink: Gst.Element, host: str, port: int, action: str, channel: weakref.ref[_Channel]) -> None:
     """The library adds or removes a viewer; before its sink does."""
     own = channel()
-    if own and over_uplink(host):
+    if own and own.serves(host):
         GObject.signal_stop_emission_by_name(sink, action)
         own.change(action, (host, port))
 
@@ -172,6 +172,7 @@ class _Channel:
         on_fault: OnFault,
     ) -> None:
         self._library, self._uplinks, self._carrying, self._on_fault = library, uplinks, carrying, on_fault
+        self._are_loopback = all(each.address and not over_uplink(each.address) for each in uplinks.values())
         self._idle = IdleProbe(self._on_idle)
         self._tee: Gst.Element | None = None
         self._is_rtp = False
@@ -182,6 +183,10 @@ class _Channel:
         self._before = dict.fromkeys(uplinks, UplinkSent())  # of former branches and viewers; all errors
         self._feedback = Feedback()
         self._lock = threading.RLock()
+
+    def serves(self, host: str) -> bool:
+        """Whether the uplinks reach a viewer; one on the vehicle itself only if they begin and end there, too."""
+        return over_uplink(host) or self._are_loopback
 
     def change(self, action: str, viewer: Destination) -> None:
         """Add or remove a viewer."""

@@ -22,6 +22,7 @@ OUT/runs.jsonl, or DIR/runs.jsonl, has a line for each run: its directory and it
   tod-runner demo pqos.file=tum_bandwidth_map.yaml            along another map
   tod-runner demo experiment=driving_test output=OUT          the paper's driving test, with its figures
   tod-runner demo experiment=bottleneck output=OUT            three ways to share a rate-limited link
+  tod-runner demo experiment=two_uplinks output=OUT           two uplinks, of which one is cut
   tod-runner demo -m modes=paper,safe output=OUT              the same drive under other rules
   tod-runner demo link=netns link.file=uplink.csv output=OUT  an uplink of your own; as root
 """
@@ -42,7 +43,7 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 from runner.configuration.config import Configuration, configuration
-from runner.configuration.experiment import LinkSettings
+from runner.configuration.experiment import LinkSettings, lane_overrides
 from runner.configuration.files import conf_directories
 from runner.drive.log import FILES, WITHOUT_LOG, Log, check_free
 from runner.errors import ArgumentError, os_errors_as
@@ -271,6 +272,7 @@ def _drive(run: _Run) -> None:
 def _sides(words: Sequence[str], link: LimitedLink | None, run: _Run) -> Iterator[tuple[VerbProcess, ...]]:
     """Both sides as processes, vehicle and operator. The vehicle's error output is shown only if it failed."""
     to_vehicle, to_operator = (link.vehicle_overrides, link.operator_overrides) if link else ((), ())
+    to_vehicle = (*to_vehicle, *(lane_overrides(run.document) if link else ()))
     if run.keys:
         to_vehicle = (*to_vehicle, f"keys={run.keys.vehicle}")
         to_operator = (*to_operator, f"keys={run.keys.controller}")
