@@ -28,8 +28,9 @@ from runner.simulation.families import FAMILIES, LEFT_OUT, generate
 from runner.simulation.figures import cuts, percentile
 from runner.simulation.predictions import prediction
 from runner.simulation.queues import CreditQueue, OpportunityQueue, RateQueue
-from runner.simulation.runs import Common, Job, jobs, run_job
+from runner.simulation.runs import CONFIGURED, SEEDS, Common, Job, jobs, run_job
 from runner.simulation.steps import Steps
+from runner.simulation.way import Put, merged
 
 SHORT = Common(("vehicle=delivery_robot", "fps_max=15"), None)
 
@@ -145,6 +146,43 @@ def test_what_is_modelled_has_the_numbers_of_the_real_sides() -> None:
         operator.DECAY,
     )
     assert (1000 * operator.INITIAL_RTT_S, 1000 * operator.LONGEST_WAIT_S) == (repair.INITIAL_RTT_MS, repair.LONGEST_MS)
+
+
+def test_a_frame_over_two_ways_lacks_what_both_lost_and_is_whole_with_the_first_whole_copy() -> None:
+    def put(last: float, *lost: int) -> Put:
+        missing = dict.fromkeys(lost, 100)
+        return Put(4 - len(lost), 400 - 100 * len(lost), 50, last - 0.01, last, last - 0.02, (0, 0), missing, 0)
+
+    assert merged([put(1.0), put(2.0)]) == put(1.0)._replace(carried=100)
+    assert merged([put(1.0, 1), put(2.0)]) == put(2.0)._replace(carried=100, first=0.99)
+    both = merged([put(1.0, 1, 3), put(2.0, 0, 3)])
+    assert (both.packets, both.bytes, both.missing, both.tail, both.last) == (3, 300, {3: 100}, 1, 2.0)
+
+
+def test_a_cut_of_one_of_two_uplinks_loses_nothing_of_redundant_cameras() -> None:
+    uplinks, rate = "uplinks={a: {interface: a}, b: {interface: b}}", "link.lanes={a: {kbps: 5000}, b: {kbps: 4000}}"
+    cut = "link.cuts=[{lane: a, at_s: 6, for_s: 4, how: silence}]"
+    words = (*SHORT.overrides, uplinks, "link=netns", "link.delay_ms=15", rate, cut)
+    job = Job(CONFIGURED, 0.0, "absent", 1, 14.0)
+
+    def driven(*more: str) -> tuple[float, float]:
+        figures = run_job(Common((*words, *more), None), job).figures
+        return figures["camera"], figures["lost"]
+
+    names = configuration(SHORT.overrides, runnable=False).vehicle().cameras
+    assert driven(*(f"++cameras.{name}.redundant=true" for name in names)) == (0, 0)
+    frozen, lost = driven()  # until the stall is noticed
+    assert frozen < 4 and lost > 0
+    frozen, _ = driven("~uplinks.b")  # 4 of 11 s
+    assert frozen > 35
+
+
+def test_links_of_several_uplinks_are_named_together() -> None:
+    named = (*SHORT.overrides, "uplinks={a: {interface: w0}, b: {interface: w1, pqos: {kind: live}}}")
+    result = run_job(Common(named, None), Job("saw+step", 0.0, "right", 1, 9.0), keep=True)
+    both = [generate(name, seed, 20) for name, seed in (("saw", 1), ("step", 1 + SEEDS))]
+    assert result.job.link_name == "saw+step" and result.uplinks == 2
+    assert result.drive and all(result.drive.capacity.at(t) == sum(one.at(t) for one in both) for t in (0, 3.3, 8))
 
 
 def test_ctrl_c_ends_every_process() -> None:

@@ -258,8 +258,11 @@ class Builder:
             data = data[key]
         return self.attempt(path, lambda: make(data))
 
-    def check_link(self, link: LinkSettings) -> None:
-        """Check that all cameras can use a limited link, and that its kind supports the settings."""
+    def check_link(self, link: LinkSettings, *, needs_lanes: bool) -> None:
+        """Check that all cameras can use a limited link, and that its kind supports the settings.
+
+        needs_lanes  whether several uplinks do
+        """
         from runner.configuration.experiment import lane_problems, unreachable_uplinks
 
         cameras = tuple(self.setup.vehicle.cameras.values()) if self.setup else ()
@@ -274,7 +277,7 @@ class Builder:
             self._refuse_link("tcp", None, "is not supported by link=relay; choose link=netns", ("link", "kind"))
         for error in lane_problems(self.composed.document["link"]):
             self._report(("link",), error)
-        if self.is_valid("uplinks"):
+        if self.is_valid("uplinks") and (link.lanes or needs_lanes):
             for error in unreachable_uplinks(self.composed.document):
                 self._report(("uplinks",), error)
 

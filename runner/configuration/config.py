@@ -123,10 +123,11 @@ class Configuration:
             builder.check_requests(experiment.requests)
         return builder.checked(experiment)
 
-    def link(self, rates: RateAtTime | None = None) -> LinkSettings | None:
+    def link(self, rates: RateAtTime | None = None, *, simulated: bool = False) -> LinkSettings | None:
         """The limited link between the demo's sides, if any.
 
         rates  to follow if it names no file; None: what the source of predictions states, for a lane that of its uplink
+        simulated  uplinks need no lanes
         """
         from runner.configuration.experiment import lane_of, read_link, true_rates
 
@@ -140,7 +141,7 @@ class Configuration:
         by_lane = {lane: each for name, each in own.items() if each and (lane := lane_of(self.document, name))}
         link = builder.part(("link",), lambda settings: read_link(settings, followed, self._bases, by_lane))
         if link:
-            builder.check_link(link)
+            builder.check_link(link, needs_lanes=not simulated)
         return builder.checked(link)
 
     @cached_property

@@ -6,37 +6,31 @@ import heapq
 import random
 from array import array
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import count
-from typing import Any, NamedTuple
+from typing import Any
 
 from runner.configuration.experiment import TimedRequest
 from runner.core.budget import payload_bytes
 from runner.core.events import BitratePredicted, ClockAdvanced, Event, parse
 from runner.core.step import Run
-from runner.link.limit import TcpFlows
-from runner.link.losses import LossModel
 from runner.pqos import Predictions
-from runner.records.reception import Arrival, ReceptionReported
+from runner.records.reception import ReceptionReport, ReceptionReported
 from runner.settings import Setup
 from runner.simulation.control import ControlMessages, segments
 from runner.simulation.encoder import Encoder, EncoderModel
 from runner.simulation.operator import REORDER_S, RETRY_S, TAIL_S, Frame, Loss, Operator
-from runner.simulation.queues import Queue
 from runner.simulation.steps import Steps
 from runner.simulation.tcp import Feedback, Flow
 from runner.simulation.vehicle import SimulatedVehicle
+from runner.simulation.way import EXTENSION, RTO_S, Link, Put, Way, carried, framed, merged
 
 ENCODED_S = 0.001  # from the capture of a frame until it is sent, at least
 TICK_S, TELEMETRY_S, REPORT_S = 0.1, 0.2, 0.04
 REPORT_BYTES, UNIT_BYTES = 170, 62  # of a report in JSON with MQTT's header, and of each frame in it
-RTO_S = 0.2  # until TCP repeats a segment (Linux' least)
-# Each frame begins with a packet of its own for the access unit delimiter (2 bytes of payload), and only this one has
-# the header extension with the capture time. Seen in reports of real drives.
-DELIMITER, EXTENSION = 2, 16
 UNSTATED_WAVE_S = 1.5  # length of a refresh wave where the graph states none
 REPEATED = 2  # bytes by which a repeated packet is longer (RFC 4588)
-DelayAt = Callable[[float], float]
 
 
 @dataclass(frozen=True)
@@ -59,47 +53,10 @@ class Conditions:
 
 
 @dataclass
-class Link:
-    """From the vehicle to the operator; those that begin with `back` are of the other direction.
-
-    capacity  kbit/s
-    queue     in front of it; back None: there is none
-    one_way_s, delay_at  delay without any queue, and what is added over time, s
-    losses    behind the queue; None: there are none
-    tcp       competing flows
-    """
-
-    capacity: Steps
-    queue: Queue
-    one_way_s: float
-    back_s: float
-    delay_at: DelayAt | None = None
-    losses: LossModel | None = None
-    back: Queue | None = None
-    back_at: DelayAt | None = None
-    back_losses: LossModel | None = None
-    tcp: TcpFlows | None = None
-
-    def back_after_s(self, t: float) -> float:
-        """Delay of a packet to the vehicle without any queue."""
-        return self.back_s + (self.back_at(t) if self.back_at else 0.0)
-
-    def back_arrival(self, t: float, size: int) -> float:
-        """When a message to the vehicle arrives; a segment that is dropped is repeated later."""
-        left: float | None = t
-        for part in segments(size) if self.back else ():
-            left = self.back.put(t, part) if self.back and left is not None else None
-        return (t + RTO_S if left is None else left) + self.back_after_s(t)
-
-    def loses_back(self) -> bool:
-        """Whether the next packet to the vehicle is lost."""
-        return bool(self.back_losses and self.back_losses.draw())
-
-
-@dataclass
 class Drive:
     """What happened: pairs of time, s, and value, as flat arrays.
 
+    capacity     of all links together, but for cuts, kbit/s
     totals       kbit/s that the rules decided, whenever they did
     predictions  kbit/s
     waits        of each frame's last packet in the queue, with its own service, s
@@ -108,6 +65,7 @@ class Drive:
     lost         when packets of the cameras were lost
     tcp_bytes    that competing flows delivered
     damaged_s    by camera
+    arrivals     by camera, when frames arrived, by the first of several ways, s
     """
 
     duration_s: float
@@ -120,27 +78,7 @@ class Drive:
     lost: array[float] = field(default_factory=lambda: array("d"))
     tcp_bytes: int = 0
     damaged_s: dict[str, float] = field(default_factory=dict)
-
-
-class _Put(NamedTuple):
-    """A frame on the link.
-
-    packets, bytes         that get through, and their bytes of video
-    carried                their bytes on the link
-    first_left, last_left  when the first and the last of these leave the queue, s
-    begun                  packets and bytes of all cameras that get through, up to the first of these
-    missing                bytes of each lost packet
-    tail                   how many of these follow the last that gets through
-    """
-
-    packets: int
-    bytes: int
-    carried: int
-    first_left: float
-    last_left: float
-    begun: tuple[int, int]
-    missing: list[int]
-    tail: int
+    arrivals: dict[str, array[float]] = field(default_factory=dict)
 
 
 class Recorder:
@@ -156,33 +94,39 @@ class Simulation:
     """One drive. Events wait in a heap; packets do not, see `runner.simulation.queues`."""
 
     def __init__(
-        self, setup: Setup, link: Link, pqos: Predictions, duration_s: float, conditions: Conditions, seed: int,
-        recorder: Recorder, requests: Sequence[TimedRequest] = (),
+        self, setup: Setup, links: Mapping[str, Link], pqos: Predictions, duration_s: float, conditions: Conditions,
+        seed: int, recorder: Recorder, requests: Sequence[TimedRequest] = (),
     ) -> None:  # fmt: skip
-        self.link, self.conditions, self.recorder = link, conditions, recorder
+        self.conditions, self.recorder = conditions, recorder
         self._rng = rng = random.Random(seed)
-        self.done = Drive(duration_s, link.capacity)
         cameras = setup.vehicle.cameras
+        arrivals = {name: array("d") for name in cameras}
+        self.done = Drive(duration_s, carried(links.values()), arrivals=arrivals)
         self._sizes = {
             n: (payload_bytes(c.graph), c.graph.settings.header_bytes - EXTENSION) for n, c in cameras.items()
         }
         self.encoders = {n: Encoder(c, conditions.encoder, rng) for n, c in cameras.items()}
         settings = [camera.graph.settings for camera in cameras.values()]
-        self.operator = Operator(
+        operator = partial(
+            Operator,
             repairs_s=max(one.retransmission_ms for one in settings) / 1000,
             jitter_s=max(one.jitter_buffer_ms for one in settings) / 1000,
             wave_s=2 * max(one.key_interval_s or UNSTATED_WAVE_S for one in settings),
         )
+        # One knows the pictures, and reports where there is one way; otherwise each way has one that reports on it.
+        self.operator = operator()
+        self.ways = {n: Way(one, operator() if n else self.operator, self._sizes) for n, one in links.items()}
         self.vehicle = SimulatedVehicle(setup, pqos, self.encoders, self._stepped, recorder.reported)
         self._requests = requests
         self._order = count()
         self._events: list[tuple[float, int, Callable[[float, Any], None], Any]] = []
-        self._newest = 0.0  # arrival of the newest packet: packets stay in order
         self._held_up_until = 0.0  # the control link
         self._back_newest = 0.0  # arrival of the newest report
+        first = next(iter(links.values()))
+        self._first_queue = first.queue
         self._flows = [
-            Flow(flows, link.one_way_s + link.back_s, random.Random(number))
-            for flows in ([link.tcp] if link.tcp else [])
+            Flow(flows, first.one_way_s + first.back_s, random.Random(number))
+            for flows in ([first.tcp] if first.tcp else [])
             for number in range(flows.flows)
         ]
 
@@ -252,17 +196,18 @@ class Simulation:
         A lost segment holds up the connection until TCP repeats it, and later messages are left out meanwhile
         (`MqttLink.is_behind`); the repetition itself is not simulated.
         """
+        way = self._control_way(t)
         if not self.conditions.control:
-            return t + self.link.one_way_s
+            return t + way.link.one_way_s
         if t < self._held_up_until:
             return None
-        arrival, losses = t, self.link.losses
+        arrival = t
         for part in segments(size):
-            left = self.link.queue.put(t, part)
-            if left is None or (losses and losses.draw()):
+            left = way.link.queue.put(t, part)
+            if left is None or way.link.loses(left):
                 self._held_up_until = t + RTO_S
                 return None
-            arrival = self._arrival(left)
+            arrival = way.arrival(left)
             self.done.others.extend((arrival, part))
         return arrival
 
@@ -280,69 +225,38 @@ class Simulation:
         if not size:
             return
         self.vehicle.sent(name, captured, t)
-        put = self._put_packets(t, name, size)
+        ways = [self.ways[uplink] for uplink in encoder.uplinks or self.ways]
+        puts = [way.put_frame(t, name, size) for way in ways]
+        for way, own in zip(ways, puts, strict=True):
+            if way.receiver is not self.operator:
+                way.deliver(t, name, captured, own)
+        put = merged(puts)
         if put.missing:
             self.done.lost.extend([t] * len(put.missing))
         if not put.packets:
-            self._lost(name, captured, t, put.missing, t + encoder.interval_s, put.tail)
+            self._lost(name, captured, t, put, t + encoder.interval_s)
             return
-        first, last = self._arrival(put.first_left), self._arrival(put.last_left)
-        self.done.waits.extend((t, put.last_left - t))
-        self.done.frames.extend((last, put.carried))
-        whole, ended = not put.missing, self.operator.arrived
-        frame = Frame(name, Arrival(last, captured, put.bytes, whole, first), put.begun, ended, put.packets)
+        self.done.waits.extend((t, put.left - t))
+        self.done.frames.extend((put.last, put.carried))
+        self.done.arrivals[name].append(put.last)
+        frame = framed(name, captured, put, ways[0].receiver.arrived)
         self.recorder.frame(frame)
-        self.operator.frame(frame, last + TAIL_S if put.tail else last)
-        if not whole:
-            self._lost(name, captured, t, put.missing, last, put.tail)
+        self.operator.frame(frame, put.last + TAIL_S if put.tail else put.last)
+        if put.missing:
+            self._lost(name, captured, t, put, put.last)
         elif key:
-            self.operator.key_frame(name, captured, last)
+            self.operator.key_frame(name, captured, put.last)
 
-    def _put_packets(self, t: float, name: str, size: int) -> _Put:
-        """Put a frame's packets on the link one after the other, as `udpsink` does with the list of a payloader."""
-        payload, header = self._sizes[name]
-        put, losses = self.link.queue.put, self.link.losses
-        before, arrived = self.operator.arrived
-        first_left = last_left = 0.0
-        begun = (0, 0)
-        packets = received = carried = tail = 0
-        missing: list[int] = []
-        part, wire = DELIMITER, DELIMITER + header + EXTENSION
-        while True:
-            left = put(t, wire)
-            if left is None or (losses is not None and losses.draw()):
-                missing.append(part)
-                tail += 1
-            else:
-                tail = 0
-                packets += 1
-                received += part
-                carried += wire
-                last_left = left
-                if packets == 1:
-                    first_left, begun = left, (before + 1, arrived + part)
-            if size <= 0:
-                break
-            part = size if size < payload else payload
-            size -= part
-            wire = part + header
-        self.operator.arrived = (before + packets, arrived + received)
-        return _Put(packets, received, carried, first_left, last_left, begun, missing, tail)
-
-    def _arrival(self, left: float) -> float:
-        """When a packet that has left the queue arrives; packets stay in order."""
-        at = left + self.link.one_way_s
-        if self.link.delay_at:
-            at += self.link.delay_at(left)
-        if at < self._newest:
-            return self._newest
-        self._newest = at
-        return at
+    def _control_way(self, t: float) -> Way:
+        """The first way that is not cut: the control link goes over all of them."""
+        living = (way for way in self.ways.values() if not way.link.cuts or way.link.cut_at(t) is None)
+        return next(living, next(iter(self.ways.values())))
 
     # --- repair ---
 
-    def _lost(self, name: str, captured: float, sent: float, sizes: list[int], last: float, tail: int) -> None:
+    def _lost(self, name: str, captured: float, sent: float, put: Put, last: float) -> None:
         """Packets of a frame are lost; those at its end are missed only a while after the last that arrived."""
+        sizes, tail = list(put.missing.values()), put.tail
         self.operator.missing(len(sizes), last + TAIL_S if tail else last)
         loss = Loss(name, captured, sizes, last + self.operator.wait_s())
         self._at(loss.due, self._check_repaired, loss)
@@ -356,29 +270,35 @@ class Simulation:
         if loss.complete is not None or t >= loss.due or self.operator.congested:
             return
         self._at(t + max(RETRY_S, self.operator.rtt_s), self._request, what)
-        if not self.link.loses_back():
-            self._at(t + self.link.back_after_s(t), self._repeat, (loss, sent, t))
+        link = self._control_way(t).link
+        if not link.loses_back():
+            self._at(t + link.back_after_s(t), self._repeat, (loss, sent, t))
 
     def _repeat(self, t: float, what: tuple[Loss, float, float]) -> None:
         """The vehicle sends lost packets again."""
         loss, sent, requested = what
         if t - sent > self.operator.repairs_s or not loss.sizes:
             return
-        header, losses, still = self._sizes[loss.camera][1] + REPEATED, self.link.losses, []
-        packets, arrived = self.operator.arrived
+        header, way, still = self._sizes[loss.camera][1] + REPEATED, self._repeating_way(loss.camera), []
+        packets, arrived = way.receiver.arrived
         for part in loss.sizes:
-            left = self.link.queue.put(t, part + header)
-            if left is None or (losses is not None and losses.draw()):
+            left = way.link.queue.put(t, part + header)
+            if left is None or way.link.loses(left):
                 still.append(part)
                 continue
             packets, arrived = packets + 1, arrived + part
-            at = self._arrival(left)
+            at = way.arrival(left)
             self.done.others.extend((at, part + header))
             self.operator.rtt_s += (at - requested - self.operator.rtt_s) / 8
-        self.operator.arrived = (packets, arrived)
+        way.receiver.arrived = (packets, arrived)
         loss.sizes = still
         if not still:
-            loss.complete = self._newest
+            loss.complete = way.newest
+
+    def _repeating_way(self, camera: str) -> Way:
+        """The first way of a camera that is not known to have stalled."""
+        shares, names = self.vehicle.run.decision.uplinks, self.encoders[camera].uplinks or tuple(self.ways)
+        return self.ways[next((name for name in names if name in shares and not shares[name].stalled), names[0])]
 
     def _check_repaired(self, _: float, loss: Loss) -> None:
         if loss.complete is None or loss.complete > loss.due:
@@ -389,14 +309,19 @@ class Simulation:
     def _report(self, t: float, _: None) -> None:
         self._at(t + REPORT_S, self._report, None)
         report = self.operator.report(t)
-        conditions, rng = self.conditions, self._rng
+        for name, way in self.ways.items():
+            own = way.receiver.report(t) if name else report
+            self._send_report(t, replace(own, uplink=name, as_of=report.as_of, damaged=report.damaged) if name else own)
+
+    def _send_report(self, t: float, report: ReceptionReport) -> None:
+        conditions, rng, link = self.conditions, self._rng, self._control_way(t).link
         if conditions.report_loss and rng.random() < conditions.report_loss:
             return
-        arrival = self.link.back_arrival(t, REPORT_BYTES + UNIT_BYTES * len(report.units))
+        arrival = link.back_arrival(t, REPORT_BYTES + UNIT_BYTES * len(report.units))
         if conditions.report_jitter_s:
             arrival += rng.expovariate(1 / conditions.report_jitter_s)
-        if self.link.loses_back():  # TCP repeats it one round trip after the next one has arrived (RFC 8985)
-            arrival += REPORT_S + self.link.one_way_s + self.link.back_s
+        if link.loses_back():  # TCP repeats it one round trip after the next one has arrived (RFC 8985)
+            arrival += REPORT_S + link.one_way_s + link.back_s
         self._back_newest = max(self._back_newest, arrival)
         self._at(self._back_newest, self._take_report, report)
 
@@ -408,11 +333,11 @@ class Simulation:
     # --- other traffic ---
 
     def _begin_flow(self, t: float, flow: Flow) -> None:
-        self._schedule(t, flow, flow.begin(t, self.link.queue))
+        self._schedule(t, flow, flow.begin(t, self._first_queue))
 
     def _feedback(self, t: float, what: tuple[Flow, bool, float]) -> None:
         flow, delivered, sent = what
-        self._schedule(t, flow, flow.feedback(t, delivered, sent, self.link.queue))
+        self._schedule(t, flow, flow.feedback(t, delivered, sent, self._first_queue))
 
     def _schedule(self, t: float, flow: Flow, sent: Iterable[Feedback]) -> None:
         for when, delivered, at in sent:

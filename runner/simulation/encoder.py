@@ -60,6 +60,11 @@ class Encoder:
     def sends(self) -> bool:
         return self._set > 0
 
+    @property
+    def uplinks(self) -> tuple[str, ...]:
+        """That carry the camera; empty: all of them, or there is one."""
+        return tuple(self._values.get("uplinks", ()))
+
     def turn(self, command: Command) -> None:
         """Turn a knob, before the next frame."""
         before = self._values.get(command.knob)

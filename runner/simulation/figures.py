@@ -5,7 +5,7 @@ from __future__ import annotations
 from array import array
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
 from math import nan
 from statistics import fmean
@@ -21,6 +21,7 @@ FIGURES = {  # by name: what the column says, and its digits
     "p95": ("p95 ms", 0),
     "p99": ("p99 ms", 0),
     "frozen": ("frozen %", 1),
+    "camera": ("a camera %", 1),
     "cuts": ("cuts/min", 1),
     "lost": ("lost", 0),
     "damaged": ("damaged %", 1),
@@ -36,6 +37,7 @@ def figures(drive: Drive, since_s: float) -> Figures:
     p50, p95, p99  of each frame's wait in the queue with its own service, ms
     frozen, damaged  share of the time in which no frame came for longer than FROZEN_S, and in which a camera's picture
                    showed a loss, %
+    camera         as frozen, of the camera that it concerns most
     cuts           a minute
     lost           packets of the cameras
     tcp            that competing flows got, kbit/s
@@ -45,20 +47,30 @@ def figures(drive: Drive, since_s: float) -> Figures:
     could = drive.capacity.mean(since_s, end) * seconds
     carried = sum(size for some in (drive.frames, drive.others) for t, size in pairs(some) if since_s < t < end)
     waits = sorted(wait for t, wait in pairs(drive.waits) if t > since_s)
-    times = sorted(t for t, _ in pairs(drive.frames) if since_s < t < end)
-    frozen = sum(gap for a, b in pairwise(times) if (gap := b - a) > FROZEN_S)
+    times = _within((t for t, _ in pairs(drive.frames)), since_s, end)
+    arrivals = drive.arrivals.values()
     totals = list(pairs(drive.totals))
     before = bisect_left(totals, (since_s,)) - 1
     return {
         "use": carried * 0.008 / max(1.0, could),
         **{f"p{share}": 1000 * percentile(waits, share) for share in (50, 95, 99)},
-        "frozen": 100 * frozen / seconds,
+        "frozen": 100 * _frozen_s(times) / seconds,
+        "camera": 100 * max(_frozen_s([since_s, *_within(each, since_s, end), end]) for each in arrivals) / seconds,
         "cuts": 60 * sum(t > since_s for t in cuts(totals)) / seconds,
         "lost": float(sum(t > since_s for t in drive.lost)),
         "damaged": 100 * fmean(drive.damaged_s.values()) / end if drive.damaged_s else 0.0,
         "tcp": drive.tcp_bytes * 0.008 / end,
         "lowest": min((total for _, total in totals[max(0, before) :]), default=nan),
     }
+
+
+def _within(times: Iterable[float], begin: float, end: float) -> list[float]:
+    return sorted(t for t in times if begin < t < end)
+
+
+def _frozen_s(times: Sequence[float]) -> float:
+    """Between times that are further apart than FROZEN_S."""
+    return sum(gap for a, b in pairwise(times) if (gap := b - a) > FROZEN_S)
 
 
 def percentile(rising: Sequence[float], share: float) -> float:

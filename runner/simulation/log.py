@@ -9,6 +9,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from msgspec import UNSET
+
 from runner.core.events import BitratePredicted, Event, describe
 from runner.core.model import Vehicle, plain
 from runner.core.step import Run
@@ -89,11 +91,11 @@ class DriveFiles(Recorder):
         self._received[frame.camera].coming.append(frame.arrival)
 
     def tick(self, t: float, simulation: Simulation) -> None:
-        counters = simulation.link.queue.counters(t)
-        sample = LinkSample(
-            **asdict(counters) | {"tcp_bytes": simulation.tcp_bytes}, t=t, kbps=simulation.link.capacity.at(t)
-        )
-        self._logs["link"].record(sample)
+        for name, way in simulation.ways.items():
+            counters = asdict(way.link.queue.counters(t)) | {"tcp_bytes": simulation.tcp_bytes}
+            kbps = 0.0 if way.link.cut_at(t) else way.link.capacity.at(t)
+            sample = LinkSample(**counters, t=t, kbps=kbps, lane=name or UNSET)
+            self._logs["link"].record(sample)
         self._ticks += 1
         if self._ticks % TELEMETRY_TICKS == 0:
             self._logs["vehicle"].record(self._telemetry(t, simulation))

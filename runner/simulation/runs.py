@@ -20,15 +20,18 @@ from runner.link.losses import LossModel
 from runner.link.policer import Policer
 from runner.pqos import Predictions
 from runner.pqos.settings import find_file, find_path
-from runner.simulation.drive import Conditions, Drive, Link, Recorder, Simulation
+from runner.simulation.drive import Conditions, Drive, Recorder, Simulation
 from runner.simulation.families import FAMILIES, LEFT_OUT, generate, is_family
 from runner.simulation.figures import SETTLED_S, Figures, figures
 from runner.simulation.predictions import KINDS, prediction
 from runner.simulation.queues import KBIT, OPPORTUNITY_BYTES, CreditQueue, OpportunityQueue, Queue, RateQueue
 from runner.simulation.steps import Steps
+from runner.simulation.way import Link
 
 CONFIGURED = "configured"  # the link, or the predictions, of the configuration
 OPPORTUNITIES = {".up", ".down", ".pps"}  # names of files with opportunities to send
+BESIDE = "+"  # between links of several uplinks
+SEEDS = 1_000_000  # between those of generated links of several uplinks
 DURATION_S = 60.0
 MARGIN_S = 5.0  # of a link behind the end of a drive: predictions look ahead
 # Without link=, of links by name: as wide as their name or file says, and 30 ms of round trip.
@@ -36,6 +39,7 @@ UNNAMED_LINK = (
     *("link=netns", "link.share=1", "link.queue_ms=300", "link.delay_ms=15"),
     "link.reverse={kbps: 100000, queue_ms: 300, delay_ms: 15}",
 )
+Limits = Mapping[str, Limit]  # by uplink; "": there is one, without a name
 LEAST_KBPS = 500.0  # windows of a trace in which the link carries less on average are left out
 
 
@@ -92,16 +96,22 @@ class Job(NamedTuple):
 
     @property
     def link_name(self) -> str:
-        return self.run or (self.link if is_family(self.link) else Path(self.link).stem)
+        return self.run or "+".join(part if is_family(part) else Path(part).stem for part in self.parts)
+
+    @property
+    def parts(self) -> list[str]:
+        """The links of several uplinks, in order; the last is that of all others, too."""
+        return self.link.split(BESIDE)
 
 
 class Result(NamedTuple):
-    """A job's figures; took_s: processor time; drive: what happened, where it was asked for."""
+    """A job's figures; took_s: processor time; drive: what happened, where it was asked for; uplinks: their number."""
 
     job: Job
     figures: Figures
     took_s: float
     drive: Drive | None
+    uplinks: int = 1
 
     def to_json(self) -> dict[str, Any]:
         return {**self.job._asdict(), "took_s": round(self.took_s, 3), **self.figures}
@@ -131,7 +141,7 @@ def _of_link(common: Common, link: str, windows: int) -> list[Job]:
     if link == CONFIGURED:
         runs = _composed(common, job)[0].experiment().runs or {"": ()}
         return [_timed(common, job._replace(run=name, words=words)) for name, words in runs.items()]
-    if is_family(link):
+    if is_family(job.parts[0]):
         return [job]
     return [job._replace(begin_s=begin) for begin in _windows(common, job, windows)]
 
@@ -145,7 +155,7 @@ def _timed(common: Common, job: Job) -> Job:
 
 def _windows(common: Common, job: Job, most: int) -> list[float]:
     """Where windows of a file begin, evenly taken from those in which the link carries something."""
-    rates, length = _file(job.link, common.conf)[0], job.duration_s
+    rates, length = _file(job.parts[0], common.conf)[0], job.duration_s
     begins = [begin * length for begin in range(int((rates.times[-1] + 1) / length))] or [0.0]
     usable = [begin for begin in begins if rates.mean(begin, begin + length) >= LEAST_KBPS]
     return [usable[i * len(usable) // most] for i in range(most)] if len(usable) > most else usable or begins[:1]
@@ -202,20 +212,25 @@ def _opportunities(path: Path) -> tuple[Steps, tuple[float, ...]]:
     return Steps(range(len(counts)), [count * OPPORTUNITY_BYTES * KBIT for count in counts]), times
 
 
-def _composed(common: Common, job: Job) -> tuple[Configuration, Limit]:
-    """The configuration of a job, and its link; the rate of the link is that of CONFIGURED only."""
+def _composed(common: Common, job: Job) -> tuple[Configuration, Limits]:
+    """The configuration of a job, and its links by uplink; rates of links are those of CONFIGURED only, or a lane's."""
     return _compose((*_link_words(common), *common.overrides, *job.words), common.conf, job.link == CONFIGURED)
 
 
 @lru_cache(maxsize=64)
-def _compose(words: tuple[str, ...], conf: Path | None, configured: bool) -> tuple[Configuration, Limit]:
+def _compose(words: tuple[str, ...], conf: Path | None, configured: bool) -> tuple[Configuration, Limits]:
+    from runner.configuration.experiment import lane_of
+
     config = configuration(words, conf, runnable=False)
-    link = config.link(None if configured else lambda _: Kbps(0))
+    link = config.link(None if configured else lambda _: Kbps(0), simulated=True)
     if link is None:
         raise ArgumentError("link", "null", "must not be null: it describes the link that is simulated")
-    if link.lanes:
-        raise ArgumentError("link.lanes", ", ".join(link.lanes), "must be null: a simulated link has no lanes")
-    return config, link.limit
+    uplinks = config.document["uplinks"]
+    if link.lanes and not uplinks:
+        rule = "must be null without uplinks: nothing would use but the first lane"
+        raise ArgumentError("link.lanes", ", ".join(link.lanes), rule)
+    lanes = {name: lane_of(config.document, name) for name in uplinks}
+    return config, {name: link.lanes[lane] if lane else link.limit for name, lane in lanes.items()} or {"": link.limit}
 
 
 def _link_words(common: Common) -> tuple[str, ...]:
@@ -253,17 +268,19 @@ def run_job(common: Common, job: Job, keep: bool = False, log: tuple[Path, float
     keep  return what happened, too
     log   directory in which it is logged, and when it began, s since 1970
     """
-    config, limit = _composed(common, job)
+    config, limits = _composed(common, job)
     began = time.process_time()
-    capacity = _capacity(common, job, limit, float(config.document["link"]["share"]))
+    capacities = {n: _capacity(common, job, n, number) for number, n in enumerate(limits)}
     if job.prediction == CONFIGURED:
         seen, _ = config.pqos()
     else:
-        seen = Predictions({"": prediction(job.prediction, capacity, job.duration_s, job.seed)})
-    link, requests, setup = _link(common, job, limit, capacity), config.experiment().requests, config.setup()
+        each = capacities.items()
+        seen = Predictions({n: prediction(job.prediction, own, job.duration_s, job.seed) for n, own in each})
+    requests, setup = config.experiment().requests, config.setup()
+    ways = {n: _link(common, job, number, limits[n], capacities[n]) for number, n in enumerate(limits)}
     with _recorder(common, job, log) as recorder:
-        drive = Simulation(setup, link, seen, job.duration_s, common.conditions, job.seed, recorder, requests).run()
-    return Result(job, figures(drive, common.since_s), time.process_time() - began, drive if keep else None)
+        drive = Simulation(setup, ways, seen, job.duration_s, common.conditions, job.seed, recorder, requests).run()
+    return Result(job, figures(drive, common.since_s), time.process_time() - began, drive if keep else None, len(ways))
 
 
 @contextmanager
@@ -285,24 +302,46 @@ def _recorder(common: Common, job: Job, log: tuple[Path, float] | None) -> Itera
     files.close()
 
 
-def _capacity(common: Common, job: Job, limit: Limit, share: float) -> Steps:
-    duration_s = job.duration_s + MARGIN_S
-    if job.link == CONFIGURED:
-        return Steps.of(limit.kbps_at, duration_s)
+def _capacity(common: Common, job: Job, uplink: str, number: int) -> Steps:
+    """Of the link of an uplink, the first of which has number 0."""
+    duration_s, (config, limits) = job.duration_s + MARGIN_S, _composed(common, job)
+    if job.link == CONFIGURED or _has_own_rate(config.document, uplink):
+        return Steps.of(limits[uplink].kbps_at, duration_s)
+    link = _part(job, number)
     rates = (
-        generate(job.link, job.seed, duration_s)
-        if is_family(job.link)
-        else _file(job.link, common.conf)[0].moved(job.begin_s)
+        generate(link, job.seed + SEEDS * number, duration_s)
+        if is_family(link)
+        else _file(link, common.conf)[0].moved(job.begin_s)
     )
-    return Steps(rates.times, [share * rate for rate in rates.values])
+    share = _lane(config.document, uplink).get("share", config.document["link"]["share"])
+    return Steps(rates.times, [float(share) * rate for rate in rates.values])
 
 
-def _link(common: Common, job: Job, limit: Limit, capacity: Steps) -> Link:
-    """The link that the configuration describes, with this capacity."""
-    back, seed = limit.reverse, job.seed
+def _part(job: Job, number: int) -> str:
+    return job.parts[min(number, len(job.parts) - 1)]
+
+
+def _has_own_rate(document: Mapping[str, Any], uplink: str) -> bool:
+    """Whether the lane of an uplink states a rate."""
+    lane = _lane(document, uplink)
+    return bool(lane.get("file") or lane.get("kbps"))
+
+
+def _lane(document: Mapping[str, Any], uplink: str) -> Mapping[str, Any]:
+    """What the lane of an uplink states; nothing if it has none."""
+    from runner.configuration.experiment import lane_of
+
+    lane = lane_of(document, uplink) if uplink else None
+    own: Mapping[str, Any] = document["link"]["lanes"][lane] if lane else {}
+    return own
+
+
+def _link(common: Common, job: Job, number: int, limit: Limit, capacity: Steps) -> Link:
+    """The link that the configuration describes, with this capacity; number: of its uplink."""
+    back, seed = limit.reverse, job.seed + SEEDS * number
     return Link(
         capacity,
-        _queue(common, job, limit, capacity),
+        _queue(common, job, number, limit, capacity),
         one_way_s=limit.delay_ms / 1000,
         back_s=back.delay_ms / 1000 if back else 0.0,
         delay_at=_in_seconds(limit),
@@ -311,12 +350,14 @@ def _link(common: Common, job: Job, limit: Limit, capacity: Steps) -> Link:
         back=RateQueue(Steps.of(back.kbps_at, job.duration_s), back.queue_ms) if back else None,
         back_losses=LossModel(back.loss, back.burst, seed) if back and back.loss else None,
         tcp=limit.tcp,
+        cuts=[cut for cut in limit.cuts if cut.how != "address"],
     )
 
 
-def _queue(common: Common, job: Job, limit: Limit, capacity: Steps) -> Queue:
+def _queue(common: Common, job: Job, number: int, limit: Limit, capacity: Steps) -> Queue:
     policer = Policer(*limit.policer) if limit.policer else None
-    times = () if job.link == CONFIGURED or is_family(job.link) else _file(job.link, common.conf)[1]
+    link = _part(job, number)
+    times = () if link == CONFIGURED or is_family(link) else _file(link, common.conf)[1]
     if times:
         end = job.begin_s + job.duration_s + MARGIN_S
         within = [t - job.begin_s for t in times if job.begin_s <= t < end]

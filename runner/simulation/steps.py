@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from math import inf
 
 GRID_S = 0.01  # a rate given as a function is read this often; the real link follows it every 20 ms
@@ -27,6 +27,22 @@ class Steps:
                 times.append(step * GRID_S)
                 values.append(value)
         return cls(times, values)
+
+    @classmethod
+    def total(cls, each: Sequence[Steps]) -> Steps:
+        """The sum of several."""
+        if len(each) == 1:
+            return each[0]
+        times = sorted({t for one in each for t in one.times})
+        return cls(times, [sum(one.at(t) for one in each) for t in times])
+
+    def without(self, spans: Iterable[tuple[float, float]]) -> Steps:
+        """With 0 in these spans, each (begin, end)."""
+        spans = list(spans)
+        if not spans:
+            return self
+        times = sorted({*self.times, *(t for span in spans for t in span)})
+        return Steps(times, [0.0 if any(a <= t < b for a, b in spans) else self.at(t) for t in times])
 
     def at(self, t: float) -> float:
         return self.values[max(0, bisect_right(self.times, t + 1e-9) - 1)]

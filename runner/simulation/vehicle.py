@@ -73,7 +73,8 @@ class SimulatedVehicle:
         while self._sent and self._sent[0][1].sent <= t // LOOK_S * LOOK_S:
             name, frame = self._sent.popleft()
             self._sending.add({name: (frame,)})
-        reported = self._sending.judge(ReceptionReported(t, OPERATOR, True, report), report.as_of)
+        placed = {name: each.uplinks for name, each in self.run.decision.settings.items() if each.uplinks}
+        reported = self._sending.judge(ReceptionReported(t, OPERATOR, True, report), report.as_of, placed)
         self.on_report(reported)
         if measured := self._uplinks.take(reported):
             self.take(measured)

@@ -10,8 +10,9 @@ is encoded and nobody waits: one core simulates a minute with eight cameras in a
 links= names the links: synthetic (all that are generated: gauss_0.2_5, gauss_0.5_5, gauss_0.5_1, gauss_0.3_0.3, markov,
 step, ramp, outage, saw), left_out (handover, shared: no number of any rule was chosen by them), a CSV file as
 link.file, a file of mahimahi with opportunities to send (.up, .pps), the directory of a drive over a limited link, or
-configured: the link of the configuration, and the runs of its experiment. Of a file or a drive at most windows= parts
-of duration_s are driven; each drive counts from since_s on. seeds= is their number, or FIRST-LAST.
+configured: the link of the configuration, and the runs of its experiment. Several uplinks have a link each, as in
+one.csv+markov. Of a file or a drive at most windows= parts of duration_s are driven; each drive counts from since_s on.
+seeds= is their number, or FIRST-LAST.
 Everything else about the link is that of link=: link.queue_ms, link.delay_ms, link.delay_file, link.loss,
 link.loss_burst, link.policer, link.tcp, link.reverse, link.share. Without link= it has a queue of 300 ms and 15 ms each
 way.
@@ -93,7 +94,9 @@ def _table(results: Sequence[Result]) -> Iterator[str]:
     groups: dict[tuple[str, str], list[Result]] = {}
     for result in results:
         groups.setdefault((result.job.link_name, result.job.prediction), []).append(result)
-    shown = [key for key in FIGURES if key != "tcp" or any(one.figures["tcp"] for one in results)]
+    left_out = [] if any(one.figures["tcp"] for one in results) else ["tcp"]
+    left_out += [] if any(one.uplinks > 1 for one in results) else ["camera"]
+    shown = [key for key in FIGURES if key not in left_out]
     yield row("link", "prediction", "drives", *(FIGURES[key][0] for key in shown))
     yield row(*["---"] * (len(shown) + 3))
     for (link, kind), some in groups.items():
