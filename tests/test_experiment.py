@@ -36,7 +36,7 @@ TAIL = "experiment: {about: x, duration_s: 5}\n"
 def test_every_packaged_experiment_and_each_of_its_runs_can_be_driven(name: str) -> None:
     config = configuration([f"experiment={name}"], runnable=False)
     experiment, link = config.experiment(), config.link()
-    assert (link is not None) == (name in ("bottleneck", "loss", "rfc8867", "wrong_prediction"))
+    assert (link is not None) == (name in ("bottleneck", "loss", "rfc8867", "two_uplinks", "wrong_prediction"))
     for words in ((), *experiment.runs.values()):
         run = configuration([f"experiment={name}", *words], runnable=False)
         own = [word for word in words if word.startswith("experiment.duration_s=")]
@@ -257,7 +257,7 @@ def test_wrong_lanes_and_cuts_are_reported_together(tod: Command) -> None:
     relayed = ("link=relay", "link.lanes={b: {}}", "link.cuts=[{lane: b, at_s: 1, for_s: 2, how: down}]")
     assert tod("demo", *relayed).problems == [f"command line: link.cuts[0].how: down: {rule}"]
     assert (
-        "link.lanes: a: must be null: a simulated link has no lanes"
+        "link.lanes: a: must be null without uplinks: nothing would use but the first lane"
         in tod("simulate", "link=netns", "link.lanes={a: {}}").err
     )
 
