@@ -270,6 +270,7 @@ def test_predictions_of_one_uplink_concern_that_one() -> None:
         ride.accept("bitrate_predicted", t=t, kbps=1000, uplink="b")
     totals = {name: share.total for name, share in ride.run.decision.uplinks.items()}
     assert totals["a"] == 4 * totals["b"] > 0
+    assert ride.run.decision.asked == ride.run.state.predicted_kbps == 5000
 
 
 def test_the_operators_total_limits_both_together() -> None:

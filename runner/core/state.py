@@ -62,6 +62,13 @@ class State:
             manual={},
         )
 
+    @property
+    def predicted_kbps(self) -> Kbps | None:
+        """For all uplinks together: the newest prediction for these, otherwise the sum of those for single ones."""
+        if self.prediction:
+            return self.prediction.kbps
+        return sum((own.kbps for own in self.predictions.values()), Kbps(0)) if self.predictions else None
+
     def over(self, uplink: str, uplinks: int) -> State:
         """As if this uplink, one of several, were the only one.
 

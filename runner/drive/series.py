@@ -227,11 +227,19 @@ def _warnings(sides: Mapping[str, Side], samples: Sequence[Any]) -> Iterator[str
 
 
 def _predicted(vehicle: _Shifted, telemetry: Sequence[Any], samples: Sequence[Any]) -> TimeSeries:
-    """Predictions as received, or those in force according to the samples."""
+    """Predictions as received, for all uplinks together, or those in force according to the samples."""
     events = vehicle.of(BitratePredicted)
     if events:
-        return TimeSeries.of((t, float(event.kbps)) for t, event in events)
+        return TimeSeries.of(_for_all(events))
     return TimeSeries.of((t, line.predicted_kbps) for t, line in (telemetry or samples))
+
+
+def _for_all(events: Sequence[tuple[float, BitratePredicted]]) -> Iterator[tuple[float, float]]:
+    """As `State.predicted_kbps`, after each event."""
+    known: dict[str, float] = {}
+    for t, event in events:
+        known[event.uplink] = float(event.kbps)
+        yield t, known.get("", sum(known.values()))
 
 
 def _total(samples: Sequence[Any], cameras: Mapping[str, CameraSeries]) -> TimeSeries:

@@ -165,7 +165,7 @@ class Simulation:
         if after.decision is not before.decision and after.decision.total != before.decision.total:
             self.done.totals.extend((event.t, float(after.decision.total)))
         if isinstance(event, BitratePredicted):
-            self.done.predictions.extend((event.t, float(event.kbps)))
+            self.done.predictions.extend((event.t, float(after.state.predicted_kbps or 0)))
         self.recorder.step(before, event, after)
 
     # --- vehicle ---

@@ -80,7 +80,7 @@ class DriveFiles(Recorder):
     def step(self, before: Run, event: Event, after: Run) -> None:
         self._logs["vehicle"].on_step(before, event, after)
         if isinstance(event, BitratePredicted):
-            self._predicted = plain(event.kbps)
+            self._predicted = plain(after.state.predicted_kbps or event.kbps)
         if after.commands or after.decision != before.decision:
             self._logs["operator"].record(vehicle_state(after, event.t, describe(event)))
 

@@ -109,8 +109,8 @@ class Publisher:
             )
             for name, camera in cameras.items()
         }
-        prediction = run.state.prediction
-        predicted = plain(prediction.kbps) if prediction else None
+        known = run.state.predicted_kbps
+        predicted = None if known is None else plain(known)
         position, factor = self._current_position(t), self._speed_factor(run, t)
         links = run.state.links
         uplinks = {name: UplinkTelemetry(own, _measured(links.get(name))) for name, own in addresses.items()}

@@ -12,10 +12,10 @@ from runner.core.rules.registry import Last, Memory, Step, rule
 from runner.core.state import State
 
 
-@rule(gives=["total"], reads=["prediction"])
+@rule(gives=["total"], reads=["prediction", "predictions"])
 def total_from_prediction(vehicle: Vehicle, state: State, draft: Draft, memory: Memory, *, start_kbps: Kbps) -> Step:
     """Mode A: the total is the last prediction of pQoS; `start_kbps` until the first one arrives."""
-    return draft.replaced(total=start_kbps if state.prediction is None else state.prediction.kbps), memory
+    return draft.replaced(total=start_kbps if (known := state.predicted_kbps) is None else known), memory
 
 
 @rule(gives=["total"], reads=["collective_total"])
