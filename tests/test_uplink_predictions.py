@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+import pytest
 from helpers import Command
 
 from runner.configuration.config import configuration
 from runner.configuration.experiment import lane_overrides
 from runner.core.events import BitratePredicted, ClockAdvanced, PositionReported
+from runner.errors import RunError
 from runner.link.limit import Limit
 from runner.settings import Uplink
+from runner.vehicle.live import missing_devices
 
 NARROW = ("vehicle=delivery_robot", "source=test")
 
@@ -120,3 +124,11 @@ def test_print_names_the_sources(tod: Command) -> None:
     ]
     note = "# redundant has no effect on front: it needs two uplinks"
     assert note in tod("print", *NARROW, "++cameras.front.redundant=true").out.splitlines()
+
+
+def test_a_device_that_does_not_exist_is_reported_and_ends_a_strict_vehicle() -> None:
+    uplinks = {"a": Uplink("lo"), "b": Uplink("nix0"), "c": Uplink(address="10.0.0.7")}
+    setup = replace(configuration(NARROW, runnable=False).setup(), uplinks=uplinks)
+    assert missing_devices(setup) == ["uplink b: nix0: no such device; it is used once there is one"]
+    with pytest.raises(RunError, match=r"^uplink b: nix0: no such device$"):
+        missing_devices(replace(setup, strict=True))

@@ -343,7 +343,7 @@ def _check_ros(setup: Setup) -> None:
         check_discovery(setup.ros, setup.insecure)
 
 
-def _missing_devices(setup: Setup) -> list[str]:
+def missing_devices(setup: Setup) -> list[str]:
     """Uplinks whose device does not exist, or not yet. raises RunError if the vehicle must not start without one"""
     missing = [
         f"uplink {name}: {uplink.interface}: no such device"
@@ -398,7 +398,7 @@ def live_vehicle(
     _check_ros(setup)
     render_missing(setup.vehicle, progress)
     plans = compile_plans(setup)
-    lost, missing = apply.check_machine(plans, strict=setup.strict), _missing_devices(setup)
+    lost, missing = apply.check_machine(plans, strict=setup.strict), missing_devices(setup)
     if log and setup.strict:
         check_free(log, "vehicle")
     console = _Console(say)

@@ -18,9 +18,13 @@ from typing import NamedTuple
 import pytest
 from test_link import WIDE, _ends, _left, _python, full_rate
 
-from rig import free_port, needs_root, until
+from rig import SMALL_ROBOT, free_port, needs_root, run, until
+from runner.core.events import BitratePredicted, LinkMeasured
+from runner.drive.read import read_drive
 from runner.link import Limit, limited_link
 from runner.link.limit import Cut
+from runner.records.lines import LinkSample
+from runner.records.operator import Sample
 from runner.settings import Endpoint
 
 # Sends numbered packets over each way, and prints when each was sent, or why not, and what it received.
@@ -304,3 +308,23 @@ def test_lanes_of_a_relay_are_addresses_of_the_vehicle():
         with pytest.raises(TimeoutError):
             received.recv(100)
         link.check()
+
+
+@pytest.mark.gst
+def test_a_vehicle_uses_both_lanes_of_a_relay(tmp_path):
+    """The redundant camera goes on over one while the other is cut."""
+    path, ports = tmp_path / "drive", (f"media.port={free_port()}", f"control.port={free_port()}")
+    cut = "link.cuts=[{lane: b, at_s: 2, for_s: 2, how: silence}]"
+    words = ("experiment=two_uplinks", "~experiment.runs", cut, "link.queue_ms=2000", *SMALL_ROBOT[1:], "source=test")
+    done = run("demo", *words, "page.serve=false", *ports, f"log={path}", "duration_s=4.5")
+    assert done.returncode == 0, done.stderr
+    sides = read_drive(path).sides
+    carried = {line.lane: line.packets for line in sides["link"].of(LinkSample)}
+    assert carried["a"] > 100 and carried["b"] > 100
+    events = sides["vehicle"]
+    assert {event.uplink for event in events.of(BitratePredicted)} == {"a", "b"}
+    assert {event.uplink for event in events.of(LinkMeasured) if event.kbps > 100} == {"a", "b"}
+    stalled = [event.t for event in events.of(LinkMeasured) if event.uplink == "b" and event.state == "stalled"]
+    samples = [line for line in sides["operator"].of(Sample) if line.cameras]
+    arrived = [at for line in samples for at, _ in line.cameras["front"].arrivals if stalled[0] < at < stalled[0] + 1]
+    assert len(arrived) >= 5  # of 10
