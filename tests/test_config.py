@@ -256,6 +256,13 @@ def problems(tod: Command, conf: UserConf, *words: str) -> list[str]:
     return [problem.replace(str(conf.path), "~") for problem in found.problems]
 
 
+def test_uplinks_support_rtsp_only(tod: Command) -> None:
+    rule = "support RTSP only; the graph of front has its own transport; choose graph=h264_rtsp, or name none"
+    found = tod("print", "vehicle=delivery_robot", "source=test", "graph=h264_srt", "uplinks={a: {interface: wwan0}}")
+    assert found.status == 2
+    assert found.problems == [f"command line: uplinks: {rule}; see conf/graph/h264_srt.yaml: transport: 'pipeline'"]
+
+
 @pytest.mark.parametrize("word", ["graph.vehicle.crop.element=x", "graph.vehicle.x=1", "~graph.vehicle.0"])
 def test_an_entry_of_a_list_is_named_by_its_number(tod: Command, word: str) -> None:
     found = tod("print", word)

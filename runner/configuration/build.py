@@ -117,6 +117,8 @@ class Builder:
         ways = document.get("uplinks") or {}  # older drives have none
         for error in uplink_problems(ways):
             self._report(("uplinks",), error)
+        if ways:
+            self._check_uplinks(built)
         known = document.get("dimensions") is not None
         dimensions = self.part(("dimensions",), lambda data: Dimensions(**data)) if known else None
         ros = _ros(document.get("ros", {}))
@@ -257,6 +259,13 @@ class Builder:
         for key in path:
             data = data[key]
         return self.attempt(path, lambda: make(data))
+
+    def _check_uplinks(self, cameras: Mapping[str, Camera]) -> None:
+        """Check that the cameras can use uplinks that are named."""
+        for name in [name for name, camera in cameras.items() if camera.graph.transport != "rtsp"][:1]:
+            rule = f"support RTSP only; the graph of {name} has its own transport; choose graph=h264_rtsp, or name none"
+            other = self._place(("cameras", name), "graph.transport")
+            self.problems.append(self.composed.problem(("uplinks",), None, rule, [other]))
 
     def check_link(self, link: LinkSettings, *, needs_lanes: bool) -> None:
         """Check that all cameras can use a limited link, and that its kind supports the settings.

@@ -35,6 +35,7 @@ LONGEST_MS = 300  # a picture that is later is useless for driving
 RETRANSMITTED = Gst.BufferFlags.LAST  # GST_RTP_BUFFER_FLAG_RETRANSMISSION, which has the same value
 FRAMES = 64  # whose end is remembered
 OVER_TCP = "over TCP, since UDP was refused: are the vehicle's media.rtp_ports in use?"
+BY_ROUTE = "over TCP by the vehicle's routes: none of its uplinks carries it or is measured by it"
 
 
 class RepairBuffer:
@@ -211,6 +212,7 @@ class RtpSession:
         self._over_udp = self._feedback = False  # transport and profile
         self._kernel_times = False  # whether packets state when the kernel received them
         self._may_use_udp = False  # until it is known whether it does
+        self._may_use_uplinks = self.uplinks is not None  # likewise
         if self.uplinks:
             self.uplinks.begin()
 
@@ -260,10 +262,12 @@ class RtpSession:
             buffer.request_tail()
 
     def report_transport(self) -> None:
-        """Once packets arrive: say it if UDP was wanted. Over TCP a late packet holds back all that follow."""
+        """Once packets arrive: say it if UDP or uplinks were wanted. Over TCP a late packet holds back what follows."""
         if self._may_use_udp and not self._over_udp:
             self._on_report(OVER_TCP)
-        self._may_use_udp = False
+        if self._may_use_uplinks and not self._over_udp:
+            self._on_report(BY_ROUTE)
+        self._may_use_udp = self._may_use_uplinks = False
 
     def take_arrivals(self) -> list[Arrival]:
         """Frames that arrived since the last call, without waiting for missing packets. From any one thread."""

@@ -8,7 +8,7 @@ import struct
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
@@ -111,7 +111,12 @@ class Operator:
 
 @contextmanager
 def drive(
-    tmp_path: Path, keys: bool, addresses: Mapping[str, str] = ADDRESSES, host: str = "", cut: str = ""
+    tmp_path: Path,
+    keys: bool,
+    addresses: Mapping[str, str] = ADDRESSES,
+    host: str = "",
+    cut: str = "",
+    receiver: Sequence[str] = (),
 ) -> Iterator[tuple[Ways, Vehicle, Operator]]:
     """host: media.host of the vehicle, "": any. cut: ways that are cut before the operator's side begins"""
     port = free_port()
@@ -124,7 +129,7 @@ def drive(
         vehicle = Vehicle(ways, [*words, *own[0]])
         for name in cut:
             ways[name].is_cut = True
-        operator = Operator([*words, *own[1]], addresses)
+        operator = Operator([*words, *own[1], *receiver], addresses)
         try:
             with repeating(operator.sample, SAMPLES_S):
                 until(lambda: len(operator.units) > FPS)
@@ -186,6 +191,15 @@ def test_over_ipv6(tmp_path: Path) -> None:
             for port in ports:
                 stranger.sendto(bytes(100), (OPERATOR_6, port))
         until(lambda: operator.sample().foreign)
+
+
+@needs_root
+def test_over_tcp_no_uplink_carries_a_camera(tmp_path: Path) -> None:
+    with drive(tmp_path, keys=False, receiver=["graph.receiver.0.properties.protocols=tcp"]) as (_, vehicle, operator):
+        assert vehicle.sent == {"a": 0, "b": 0}
+        until(lambda: operator.reported)
+        reported = "over TCP by the vehicle's routes: none of its uplinks carries it or is measured by it"
+        assert operator.reported == [f"{CAMERA}: {reported}"]
 
 
 @needs_root
