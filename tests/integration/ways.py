@@ -34,6 +34,11 @@ def whole(address: str) -> str:
     return f"{address}/128 nodad" if ":" in address else f"{address}/32"
 
 
+def operator_at(address: str) -> str:
+    """The operator's address of the same family."""
+    return OPERATOR_6 if ":" in address else OPERATOR
+
+
 def ip(words: str) -> None:
     subprocess.run(["ip", *words.split()], check=True, timeout=WAIT_S)
 
@@ -64,8 +69,8 @@ class Way:
         metric = 1 + list(ADDRESSES).index(self.name)
         ip(f"link set dev {self.device} netns {self._vehicle.pid}")
         ip(f"link set dev {self._near} up")
-        family, operator = ("-6", OPERATOR_6) if ":" in address else ("-4", OPERATOR)
-        ip(f"route add {address} dev {self._near} src {operator}")
+        family = "-6" if ":" in address else "-4"
+        ip(f"route add {address} dev {self._near} src {operator_at(address)}")
         self._vehicle.run(f"ip addr add {whole(address)} dev {self.device}")
         self._vehicle.run(f"ip link set dev {self.device} up")
         self._vehicle.run(f"ip {family} route add default dev {self.device} metric {metric}")
@@ -103,7 +108,8 @@ class Ways:
     def __init__(self, vehicle: Machine, addresses: Mapping[str, str]) -> None:
         self.vehicle = vehicle
         ip("link set dev lo up")
-        for own in (OPERATOR, OPERATOR_6):
+        self._own = {operator_at(address) for address in addresses.values()}
+        for own in self._own:
             ip(f"addr add {whole(own)} dev lo")
         self.named = {name: Way(name, vehicle, address) for name, address in addresses.items()}
         self._ended = False
@@ -139,7 +145,7 @@ class Ways:
         self._thread.join()
         for way in self.named.values():
             way.remove()
-        for own in (OPERATOR, OPERATOR_6):
+        for own in self._own:
             ip(f"addr del {whole(own).split()[0]} dev lo")
 
 
