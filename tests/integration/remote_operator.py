@@ -45,7 +45,7 @@ def main(words: list[str]) -> None:
     def build(_on_unit: object) -> apply.OperatorSide:
         return apply.OperatorSide(
             plans,
-            station.report,
+            lambda camera, what: station.note(f"{camera}: {what}"),
             on_picture=lambda camera, *_: report(what=camera, t=time.monotonic()),
             operator=station.identity,
             keyring=keyring,
