@@ -171,8 +171,8 @@ class VehicleSide:
         may_listen: Callable[[str], bool] = lambda address: False,
     ) -> None:
         self._on_report, self._video = on_report, video
-        own = import_module("runner.gst.uplinks") if uplinks else None
-        self._uplinks = own and own.VehicleUplinks(uplinks, on_report, may_listen)
+        kind: Any = uplinks and import_module("runner.gst.uplinks").VehicleUplinks
+        self._uplinks = kind(uplinks, on_report, may_listen) if kind else None
         passphrase = keyring.watched_passphrase(lambda what: on_report("keys", what)).get if keyring else None
         plans = _with_clip_range(_with_video(plans, video, "vehicle"))
         self._lock = threading.Lock()

@@ -353,11 +353,6 @@ def test_a_viewer_connects_by_another_uplink_if_the_first_is_cut(tmp_path: Path)
         assert operator.side.received()[CAMERA]["b"].packets > FPS
 
 
-def payload_type(packet: bytes) -> int:
-    """Of an RTP packet; 0 of another one."""
-    return packet[29] & 0x7F if packet[23] % 2 == 0 and packet[9] == socket.IPPROTO_UDP and len(packet) > 100 else 0
-
-
 @needs_root
 def test_what_is_lost_is_sent_again_although_the_other_uplink_is_cut(tmp_path: Path) -> None:
     """That by which the operator is connected. By both, a request is sent twice, and granted once."""
