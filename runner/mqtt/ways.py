@@ -68,7 +68,12 @@ class ControlLinks:
 
     def publish(self, topic: str, message: JsonObject) -> bool:
         """Send a message by every uplink; returns False if all that work have earlier ones waiting."""
-        sent = [self._publish(name, topic, message) for name, link in self._links.items() if link.is_connected]
+        sent = list[bool]()
+        for name, link in self._links.items():
+            if link.is_connected:
+                sent.append(self._publish(name, topic, message))
+            else:
+                self._owed.pop(name, None)  # whoever publishes does so anew once it is connected
         return any(sent) or not sent
 
     def close(self, *goodbye: tuple[str, JsonObject]) -> None:
