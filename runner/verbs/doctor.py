@@ -2,8 +2,8 @@
 
 Lists what this machine lacks to run a verb with this configuration, and how to install it: Python packages, GStreamer
 and its bindings, elements, broker, free ports, certificates that are valid for 30 more days, cameras and the USB
-bandwidth they share, cores. The default verb is `demo`, which needs everything that both sides need. Ends with status 1
-if something is missing.
+bandwidth they share, uplinks, cores. The default verb is `demo`, which needs everything that both sides need. Ends with
+status 1 if something is missing.
 
   tod-runner doctor
   tod-runner doctor vehicle source=v4l2 graph=h264_va_rtsp
@@ -19,7 +19,7 @@ from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from runner.configuration.config import configuration
 from runner.core.model import Camera, Vehicle
@@ -36,6 +36,7 @@ from runner.system.rtsp import OK, UNAUTHORIZED, describe
 from runner.system.usb import UsbCamera, buses
 from runner.system.v4l2 import device_problem
 from runner.verbs import VERBS, Arguments, study_word
+from runner.verbs.doctor_uplinks import Diagnosis, check_uplinks
 
 IMPORT_S = 30  # rclpy or rospy loads within a second
 CORE_MPX_S = 180  # cropped, scaled and encoded per core and second at factor 0.5, measured with h264_rtsp
@@ -53,13 +54,6 @@ NEEDED = {  # extras of this package that a verb needs with any configuration
     "quality": ("model",),
     "export": ("mcap",),
 }
-
-
-class Diagnosis(NamedTuple):
-    """The result of one check."""
-
-    fine: bool
-    what: str
 
 
 def run(arguments: Arguments) -> int:
@@ -108,6 +102,8 @@ def examine(verb: str, setup: Setup, document: Mapping[str, Any]) -> Iterator[Di
         yield from _devices(vehicle)
         yield from _ip_cameras(vehicle)
     if verb in ("vehicle", "demo"):
+        if not (document.get("link") or {}).get("lanes"):  # they make the devices of the uplinks
+            yield from check_uplinks(setup.uplinks, setup.control.host)
         yield _cores(vehicle)
     subscribes = any(camera.source.subscribes for camera in vehicle.cameras.values())
     publishes = setup.ros.pictures and verb in ("operator", "demo")

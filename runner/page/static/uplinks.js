@@ -24,7 +24,7 @@ export function uplinkLines(state, sample) {
 }
 
 const measuredWords = (measured) => `${whole(measured?.queue_ms)}${UNBROKEN}ms, ${whole(100 * measured?.loss)}${UNBROKEN}% lost`;
-const titled = (why) => ["Uplink: received of allowed, queue, loss, cameras", why].filter(Boolean).join("; ");
+const titled = (why) => ["Uplink: received, with packet headers, of allowed; queue, loss, cameras", why].filter(Boolean).join("; ");
 
 /** Show the lines in an element, which is hidden while there are none. @param {HTMLElement} element  @param {Line[]} lines */
 export function showUplinks(element, lines) {
