@@ -19,7 +19,8 @@ export function uplinkLines(state, sample) {
     const isAll = cameras.length > 1 && cameras.length === Object.keys(state.cameras).length;
     const carries = isAll ? "all cameras" : cameras.map(displayName).join(", ") || "no camera";
     const what = isStalled ? "STALLED" : `${whole(measured?.kbps)} of ${whole(total_kbps)}${UNBROKEN}kbit/s, ${measuredWords(measured)}`;
-    return { text: `${isStalled ? "✕ " : ""}${name}: ${what}: ${carries}`, title: titled(isStalled ? "nothing arrives" : reason), isStalled };
+    const text = `${isStalled ? "✕ " : ""}${name}: ${what}: ${carries}`;
+    return { text, title: titled(isStalled ? "nothing arrives" : reason), isStalled };
   });
 }
 
