@@ -16,15 +16,20 @@ from math import inf
 from typing import NamedTuple
 
 import pytest
+from msgspec import UNSET
 from test_link import WIDE, _ends, _left, _python, full_rate
 
 from rig import SMALL_ROBOT, free_port, needs_root, run, until
 from runner.core.events import BitratePredicted, LinkMeasured
-from runner.drive.read import read_drive
+from runner.drive.read import Drive, read_drive
+from runner.drive.series import series
+from runner.drive.statistics import statistics
 from runner.link import Limit, limited_link
 from runner.link.limit import Cut
-from runner.records.lines import LinkSample
+from runner.records.decisions import DecisionMade
+from runner.records.lines import LinkSample, Note
 from runner.records.operator import Sample
+from runner.records.vehicle import Telemetry
 from runner.settings import Endpoint
 
 # Sends numbered packets over each way, and prints when each was sent, or why not, and what it received.
@@ -328,3 +333,14 @@ def test_a_vehicle_uses_both_lanes_of_a_relay(tmp_path):
     samples = [line for line in sides["operator"].of(Sample) if line.cameras]
     arrived = [at for line in samples for at, _ in line.cameras["front"].arrivals if stalled[0] < at < stalled[0] + 1]
     assert len(arrived) >= 5  # of 10
+    decided = [each for each in events.of(DecisionMade) if each.uplinks is not UNSET and each.uplinks["b"].stalled]
+    assert {decided[-1].cameras[name].uplinks for name in ("rear", "mast")} >= {("a",)}
+    assert "over a and b: redundant" in decided[-1].cameras["front"].reason
+    sent = [each for line in events.of(Telemetry) if (each := line.cameras["front"].sent) is not UNSET][-1]
+    received = samples[-1].cameras["front"].received
+    assert all(0 < received[name].packets <= sent[name].packets for name in "ab")
+    assert received["b"].packets < received["a"].packets, "b was cut"
+    assert any(note.text.startswith("uplink b: nothing arrives") for note in sides["operator"].of(Note))
+    found = statistics(series(Drive(path, sides))).uplinks
+    assert (found["a"].stalls, found["b"].stalls) == (0, 1)
+    assert 1 < found["b"].stalled_s < 2.5
