@@ -35,7 +35,7 @@ def _rates(series: Series) -> Iterable[Curve]:
     """By uplink, allowed and received; and the rates of the lanes of a limited link, 0 while they are cut."""
     for number, (lane, link) in enumerate(series.links.items()):
         if lane:
-            yield steps(f"lane {lane}", TimeSeries(link.t, link.kbps), series, "link", dash=number, width=1.2)
+            yield steps(f"lane {lane}", TimeSeries(link.t, link.kbps), series, "text", dash=2 + number, width=0.7)
     for number, (name, each) in enumerate(series.uplinks.items()):
         yield steps(f"{name} allowed", each.allowed, series, number, dash=1)
         yield Curve(f"{name} received", *each.received, number, width=0.8)
