@@ -48,6 +48,10 @@ STALE = "no prediction for 2 s"
         (state(PREDICTED, rear=camera(reason="another")), None),
         (state(PREDICTED, rear=camera(0.25, reason=LOW)), f"Prediction 900 kbit/s: rear 0.5 -> 0.25 ({LOW})"),
         (
+            state("bitrate_predicted uplink a kbps 900", rear=camera(0.25, reason=LOW)),
+            f"Prediction 900 kbit/s, uplink a: rear 0.5 -> 0.25 ({LOW})",
+        ),
+        (
             state(PREDICTED, total=900, rear=camera(0.25), front=camera(0.25), mast=camera(0.125)),
             "Prediction 900 kbit/s: front, rear 0.5 -> 0.25; mast 0.5 -> 0.125 (3 of 3 cameras, total 900 kbit/s)",
         ),

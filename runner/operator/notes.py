@@ -101,8 +101,9 @@ def _cause(described: str) -> str:
     if event not in EVENTS:
         return described
     phrase = CAUSES.get(event, event.replace("_", " ").capitalize())
+    values = dict(zip(words[::2], words[1::2], strict=False))
     try:
-        return phrase.format_map(dict(zip(words[::2], words[1::2], strict=False)))
+        return phrase.format_map(values) + (f", uplink {values['uplink']}" if values.get("uplink") else "")
     except KeyError:
         return described
 
