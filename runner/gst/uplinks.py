@@ -5,7 +5,7 @@ the viewers on the vehicle alone. For the others each uplink has sinks behind th
 
     rtpbin ! tee ! library's sink
              tee ! valve ! queue ! multiudpsink   for each uplink; the valve is open while it carries the camera
-    udpsrc ! funnel ! rtpbin                      for each uplink; the library's funnel takes RTCP from its socket
+    udpsrc ! funnel ! rtpbin                      for each uplink; RTCP of viewers, by the library's funnel
 """
 
 from __future__ import annotations
