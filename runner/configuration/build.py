@@ -264,8 +264,9 @@ class Builder:
         """Check that the cameras can use uplinks that are named."""
         for name in [name for name, camera in cameras.items() if camera.graph.transport != "rtsp"][:1]:
             rule = f"support RTSP only; the graph of {name} has its own transport; choose graph=h264_rtsp, or name none"
-            other = self._place(("cameras", name), "graph.transport")
-            self.problems.append(self.composed.problem(("uplinks",), None, rule, [other]))
+            self.problems.append(
+                self.composed.problem(("uplinks",), None, rule, [self._place(("cameras", name), "graph.transport")])
+            )
 
     def check_link(self, link: LinkSettings, *, needs_lanes: bool) -> None:
         """Check that all cameras can use a limited link, and that its kind supports the settings.
