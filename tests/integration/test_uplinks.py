@@ -118,9 +118,9 @@ def drive(
     cut: str = "",
     receiver: Sequence[str] = (),
 ) -> Iterator[tuple[Ways, Vehicle, Operator]]:
-    """host: media.host of the vehicle, "": any. cut: ways that are cut before the operator's side begins"""
+    """host: media.host of the vehicle, "": all. cut: ways that are cut before the operator's side begins"""
     port = free_port()
-    host = host or ("'::'" if addresses is ADDRESSES_6 else "0.0.0.0")
+    host = host or "0.0.0.0"
     words = [*small_robot(CAMERA), "source=test", f"media.host={host}", f"media.port={port}", "page.serve=false"]
     holders = [issue(tmp_path / "keys") / name for name in (VEHICLE, CONTROLLER)] if keys else []
     own = [[f"keys={holder}"] for holder in holders] or [["insecure=true"]] * 2
@@ -177,7 +177,7 @@ def test_a_camera_changes_its_uplink_and_no_picture_is_lost(tmp_path: Path, keys
 @pytest.mark.skipif(LOOPBACK6 != "::1", reason="needs IPv6")
 def test_over_ipv6(tmp_path: Path) -> None:
     """A camera changes its uplink, and packets from another address are dropped."""
-    with drive(tmp_path, keys=False, addresses=ADDRESSES_6) as (ways, vehicle, operator):
+    with drive(tmp_path, keys=False, addresses=ADDRESSES_6, host=f"'{ADDRESSES_6['a']}'") as (ways, vehicle, operator):
         assert OPERATOR_6 in addresses_of("lo")
         ports: set[int] = set()
         ways["b"].seen = lambda packet: ports.add(int.from_bytes(packet[42:44], "big")) is None
