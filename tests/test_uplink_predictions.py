@@ -119,8 +119,8 @@ def test_uplinks_of_a_relay_send_from_the_addresses_of_its_lanes() -> None:
 def test_print_names_the_sources(tod: Command) -> None:
     words = ("uplinks={a: {interface: w0, pqos: {kind: live}}, b: {address: 10.0.0.7}}", "pqos=constant")
     assert tod("print", *NARROW, *words).out.splitlines()[1:3] == [
-        "# uplink a: interface w0, predictions live",
-        "# uplink b: address 10.0.0.7, predictions constant 5000 kbit/s, for all together",
+        "# uplink a: 1500 kbit/s, interface w0, predictions live",
+        "# uplink b: 1500 kbit/s, address 10.0.0.7, predictions constant 5000 kbit/s, for all together",
     ]
     note = "# redundant has no effect on front: it needs two uplinks"
     assert note in tod("print", *NARROW, "++cameras.front.redundant=true").out.splitlines()

@@ -14,7 +14,7 @@ from runner import schema
 from runner.clips import view
 from runner.configuration.origin import GRAPH_PARTS, Composed
 from runner.configuration.rule_lists import call_entry, check_order
-from runner.configuration.uplinks import built_uplinks, reserves_kbps, uplink_problems
+from runner.configuration.uplinks import Ways, built_uplinks, reserves_kbps, uplink_problems
 from runner.core.commands import KnobValue
 from runner.core.model import (
     Camera,
@@ -115,10 +115,7 @@ class Builder:
         page = PageSettings(**document["page"])
         inputs = self.part(("inputs",), lambda data: Inputs(**data)) if "inputs" in document else None
         ways = document.get("uplinks") or {}  # older drives have none
-        for error in uplink_problems(ways):
-            self._report(("uplinks",), error)
-        if ways:
-            self._check_uplinks(built)
+        self._check_uplinks(ways, built)
         known = document.get("dimensions") is not None
         dimensions = self.part(("dimensions",), lambda data: Dimensions(**data)) if known else None
         ros = _ros(document.get("ros", {}))
@@ -260,13 +257,14 @@ class Builder:
             data = data[key]
         return self.attempt(path, lambda: make(data))
 
-    def _check_uplinks(self, cameras: Mapping[str, Camera]) -> None:
-        """Check that the cameras can use uplinks that are named."""
-        for name in [name for name, camera in cameras.items() if camera.graph.transport != "rtsp"][:1]:
+    def _check_uplinks(self, ways: Ways, cameras: Mapping[str, Camera]) -> None:
+        """Check that they are different ways, and that all cameras can use them."""
+        for error in uplink_problems(ways):
+            self._report(("uplinks",), error)
+        for name in [name for name, camera in cameras.items() if ways and camera.graph.transport != "rtsp"][:1]:
             rule = f"support RTSP only; the graph of {name} has its own transport; choose graph=h264_rtsp, or name none"
-            self.problems.append(
-                self.composed.problem(("uplinks",), None, rule, [self._place(("cameras", name), "graph.transport")])
-            )
+            other = self._place(("cameras", name), "graph.transport")
+            self.problems.append(self.composed.problem(("uplinks",), None, rule, [other]))
 
     def check_link(self, link: LinkSettings, *, needs_lanes: bool) -> None:
         """Check that all cameras can use a limited link, and that its kind supports the settings.

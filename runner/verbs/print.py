@@ -153,10 +153,10 @@ def as_json(plans: Sequence[Plan], decision: Decision, uplinks: Uplinks) -> dict
 def as_text(vehicle: Vehicle, plans: Sequence[Plan], decision: Decision, uplinks: Uplinks) -> str:
     lines = [f"# {vehicle.name}, mode {decision.mode}, total {plain(decision.total)} kbit/s"]
     for name, way in uplinks.items():
-        words = [f"{key} {value}" for key, value in way.items()]
-        if share := decision.uplinks.get(name):
-            words += filter(None, (f"{plain(share.total)} kbit/s", share.reason))
-        lines.append(f"# uplink {name}: {', '.join(words)}")
+        share = decision.uplinks.get(name)
+        words = [f"{plain(share.total)} kbit/s", share.reason] if share else []
+        words += [f"{key} {value}" for key, value in way.items()]
+        lines.append(f"# uplink {name}: {', '.join(filter(None, words))}")
     lines += [f"# {note}" for note in _notes(plans, uplinks)]
     for plan in plans:
         setting = decision.settings[plan.camera.name]
