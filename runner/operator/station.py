@@ -310,9 +310,9 @@ class Station:
             if self._published and self._uplinks_lost < self.addresses.keys():
                 return  # it has others
             state = None
-        self._known.add(name, state is not None)
         if state and not self._newest.takes("state", state.t, time.monotonic()):
             return
+        self._known.add(name, state is not None)
         self._published = state
         self._signed_off = state is None
         if state:
