@@ -36,7 +36,15 @@ def device_towards(host: str, *, source: str | None = None, device: str | None =
     """
     given = [*(("from", source) if source else ()), *(("oif", device) if device else ())]
     found = _ip("route", "get", host, *given)
+    if device and not _ip("route", "get", "fibmatch", host, *given) and _asks_neighbours(device):
+        return None  # the kernel takes every host for a neighbour then, and none answers
     return str(found[0]["dev"]) if found else None
+
+
+def _asks_neighbours(device: str) -> bool:
+    """Whether a device, such as one of Ethernet, needs the hardware address of the next host."""
+    (found,) = _ip("link", "show", "dev", device) or [{"flags": []}]
+    return "NOARP" not in found["flags"]
 
 
 def _ip(*words: str) -> list[dict[str, Any]] | None:

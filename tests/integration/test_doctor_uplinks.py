@@ -30,13 +30,16 @@ def found(machine: Machine, host: str, **uplinks: Mapping[str, str]) -> list[lis
 
 @pytest.fixture(scope="module")
 def modems():
-    """wwan0 with two addresses and the only route, wwan1 without an address, wwan2 with one."""
+    """wwan0 with two addresses and the only route, wwan1 without an address, wwan2 and Ethernet with one."""
     with machines("modems") as (machine,):
         for device in ("wwan0", "wwan1", "wwan2"):
             machine.run(f"ip tuntap add dev {device} mode tun")
             machine.run(f"ip link set {device} up")
         for address, device in (("10.1.0.2/24", "wwan0"), ("10.1.0.3/24", "wwan0"), ("10.2.0.2/24", "wwan2")):
             machine.run(f"ip address add {address} dev {device}")
+        machine.run("ip link add eth0 type veth peer name router")
+        machine.run("ip link set eth0 up")
+        machine.run("ip address add 10.3.0.2/24 dev eth0")
         machine.run("ip route add 10.9.0.0/24 dev wwan0")
         yield machine
 
@@ -47,16 +50,19 @@ def test_devices_and_addresses(modems: Machine) -> None:
         [True, "uplink a: wwan0, 10.1.0.2, 10.1.0.3"],
         [False, "uplink b: there is no interface wwan3, did you mean wwan2?"],
         [False, "uplink c: wwan1 has no address: is its modem connected?"],
-        [False, "uplink d: 10.1.0.9 is no address of this machine; it has 10.1.0.2, 10.1.0.3, 10.2.0.2"],
+        [False, "uplink d: 10.1.0.9 is no address of this machine; it has 10.1.0.2, 10.1.0.3, 10.2.0.2, 10.3.0.2"],
     ]
 
 
 def test_routes(modems: Machine) -> None:
-    """Bound to a device, packets leave by it; from an address alone they take the system's route."""
+    """Bound to a device, packets leave by it, by Ethernet with a route; from an address alone they take the system's."""
     route = f"has a route to {HOST}"
     assert found(modems, HOST, a={"interface": "wwan0"}, b={"interface": "wwan2"}) == [
         [True, f"uplink a: wwan0, 10.1.0.2, 10.1.0.3, {route}"],
         [True, f"uplink b: wwan2, 10.2.0.2, {route}"],
+    ]
+    assert found(modems, HOST, a={"interface": "eth0"}) == [
+        [False, f"uplink a: no route from eth0 to the control link's host {HOST}"],
     ]
     assert found(modems, HOST, a={"address": "10.1.0.2"}, b={"address": "10.2.0.2"}) == [
         [True, f"uplink a: wwan0, 10.1.0.2, {route}"],
