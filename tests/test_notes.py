@@ -104,6 +104,8 @@ def over(*stalled: str, **cameras: str) -> VehicleState:
         (over(front="ab", rear="a", mast="b"), []),
         (over(front="ab", rear="ba", mast="b"), ["rear goes over b"]),  # both carry it for a moment
         (over("a", front="ab", rear="b", mast="b"), ["uplink a: nothing arrives; rear goes over b"]),
+        (over("a", front="ba", rear="b", mast="b"), ["uplink a: nothing arrives; rear goes over b"]),
+        (over(front="b", rear="a", mast="b"), []),
         (over("b", front="ab", rear="a", mast="ab"), ["uplink b: nothing arrives; mast goes over a"]),
         (over("a", "b", front="ab", rear="a", mast="b"), [f"uplink {name}: nothing arrives" for name in "ab"]),
     ],

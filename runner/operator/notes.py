@@ -76,9 +76,9 @@ def _uplink_notes(before: VehicleState, state: VehicleState) -> Iterator[str]:
         return
     moved: dict[tuple[str, str], list[str]] = {}
     for name, camera in state.cameras.items():
-        was, now = (_own_uplink(each) for each in (before.cameras.get(name, camera), camera))
-        if was and now and was != now:
-            moved.setdefault((was, now), []).append(name)
+        was, now = (_carriers(each) for each in (before.cameras.get(name, camera), camera))
+        if was and now and now[0] not in was:  # otherwise it has carried the camera already, as of a redundant one
+            moved.setdefault((was[0], now[0]), []).append(name)
     for uplink, own in state.uplinks.items():
         if uplink in before.uplinks and before.uplinks[uplink].stalled != own.stalled:
             away = [_go(moved.pop(way), way[1]) for way in list(moved) if own.stalled and way[0] == uplink]
@@ -86,9 +86,8 @@ def _uplink_notes(before: VehicleState, state: VehicleState) -> Iterator[str]:
     yield from (_go(names, to) for (_, to), names in moved.items())
 
 
-def _own_uplink(camera: CameraState) -> str | None:
-    """The first of those that carry a camera; None: nothing is said of that."""
-    return None if camera.uplinks is UNSET else camera.uplinks[0]
+def _carriers(camera: CameraState) -> Sequence[str]:
+    return () if camera.uplinks is UNSET else camera.uplinks
 
 
 def _go(names: Sequence[str], uplink: str) -> str:
