@@ -248,6 +248,18 @@ def test_cameras_that_get_less_than_their_stalled_uplink_gave_them_are_cut_off()
     assert cut_off(before, replace(after, settings=louder)) == []
 
 
+def test_while_both_uplinks_carry_a_camera_that_moves_none_is_to_carry_more_than_it_can() -> None:
+    ride = Vehicle()
+    ride.drive(20, a=3000, b=3000)
+    ride.drive(3, a=3000, b=None)
+    moving = 0
+    for _ in range(300):
+        ride.drive(0.04, a=3000, b=3000)
+        moving += any(len(each.uplinks) > 1 for name, each in ride.run.decision.settings.items() if name != "front")
+        assert all(ride.load(name) <= share.total for name, share in ride.run.decision.uplinks.items())
+    assert moving
+
+
 def test_with_both_uplinks_stalled_the_redundant_camera_gets_what_the_worse_would_give_it() -> None:
     ride = Vehicle()
     ride.drive(20, a=3000, b=1500)

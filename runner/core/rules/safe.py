@@ -51,7 +51,15 @@ def _shared(vehicle: Vehicle, state: State, draft: Draft, wanted: Mapping[str, K
         name: (living[name] or uplinks) if name in living else uplinks[:1] for name, uplinks in draft.placed.items()
     }
     totals = {name: share.total for name, share in draft.uplinks.items()}
-    return shared(limits, totals, wanted, partial(_shared_among, vehicle, state))
+    share = partial(_shared_among, vehicle, state)
+    given = shared(limits, totals, wanted, share)
+    copies = {name: others for name, on in draft.placed.items() if (others := set(on).difference(limits[name]))}
+    if not copies:
+        return given
+    for name, others in copies.items():  # as of a camera that moves; they take from what the other cameras get
+        totals |= {at: max(allocation.ZERO, totals[at] - given[name]) for at in others}
+    again = shared(limits, totals, wanted, share)
+    return again | {name: min(given[name], again[name]) for name in copies}
 
 
 def _shared_among(vehicle: Vehicle, state: State, wanted: Mapping[str, Kbps], total: Kbps) -> Mapping[str, Kbps]:
