@@ -50,9 +50,9 @@ AFTER_S = 2.0  # after a cut, in which cameras move
 LOST = ("the control link is lost", "the vehicle is offline", "the vehicle has been silent")  # how notes begin
 CONTROL = "c"  # lane of everything but the cameras
 COMMON = ("modes=safe", "mode=automatic", "source=test", "link=netns", "page.serve=false", "fps_max=10")
-CAMERA = (
-    f"cameras.{REDUNDANT}.redundant=true",
-    f"cameras.{REDUNDANT}.rate_quality={{scaling: [0.25, 0.5], b_min_kbps: [0, 250], b_full_kbps: {REDUNDANT_KBPS}}}",
+REDUNDANT_OF = {"delivery_robot": REDUNDANT, "tum_q7": "front_center"}
+LIMITED = (
+    f"cameras.{REDUNDANT}.rate_quality={{scaling: [0.25, 0.5], b_min_kbps: [0, 250], b_full_kbps: {REDUNDANT_KBPS}}}"
 )
 UPLINKS = "uplinks={a: {interface: a}, b: {interface: b}}"
 
@@ -115,7 +115,7 @@ def main() -> None:
         kind.add_argument("--quick", action="store_true", help="one cut of each length")
         kind.add_argument("--keys", action="store_true")
         kind.add_argument("--control", action="store_true", help="let the control link use the uplinks, too")
-        kind.add_argument("--vehicle", default="delivery_robot")
+        kind.add_argument("--vehicle", choices=REDUNDANT_OF, default="delivery_robot" if name == "cuts" else "tum_q7")
         kind.add_argument("--seconds", type=int, default=60, help="of a drive without cuts")
     options = parser.parse_args()
     options.work(options)
@@ -150,7 +150,7 @@ def cuts(options: argparse.Namespace) -> None:
     a, b = (_rates(path) for path in options.traces)
     planned = plan(a, b, options.lengths, 1 if options.quick else options.moments, random.Random(options.seed))
     path = options.output / f"cuts-{options.how}{'-keys' if options.keys else ''}"
-    words = [*_words(options), f"duration_s={planned[-1].at_s + planned[-1].for_s + PAUSE_S:g}"]
+    words = [*_words(options), LIMITED, f"duration_s={planned[-1].at_s + planned[-1].for_s + PAUSE_S:g}"]
     of_lane = (f"{{lane: a, at_s: {cut.at_s}, for_s: {cut.for_s}, how: {options.how}}}" for cut in planned)
     words.append(f"link.cuts=[{', '.join(of_lane)}]")
     words.append(lanes(*(f"file: {trace.resolve()}" for trace in options.traces), control=options.control))
@@ -171,7 +171,8 @@ def cuts(options: argparse.Namespace) -> None:
 
 
 def _words(options: argparse.Namespace) -> list[str]:
-    words = [*COMMON, UPLINKS, f"vehicle={options.vehicle}", *(CAMERA if options.vehicle == "delivery_robot" else ())]
+    redundant = REDUNDANT_OF[options.vehicle]
+    words = [*COMMON, UPLINKS, f"vehicle={options.vehicle}", f"cameras.{redundant}.redundant=true"]
     if not options.keys:
         return words
     directory = (options.output / "keys").resolve()
