@@ -55,7 +55,7 @@ def test_devices_and_addresses(modems: Machine) -> None:
 
 
 def test_routes(modems: Machine) -> None:
-    """Bound to a device, packets leave by it, by Ethernet with a route; from an address alone by the system's."""
+    """Packets of a bound socket leave by its device, by Ethernet if a route does; others by the system's routes."""
     route = f"has a route to {HOST}"
     assert found(modems, HOST, a={"interface": "wwan0"}, b={"interface": "wwan2"}) == [
         [True, f"uplink a: wwan0, 10.1.0.2, 10.1.0.3, {route}"],
