@@ -342,5 +342,4 @@ def test_a_vehicle_uses_both_lanes_of_a_relay(tmp_path):
     assert received["b"].packets < received["a"].packets, "b was cut"
     assert any(note.text.startswith("uplink b: nothing arrives") for note in sides["operator"].of(Note))
     found = statistics(series(Drive(path, sides))).uplinks
-    assert (found["a"].stalls, found["b"].stalls) == (0, 1)
     assert 0.5 < found["b"].stalled_s < 3
