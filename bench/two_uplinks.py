@@ -29,7 +29,7 @@ from typing import NamedTuple
 
 import numpy as np
 from msgspec import UNSET
-from uplinks import row
+from uplinks import Floats, row
 
 from runner.core.roles import Role
 from runner.drive.read import Drive, read_drive
@@ -80,7 +80,7 @@ class Measured(NamedTuple):
 
     better     what B carried over what the redundant camera had just before
     due        pictures of the redundant camera that were captured from the cut on until PAUSE_S / 2 after its end
-    missing    of these, those that never arrived
+    missing    that are not among these although they were sent: one that a busy machine has left out loses no packet
     damaged    of these, those that show a loss
     after_b    how much later than by B alone each arrived, ms
     latency    of the redundant camera in the AFTER_S after the cut began, ms
@@ -233,8 +233,8 @@ def measured(logged: Drive, over_time: Series, cut: Planned) -> Measured:
     return Measured(
         _held(over_time, "b", began) / max(1.0, _decided(over_time, REDUNDANT, began)),
         len(due),
-        sum(round(gap / interval) - 1 for gap in gaps),
-        _damaged(over_time, REDUNDANT, began, until),
+        sum(round(gap / interval) - 1 for gap in gaps) if _risen(received.t, received.lost, began, until) else 0,
+        _risen(received.t, received.damaged, began, until),
         after_b,
         [1000 * (each.arrived - each.captured) for each in due if each.captured < began + AFTER_S],
         [_live_again(over_time, name, began) for name in carried_by_a(logged, began)],
@@ -303,11 +303,9 @@ def _live_again(over_time: Series, camera: str, began: float) -> float:
     return float("inf")
 
 
-def _damaged(over_time: Series, camera: str, since: float, until: float) -> int:
-    got = over_time.cameras[camera].received
-    assert got
-    first, last = np.searchsorted(got.t, (since, until))
-    return int(got.damaged[min(last, len(got.t) - 1)] - got.damaged[first])
+def _risen(t: Floats, counter: Floats, since: float, until: float) -> int:
+    first, last = np.searchsorted(t, (since, until))
+    return int(counter[min(last, len(t) - 1)] - counter[first])
 
 
 def _held(over_time: Series, lane: str, t: float) -> float:

@@ -8,7 +8,9 @@ import sys
 from dataclasses import replace
 from fractions import Fraction
 from importlib import import_module
+from itertools import pairwise
 from pathlib import Path
+from random import Random
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -154,3 +156,13 @@ def test_a_benchmark_without_the_packages_of_tests_says_what_installs_them(tmp_p
         f"{script}.py: needs packages that only tests install (pytest): "
         "run `make test` first, or install the extra: .venv/bin/pip install -e '.[dev]'\n",
     )
+
+
+def test_cuts_are_apart_and_come_where_the_other_uplink_carries_enough() -> None:
+    two_uplinks = import_module("two_uplinks")
+    wide, narrow = [2000.0] * 100, [500.0] * 40 + [2000.0] * 60
+    planned = two_uplinks.plan(wide, narrow, (0.2, 20.0), 3, Random(1))
+    assert sorted(cut.for_s for cut in planned) == [0.2] * 3 + [20.0] * 3
+    for before, cut in pairwise(planned):
+        assert cut.at_s - before.at_s - before.for_s >= two_uplinks.PAUSE_S - 0.01
+    assert all(cut.at_s % 100 >= 41 and (cut.at_s + cut.for_s + 2) % 100 >= 40 for cut in planned)
