@@ -24,7 +24,7 @@ def operator(hangs: int, notes: list[str], samples: list[Any]) -> LiveOperator:
             raise left.pop()
         return {}
 
-    side: Any = SimpleNamespace(sample=sample, stop=lambda: None)
+    side: Any = SimpleNamespace(sample=sample, received=dict, stop=lambda: None)
     station: Any = SimpleNamespace(
         state=object(),
         connect=lambda: None,
@@ -32,7 +32,7 @@ def operator(hangs: int, notes: list[str], samples: list[Any]) -> LiveOperator:
         link=SimpleNamespace(is_behind=lambda: True),
         sending=dict,
         addresses={},
-        take=samples.append,
+        take=lambda taken, _over: samples.append(taken),
         note=notes.append,
     )
     log: Any = SimpleNamespace(begin=lambda: None, close=lambda: None)

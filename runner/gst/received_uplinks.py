@@ -62,9 +62,11 @@ class ReceivedUplinks:
         """All addresses of the vehicle; none while they are unknown."""
         return list(chain.from_iterable(self._addresses.values()))
 
-    def admit(self, addresses: Addresses) -> None:
-        """Receive from these addresses, and send to them. From any thread."""
+    def admit(self, addresses: Addresses) -> bool:
+        """Receive from these addresses, and send to them; returns whether they are others. From any thread."""
         with self._lock:
+            if addresses == self._addresses:
+                return False
             before, self._addresses = self.hosts, addresses
             if self._source:
                 self._source.name(self._names)
@@ -74,6 +76,7 @@ class ReceivedUplinks:
                         if host not in others:
                             sink.emit(action, host, sink.get_property("port"))
             self._opened = 0.0
+            return True
 
     @property
     def _names(self) -> dict[str, str]:

@@ -268,11 +268,10 @@ class Receiver:
 
     def admit(self, addresses: Addresses) -> None:
         """The addresses of the vehicle's uplinks are these from now on; none: they are unknown. From any thread."""
-        if self.rtp.uplinks:
-            self.rtp.uplinks.admit(addresses)
-            if (current := self._filter) and (hosts := self.rtp.uplinks.hosts):
-                with suppress(OSError):  # it has just been closed
-                    current.admit(*hosts)
+        uplinks, current = self.rtp.uplinks, self._filter
+        if uplinks and uplinks.admit(addresses) and current and uplinks.hosts:
+            with suppress(OSError):  # it has just been closed
+                current.admit(*uplinks.hosts)
 
     def _close_filter(self) -> None:
         if self._filter:
