@@ -7,7 +7,7 @@ highest sum_i w_i b_dem,i ln(b_alloc,i / b_dem,i). Cameras are placed so that th
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import inf, log
 from typing import NamedTuple
 
@@ -102,39 +102,74 @@ def place(
     carriers = _carriers(redundant, {name: uplinks[name].kbps for name in living}, before)
     problem = _Problem(single, redundant, {name: uplinks[name].kbps for name in living}, carriers)
     own = {name: at[0] for name, at in before.uplinks.items() if name in single and at[0] in living}
-    moved = {
-        name: times for name, old in before.moved.items() if (times := tuple(at for at in old if t - at < MOVES_S))
-    }
-    last, left = before.last, {name: each for name, each in before.left.items() if name in own and t < each[1]}
-    came = {name: why for name, why in before.came.items() if name in own}
-    homeless = single.keys() - own.keys()
-    for name in sorted(homeless, key=lambda name: (-_importance(single[name]), name)):
-        own[name], last = max(ready, key=lambda uplink: problem.value({**own, name: uplink})), t
-        if name in before.uplinks:
-            came[name] = f"{before.uplinks[name][0]} stalled at {t:.1f} s"
-    if not homeless and t - last >= SETTLE_S:
-        free = [name for name in single if len(moved.get(name, ())) < MOVES]
+    now = _current(before, own, t)
+    if homeless := single.keys() - own.keys():
+        homes = _homes(problem, own, {name: single[name] for name in homeless}, ready)
+        own, now = own | homes, _after_stall(now, homes, cameras, uplinks, t)
+    elif t - before.last >= SETTLE_S:
+        free = [name for name in single if len(now.moved.get(name, ())) < MOVES]
         if move := problem.best_move(own, free, ready):
-            name = move[0]
-            came[name] = f"moved from {own[name]} at {t:.1f} s, which gives less"
-            left[name], own[name] = (own[name], t + OVERLAP_S), move[1]
-            moved[name], last = (*moved.get(name, ()), t), t
-    taken = {name: each for name, each in before.taken.items() if t - each[0] <= GROWN_S}
-    for name in {own[camera] for camera in homeless if camera in before.uplinks} - taken.keys():
-        had = sum(each.kbps for camera, each in cameras.items() if name in before.uplinks.get(camera, ()))
-        taken[name] = t, min(had, uplinks[name].kbps)
+            own, now = own | {move[0]: move[1]}, _after_move(now, move[0], own[move[0]], t)
     everywhere = (*carriers, *(name for name in uplinks if name not in living))
     at = {name: (own[name],) if name in own else _as_before(everywhere, before, name, living) for name in cameras}
-    at |= {name: (*at[name], uplink) for name, (uplink, _) in left.items() if uplink not in at[name]}
+    at |= {name: (*at[name], uplink) for name, (uplink, _) in now.left.items() if uplink not in at[name]}
     copied = _copied(at, cameras, uplinks)
     at |= {name: (*at[name], *copies) for name, copies in copied.items()}
-    narrow = [name for name in living if name not in carriers]
-    why = came | dict.fromkeys(
-        redundant, f"redundant, but {_and(narrow)} carries too little" if narrow else "redundant"
-    )
+    why = {**now.came, **_of_redundant(redundant, [name for name in living if name not in carriers])}
     for name, copies in copied.items():
         why[name] = ", ".join(filter(None, (why.get(name), f"a copy keeps {_and(copies)} measured")))
-    return Placement(at, moved, last, left, clear, came, why, taken)
+    return replace(now, uplinks=at, clear=clear, why=why)
+
+
+def _current(before: Placement, own: Mapping[str, str], t: float) -> Placement:
+    """Without what is over at time t. own: by camera that need not go elsewhere, its uplink"""
+    recent = {name: tuple(at for at in times if t - at < MOVES_S) for name, times in before.moved.items()}
+    return replace(
+        before,
+        moved={name: times for name, times in recent.items() if times},
+        left={name: each for name, each in before.left.items() if name in own and t < each[1]},
+        came={name: why for name, why in before.came.items() if name in own},
+        taken={name: each for name, each in before.taken.items() if t - each[0] <= GROWN_S},
+    )
+
+
+def _homes(
+    problem: _Problem, own: Mapping[str, str], homeless: Mapping[str, Wanted], ready: Sequence[str]
+) -> dict[str, str]:
+    """By camera without an uplink, the best one: the most important camera chooses first."""
+    homes: dict[str, str] = {}
+    for name in sorted(homeless, key=lambda name: (-_importance(homeless[name]), name)):
+        homes[name] = max(ready, key=lambda uplink: problem.value({**own, **homes, name: uplink}))
+    return homes
+
+
+def _after_stall(
+    before: Placement, homes: Mapping[str, str], cameras: Mapping[str, Wanted], uplinks: Mapping[str, Carries], t: float
+) -> Placement:
+    """Cameras have new homes: those that had others come from an uplink that has stalled."""
+    fled = {name: uplink for name, uplink in homes.items() if name in before.uplinks}
+    came = {name: f"{before.uplinks[name][0]} stalled at {t:.1f} s" for name in fled}
+    taken = {}
+    for uplink in {*fled.values()} - before.taken.keys():
+        had = sum(each.kbps for camera, each in cameras.items() if uplink in before.uplinks.get(camera, ()))
+        taken[uplink] = t, min(had, uplinks[uplink].kbps)
+    return replace(before, came={**before.came, **came}, taken={**before.taken, **taken}, last=t)
+
+
+def _after_move(before: Placement, camera: str, uplink: str, t: float) -> Placement:
+    """A camera moves away from an uplink."""
+    return replace(
+        before,
+        came={**before.came, camera: f"moved from {uplink} at {t:.1f} s, which gives less"},
+        left={**before.left, camera: (uplink, t + OVERLAP_S)},
+        moved={**before.moved, camera: (*before.moved.get(camera, ()), t)},
+        last=t,
+    )
+
+
+def _of_redundant(cameras: Iterable[str], narrow: Sequence[str]) -> dict[str, str]:
+    """By redundant camera why it goes over these uplinks. narrow: living ones that do not carry it"""
+    return dict.fromkeys(cameras, f"redundant, but {_and(narrow)} carries too little" if narrow else "redundant")
 
 
 def in_words(uplinks: Sequence[str], why: str | None) -> str:
