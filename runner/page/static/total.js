@@ -17,7 +17,7 @@ const requested = make("span", { class: "muted" }); // the total before rules lo
 const prediction = make("b", { class: "large" });
 const why = make("p", { class: "why" });
 const believed = make("p", { class: "why", id: "believed" });
-const uplinks = make("div", { id: "uplinks", "aria-label": "Uplinks" });
+const uplinks = make("div", { id: "uplinks", role: "group", "aria-label": "Uplinks" });
 const slider = makeSlider({
   label: "total bitrate",
   data: "total",
