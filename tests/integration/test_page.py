@@ -805,7 +805,7 @@ def stopped(shared, chromium, demo):
 def test_stalled_pictures_are_named_and_sounded_in_the_drive_view(stopped):
     page = stopped
     until(lambda: page.inner_text("#worst-of") == "8 of 8 pictures not live")
-    assert page.inner_text("#alarms").startswith("✕ LOST front left, front center")
+    until(lambda: page.inner_text("#alarms").startswith("✕ LOST front left, front center"))  # frozen until it is lost
     assert page.inner_text("#worst") == "– ms"
     assert {*page.locator(".tile .status").all_inner_texts()} == {"✕ LOST"}, "the worker cannot mark the pictures"
     frame = "getComputedStyle(document.querySelector('.tile .picture'), '::after').borderTopWidth"
