@@ -17,7 +17,7 @@ from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode
 from runner.errors import RunError, UserError
 from runner.mqtt.login import Login
 from runner.settings import Uplink
-from runner.system.interfaces import addresses_of
+from runner.system.interfaces import addresses_by
 
 CONNECT_S = 1.0  # one attempt to connect
 RETRY_S = (0.25, 0.5)  # between attempts, initially and at most: after an outage the vehicle waits for its operator
@@ -171,8 +171,7 @@ def _source(uplink: Uplink, family: int) -> str:
 
     raises  OSError
     """
-    addresses = [uplink.address] if uplink.address else addresses_of(uplink.interface or "")
-    for address in addresses:
+    for address in addresses_by(uplink):
         if (":" in address) == (family == socket.AF_INET6):
             return address
     raise OSError(errno.EADDRNOTAVAIL, f"{uplink.interface or uplink.address} has no address to reach it from")
