@@ -1,6 +1,6 @@
 """A vehicle with two uplinks: what the operator sees when one is cut, what both carry, and what redundancy costs.
 
-  python bench/two_uplinks.py cuts OUT A.csv B.csv             30 cuts of uplink A in one drive, 11 minutes
+  python bench/two_uplinks.py cuts OUT A.csv B.csv             30 cuts of uplink A in one drive, more than 15 minutes
   python bench/two_uplinks.py cuts OUT A.csv B.csv --quick     one cut of each length
   python bench/two_uplinks.py cuts OUT A.csv B.csv --keys --how down
   python bench/two_uplinks.py clear OUT [A.csv B.csv]          both uplinks clear, beside one of the same kind
