@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import socket
+import ssl
 import struct
 import subprocess
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -77,6 +78,7 @@ class Operator:
 
     units     capture time of each access unit, whether it is a key picture, and when it came
     reported  what it reported
+    port      of the vehicle's server
     """
 
     def __init__(self, words: list[str], addresses: Mapping[str, str]) -> None:
@@ -88,6 +90,7 @@ class Operator:
         setup = configuration([*words, f"media.host='{addresses['a']}'"], check=check_plan).setup()
         self.units: list[tuple[float, bool, float]] = []
         self.reported: list[str] = []
+        self.port = setup.media.port
         self.side = OperatorSide(
             compile_plans(setup),
             lambda camera, what: self.reported.append(f"{camera}: {what}"),
@@ -265,13 +268,13 @@ def payload_type(packet: bytes) -> int:
 
 
 def requests(packet: bytes) -> bytes:
-    """RTCP by which a viewer of an RTP packet's stream requests a key picture, and packets again (RFC 4585)."""
+    """RTCP by which a viewer requests a key picture and packets again (RFC 4585), and leaves (RFC 3550)."""
     number, stream = int.from_bytes(packet[30:32], "big"), int.from_bytes(packet[36:40], "big")
     viewer = 1
     report = struct.pack("!BBHI", 0x80, 201, 1, viewer)
     key_picture = struct.pack("!BBHII", 0x81, 206, 2, viewer, stream)
     again = struct.pack("!BBHIIHH", 0x81, 205, 3, viewer, stream, (number - 20) % 65_536, 0xFFFF)
-    return report + key_picture + again
+    return report + key_picture + again + struct.pack("!BBHI", 0x81, 203, 1, viewer)
 
 
 @needs_root
@@ -350,6 +353,19 @@ def test_a_viewer_connects_by_another_uplink_if_the_first_is_cut(tmp_path: Path)
     with drive(tmp_path, keys=False, host=ADDRESSES["a"], cut="a") as (_ways, _vehicle, operator):
         operator.watch(0.5)
         assert operator.side.received()[CAMERA]["b"].packets > FPS
+
+
+@needs_root
+def test_a_stranger_without_keys_is_refused_at_the_address_of_each_uplink(tmp_path: Path) -> None:
+    with drive(tmp_path, keys=True) as (_ways, vehicle, operator):
+        tls = ssl._create_unverified_context()
+        for address in ADDRESSES.values():
+            plain = socket.create_connection((address, operator.port), 2)
+            with suppress(ssl.SSLError), tls.wrap_socket(plain) as stranger:
+                stranger.sendall(b"OPTIONS * RTSP/1.0\r\nCSeq: 1\r\n\r\n")
+                assert not stranger.recv(1000)
+        assert vehicle.reported[1].startswith(f"keys: refused an RTSP client at {OPERATOR}: ")
+        check_every_picture(operator)
 
 
 @needs_root
