@@ -147,7 +147,7 @@ def drive(path: Path, words: Sequence[str]) -> float:
 
 def cuts(options: argparse.Namespace) -> None:
     """Cut uplink A, and print what that did, by length of the cut."""
-    a, b = (_rates(path) for path in options.traces)
+    a, b = (rates(path) for path in options.traces)
     planned = plan(a, b, options.lengths, 1 if options.quick else options.moments, random.Random(options.seed))
     path = options.output / f"cuts-{options.how}{'-keys' if options.keys else ''}"
     words = [*_words(options), LIMITED, f"duration_s={planned[-1].at_s + planned[-1].for_s + PAUSE_S:g}"]
@@ -185,7 +185,7 @@ def _words(options: argparse.Namespace) -> list[str]:
     return [*words, f"keys={directory}"]
 
 
-def _rates(path: Path) -> list[float]:
+def rates(path: Path) -> list[float]:
     """kbit/s in each second."""
     lines = path.read_text().splitlines()
     column = lines[0].split(",").index("uplink_kbps")
