@@ -69,7 +69,7 @@ def main() -> None:
     options = parser.parse_args()
     found: dict[str, dict[str, list[Figures]]] = {}
     for pair in combinations(options.uplinks, 2):
-        name = " + ".join(path.stem.split("-")[0] for path in pair)
+        name = " + ".join(path.stem.partition("-")[0] for path in pair)
         found[name] = {policy: [] for policy in POLICIES}
         for number in range(options.runs):
             for policy, done in found[name].items():

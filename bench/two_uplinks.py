@@ -165,7 +165,9 @@ def cuts(options: argparse.Namespace) -> None:
     for length in options.lengths:
         print(_summary(f"{length:g} s", [one for cut, one in found if cut.for_s == length and one.better >= BETTER]))
     print(_summary("other moments", [one for _, one in found if one.better < BETTER]))
-    lost = [line.text for line in logged.sides["operator"].of(Note) if line.text.startswith(LOST)]
+    until = planned[-1].at_s + planned[-1].for_s + PAUSE_S / 2  # then the drive ends
+    notes = logged.sides["operator"].of(Note)
+    lost = [line.text for line in notes if line.text.startswith(LOST) and line.t < until]
     rebuilt = {name: int(each.received.rebuilt[-1]) for name, each in over_time.cameras.items() if each.received}
     print(f"control: {lost or 'never lost'}; rebuilt: {rebuilt}")
 

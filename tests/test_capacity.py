@@ -135,6 +135,33 @@ def test_the_verb_writes_a_map_that_pqos_reads(tod: Command, tmp_path: Path) -> 
     assert '"source": "pqos"' in replayed.out
 
 
+def believing_of_two(side: str, lines: Lines) -> Lines:
+    """As if uplink a were believed to carry 2000 kbit/s, and b more than the one camera on it can use."""
+    known = {"deviation": 0.1, "margin": 0.1, "bias": -0.2, "error": 0.1, "gain": 0.5, "policer_kbps": None}
+    for line in lines:
+        if line.get("log") == "decision":
+            for number, camera in enumerate(line["cameras"].values()):
+                camera |= {"uplinks": ["b" if number == 0 else "a"], "demand_kbps": 900}
+            line["uplinks"] = {
+                name: {"total_kbps": kbps, "stalled": False, "reason": "", "believed": known | {"kbps": kbps}}
+                for name, kbps in (("a", 2000), ("b", 1000))
+            }
+    return lines
+
+
+def test_each_of_several_uplinks_gets_a_map_of_its_own(tod: Command, tmp_path: Path) -> None:
+    drive = str(write_drive(tmp_path / "drive", ["vehicle"], seconds=10, change=believing_of_two))
+    output = tmp_path / "map.csv"
+    assert tod("map", drive, "uplink=a", f"output={output}").status == 0
+    assert {row["kbps"] for row in csv.DictReader(output.open())} == {"2000"}
+    for words, expected in (
+        (("uplink=b",), "no map: in none of 40 samples was the link the limit: "),
+        (("uplink=c",), f"no map: {drive} has the uplinks a, b: uplink=NAME chooses one\n"),
+        ((), f"no map: {drive} has the uplinks a, b: uplink=NAME chooses one\n"),
+    ):
+        assert tod("map", drive, f"output={output}", *words).err.startswith(expected)
+
+
 def test_drives_that_yield_no_map_are_reported(tod: Command, tmp_path: Path) -> None:
     def roomy(side: str, lines: Lines) -> Lines:
         for line in lines:
@@ -157,5 +184,7 @@ def test_drives_that_yield_no_map_are_reported(tod: Command, tmp_path: Path) -> 
         assert result.err.startswith(expected) and result.err.count("\n") == 1
     alone = write_drive(tmp_path / "alone", ["vehicle"], seconds=5)
     assert tod("map", str(alone), output).err == f"no map: {alone} has no operator's log\n"
+    of_one = f"no map: {good} has no uplink a: the vehicle had one\n"
+    assert tod("map", str(good), output, "uplink=a").err == of_one
     assert tod("map", str(good), output, "percentil=5").err.startswith("command line: percentil=5: unknown argument")
     assert not (tmp_path / "map.csv").exists()

@@ -15,6 +15,7 @@ import numpy as np
 
 from runner.core.events import LEAST_ERROR
 from runner.core.learned import WRONG
+from runner.drive.believed_series import BelievedSeries
 from runner.drive.series import Positions, Series
 from runner.drive.time_series import Flags, FloatSeries, TimeSeries, held
 from runner.pqos.bandwidth_map import offset
@@ -52,9 +53,17 @@ class Cell(NamedTuple):
     error: float
 
 
-def capacity_problem(drive: Series) -> str | None:
-    """Why a drive does not show the capacity of the link; None if it does."""
-    if drive.believed:
+def capacity_problem(drive: Series, uplink: str = "") -> str | None:
+    """Why a drive does not show the capacity of the link; None if it does.
+
+    uplink  one of several; "": the vehicle has one
+    """
+    if uplink not in (drive.uplinks or [""]):
+        known = f"has the uplinks {', '.join(drive.uplinks)}: uplink=NAME chooses one" if drive.uplinks else ""
+        return known or f"has no uplink {uplink}: the vehicle had one"
+    if uplink and not drive.uplinks[uplink].believed:
+        return f"has nothing that was believed of uplink {uplink}: needs rules that measure it (modes=safe)"
+    if _believed(drive, uplink):
         return None if drive.positions else "has no positions"
     if not any(camera.received for camera in drive.cameras.values()):
         return "has no operator's log"
@@ -63,20 +72,24 @@ def capacity_problem(drive: Series) -> str | None:
     return None if drive.positions else "has no positions"
 
 
-def sample_times(drive: Series) -> FloatSeries:
+def _believed(drive: Series, uplink: str) -> BelievedSeries | None:
+    return drive.uplinks[uplink].believed if uplink else drive.believed
+
+
+def sample_times(drive: Series, uplink: str = "") -> FloatSeries:
     """When the capacity of the link may have been known, s."""
-    return np.arange(0.0, drive.end, EVERY_S) if drive.believed else drive.actual.t
+    return np.arange(0.0, drive.end, EVERY_S) if _believed(drive, uplink) else drive.actual.t
 
 
-def limited_samples(drive: Series) -> list[CapacitySample]:
+def limited_samples(drive: Series, uplink: str = "") -> list[CapacitySample]:
     """The samples of a drive in which the capacity of the link was known; none if they cannot be determined."""
-    if capacity_problem(drive) or drive.positions is None:
+    if capacity_problem(drive, uplink) or drive.positions is None:
         return []
-    if drive.believed:
-        t = sample_times(drive)
-        return _samples(t, carried(drive, t), _positions_at(drive.positions, t))
+    t = sample_times(drive, uplink)
+    if _believed(drive, uplink):
+        return _samples(t, carried(drive, t, uplink), _positions_at(drive.positions, t))
     received = [camera.received for camera in drive.cameras.values() if camera.received]
-    t, kbps = sample_times(drive), drive.actual.y
+    kbps = drive.actual.y
     limited = np.zeros(t.shape, dtype=bool)
     for camera in received:
         limited |= _lost(t, camera.t, camera.lost) | _queued(t, camera.arrival_t, camera.arrival_ms)
@@ -84,12 +97,12 @@ def limited_samples(drive: Series) -> list[CapacitySample]:
     return _samples(t, np.where(limited, kbps, np.nan), _positions_at(drive.positions, t - WINDOW_S / 2))
 
 
-def carried(drive: Series, t: FloatSeries) -> FloatSeries:
+def carried(drive: Series, t: FloatSeries, uplink: str = "") -> FloatSeries:
     """What the link was believed to carry at some times, kbit/s of video; nan where reports did not tell it.
 
     Where it carries all that the cameras can use, more cannot be known.
     """
-    believed = drive.believed
+    believed = _believed(drive, uplink)
     if believed is None:
         return np.full(t.shape, np.nan)
     kbps, deviation, usable = (

@@ -8,16 +8,15 @@ stands for a value unknown at a time.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from msgspec import UNSET
 
-from runner.core.decision import Believed
 from runner.core.events import BitratePredicted, Event, LinkMeasured, PositionReported
-from runner.core.model import Mode
+from runner.drive.believed_series import BelievedSeries, believed_series
 from runner.drive.camera_series import CameraSeries, camera_series
 from runner.drive.log import FILES
 from runner.drive.panels import Panel, panels
@@ -59,24 +58,6 @@ class LinkSeries:
     kbps: FloatSeries
     queue_ms: FloatSeries
     dropped: FloatSeries
-
-
-@dataclass(frozen=True, slots=True)
-class BelievedSeries:
-    """What was believed of the uplink, see `runner.core.decision.Believed`, each in force until the next; nan: unknown.
-
-    usable  the most that the cameras can use, kbit/s; nan in mode single
-    """
-
-    t: FloatSeries
-    kbps: FloatSeries
-    deviation: FloatSeries
-    margin: FloatSeries
-    bias: FloatSeries
-    error: FloatSeries
-    gain: FloatSeries
-    policer_kbps: FloatSeries
-    usable: FloatSeries
 
 
 class Reason(NamedTuple):
@@ -186,7 +167,7 @@ def _series(drive: Drive, label: str) -> Series:
         predicted=_predicted(vehicle, telemetry, samples),
         allocated=TimeSeries.of((t, sum(camera.kbps for camera in line.cameras.values())) for t, line in decisions),
         actual=_total(samples, cameras),
-        believed=_believed(decisions),
+        believed=believed_series(decisions),
         measured="received" if samples else "sent" if telemetry else "",
         capped=_capped(operator),
         measured_t=np.array([t for t, _ in vehicle.of(LinkMeasured)], dtype=float),
@@ -250,18 +231,6 @@ def _total(samples: Sequence[Any], cameras: Mapping[str, CameraSeries]) -> TimeS
         return TimeSeries(t, settled(t, y, np.asarray(np.sum([each.frames for each in received], axis=0))))
     sent = [camera.sent for camera in cameras.values() if camera.sent]
     return TimeSeries(sent[0].t, np.asarray(np.sum([each.kbps for each in sent], axis=0))) if sent else EMPTY
-
-
-def _believed(decisions: Sequence[tuple[float, DecisionMade | VehicleState]]) -> BelievedSeries | None:
-    if all(line.believed is UNSET for _, line in decisions):
-        return None
-
-    def row(t: float, line: DecisionMade | VehicleState) -> tuple[float | None, ...]:
-        known = (getattr(line.believed, each.name, None) for each in fields(Believed))
-        usable = sum(camera.demand_kbps for camera in line.cameras.values())
-        return t, *known, None if line.mode is Mode.SINGLE else usable
-
-    return BelievedSeries(*np.array([row(t, line) for t, line in decisions], dtype=float).T)
 
 
 def _capped(operator: _Shifted) -> TimeSeries:

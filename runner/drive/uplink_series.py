@@ -14,15 +14,14 @@ import numpy as np
 from msgspec import UNSET
 
 from runner.core.events import LinkMeasured, LinkState
+from runner.drive.believed_series import BelievedSeries, Decisions, believed_series
 from runner.drive.time_series import TimeSeries, counted
-from runner.records.decisions import DecisionMade
 from runner.records.operator import CameraSample, Sample
-from runner.records.vehicle import UplinkMeasured, VehicleState
+from runner.records.vehicle import UplinkMeasured
 
 GAP_S = 1.0  # between two measurements: nothing is known in between
 NAN = float("nan")
 
-Decisions = Sequence[tuple[float, DecisionMade | VehicleState]]
 Measured = Sequence[tuple[float, LinkMeasured | UplinkMeasured]]
 Samples = Sequence[tuple[float, Sample]]
 
@@ -46,6 +45,7 @@ class UplinkSeries:
     stalls    (start, duration), s, while nothing arrived over it
     came, left  how often a camera moved to it, and from it
     arrived   None: no operator logged
+    believed  None: no rule believed anything of it
     """
 
     allowed: TimeSeries
@@ -56,6 +56,7 @@ class UplinkSeries:
     came: int
     left: int
     arrived: Arrived | None
+    believed: BelievedSeries | None
 
 
 def uplink_series(
@@ -84,6 +85,7 @@ def uplink_series(
             sum(to == name for _, to in moves),
             sum(of == name for of, _ in moves),
             _arrived(name, samples) if samples else None,
+            believed_series(decisions, name),
         )
         for name, each in found.items()
     }

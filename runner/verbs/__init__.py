@@ -113,7 +113,7 @@ VERBS = {
     "map": Verb(
         "a bandwidth map from drives",
         "runner.verbs.map",
-        ("output", "percentile", "cell_m", "positions", "topic"),
+        ("output", "uplink", "percentile", "cell_m", "positions", "topic"),
         DRIVE,
         composes=False,
     ),

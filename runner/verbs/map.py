@@ -1,4 +1,5 @@
-"""usage: tod-runner map DRIVE [DRIVE ...] output=FILE.csv [percentile=10] [cell_m=10] [positions=BAG [topic=NAME]]
+"""usage: tod-runner map DRIVE [DRIVE ...] output=FILE.csv [uplink=NAME] [percentile=10] [cell_m=10]
+                      [positions=BAG [topic=NAME]]
 
 Makes a bandwidth map from drives, for pqos=map: per square of the ground, a percentile of what the link could carry, in
 kbit/s of video, and how far that varied: mean (bias) and deviation (error) of ln(capacity / kbps). A vehicle that
@@ -12,11 +13,14 @@ Only samples in which the link was the bottleneck count: over the second before,
 frames of a camera arrived 50 ms later than its fastest; the measured link limited the total; and neither machine was
 held up. All others show how much was sent, or how busy a machine was, not what the link can carry.
 
+uplink= is needed of a vehicle with several uplinks, each of which gets a map of its own.
+
 positions= is a ROS bag with the vehicle's positions during the drives (sensor_msgs/NavSatFix), which replace those in
 their logs; topic= is needed if it has several such topics.
 
   tod-runner map drives/monday drives/tuesday output=maps/route.csv
   tod-runner map drive output=route.csv percentile=5 cell_m=25
+  tod-runner map drive output=a.csv uplink=a
   tod-runner demo pqos.file=route.csv
 """
 
@@ -37,17 +41,18 @@ PERCENTILE, CELL_M = 10.0, 10.0
 
 def run(arguments: Arguments) -> int:
     output, percentile, cell_m = _checked_arguments(arguments)
+    uplink = arguments.values.get("uplink", "")
     read = reader(arguments.values)
     samples: list[CapacitySample] = []
     seen, unusable = 0, list[str]()
     for word in arguments.words:
         drive = series(read(Path(word)))
         print("".join(f"{warning}\n" for warning in drive.warnings), end="", file=sys.stderr)
-        if why := capacity_problem(drive):
+        if why := capacity_problem(drive, uplink):
             unusable.append(f"{word} {why}")
             continue
-        samples += limited_samples(drive)
-        seen += len(sample_times(drive))
+        samples += limited_samples(drive, uplink)
+        seen += len(sample_times(drive, uplink))
     if not samples:
         rule = "less carried than the cameras can use, as the link was measured, and no machine held up"
         reasons = [f"in none of {seen} samples was the link the limit: {rule}"] if seen else []
