@@ -5,6 +5,7 @@
 # make soak   long repetitions of faults that a drive must survive, 80 minutes; SOAK=0.1 make soak is a tenth, KEYS=1 encrypts
 # make deadspot UPLINK=FILE.csv  two drives over a recorded uplink: the picture of the README
 # make generated  the schemas and types that scripts/schemas makes of classes
+# make everywhere  HEAD on Debian 12, 13 and testing, in root directories made by debootstrap; SYSTEMS="trixie forky" selects
 # make setup  install what driving needs; the command is then .venv/bin/tod-runner
 # make ros2   ROS 2 in an environment of its own, .venv-ros2; docs/ros.md
 # make ros1   ROS 1, which is end-of-life, as Debian's packages
@@ -18,7 +19,7 @@ NODE_READY := node_modules/.ready
 # Tests start hundreds of processes; without cached bytecode each would compile the project again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test generated timed untimed compiled golden units check fast coverage lint javascript setup bench deadspot uplink-given soak ros1 ros2 clean
+.PHONY: demo test generated timed untimed compiled golden units check fast coverage lint javascript setup bench deadspot uplink-given soak everywhere ros1 ros2 clean
 
 demo: $(READY)
 	$(BIN)/tod-runner demo
@@ -28,10 +29,11 @@ test: $(TEST_READY)
 	$(MAKE) --no-print-directory -j 2 --output-sync=line timed untimed
 
 # Each worker imports all files that it is given.
+# WITHOUT="and not browser" leaves out the tests that need a browser.
 ALONE = $(shell grep -l mark.alone tests/integration/test_*.py)
 timed: $(TEST_READY)
-	$(BIN)/pytest $(ALONE) -m "alone and not soak" -n $$(($$(nproc) + 1)) --dist loadgroup --durations=10
-	$(BIN)/pytest tests/integration -m "timed and not soak" -n $$(($$(nproc) + 1)) --dist loadfile --no-loadscope-reorder --durations=30
+	$(BIN)/pytest $(ALONE) -m "alone and not soak $(WITHOUT)" -n $$(($$(nproc) + 1)) --dist loadgroup --durations=10
+	$(BIN)/pytest tests/integration -m "timed and not soak $(WITHOUT)" -n $$(($$(nproc) + 1)) --dist loadfile --no-loadscope-reorder --durations=30
 
 untimed: $(TEST_READY)
 	scripts/background $(MAKE) --no-print-directory -j 1 compiled lint javascript golden units
@@ -50,7 +52,7 @@ golden: $(TEST_READY)
 
 # Some wait, hence one worker more than cores.
 units: $(TEST_READY)
-	$(BIN)/pytest -m "not timed and not alone and not soak" -n $$(($$(nproc) + 1)) --dist loadfile --durations=30
+	$(BIN)/pytest -m "not timed and not alone and not soak $(WITHOUT)" -n $$(($$(nproc) + 1)) --dist loadfile --durations=30
 
 check: $(TEST_READY) $(NODE_READY)
 	$(MAKE) --no-print-directory -j 2 --output-sync=line fast lint javascript
@@ -90,6 +92,10 @@ uplink-given:
 
 soak: $(TEST_READY) $(NODE_READY)
 	PYTHONPATH=tests:tests/integration $(BIN)/python tests/soak $(PARTS)
+
+# Installs nothing outside root directories of its own; needs root and the package debootstrap.
+everywhere:
+	scripts/everywhere $(SYSTEMS)
 
 setup: $(READY)
 

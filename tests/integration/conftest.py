@@ -100,6 +100,8 @@ def pytest_itemcollected(item: pytest.Item) -> None:
     item.add_marker("gst")
     if item.path.stem not in UNTIMED and not item.get_closest_marker("alone"):
         item.add_marker("timed")
+    if "chromium" in getattr(item, "fixturenames", ()):
+        item.add_marker("browser")
 
 
 @pytest.fixture(scope="module")
