@@ -16,6 +16,7 @@ from helpers import Command, process
 
 from runner.__main__ import main
 from runner.verbs import VERBS
+from runner.verbs.doctor import gstreamer_fits
 
 PAPER = ("modes=paper", "source=test")
 EVENT = '{"t": 0, "event": "bitrate_predicted", "kbps": 3000}\n'
@@ -201,6 +202,14 @@ def test_doctor_checks_what_a_verb_needs(tod: Command, words: list[str], modules
 def test_doctor_accepts_a_verb(tod: Command, words: list[str], expected: str) -> None:
     result = tod("doctor", *words)
     assert (result.status, result.out) == (2, "") and expected in result.err
+
+
+def test_doctor_names_a_gstreamer_without_times_of_capture() -> None:
+    assert gstreamer_fits("1.22.0") == (True, "GStreamer 1.22.0")
+    assert gstreamer_fits("1.18.4") == (
+        False,
+        "GStreamer 1.18.4: too old; times of capture, and so latencies, need 1.22 or later, see docs/install.md",
+    )
 
 
 @pytest.mark.parametrize(

@@ -40,6 +40,7 @@ from runner.verbs.doctor_uplinks import Diagnosis, check_uplinks
 
 IMPORT_S = 30  # rclpy or rospy loads within a second
 CORE_MPX_S = 180  # cropped, scaled and encoded per core and second at factor 0.5, measured with h264_rtsp
+OLDEST_GSTREAMER = (1, 22)  # its jitter buffer keeps the times at which pictures were captured
 STREAMING = ("vehicle", "operator", "latency", "demo", "record", "model", "quality")  # verbs that need GStreamer
 CONNECTING = ("vehicle", "operator", "latency", "ros", "demo")  # verbs that use keys
 NEEDED = {  # extras of this package that a verb needs with any configuration
@@ -156,6 +157,14 @@ def _bindings() -> Iterator[Diagnosis]:
         yield from (Diagnosis(False, f"{part}: {why}") for part, why in error.missing.items())
     else:
         yield from (Diagnosis(True, f"typelib {name}") for name in apply.TYPELIBS)
+        yield gstreamer_fits(apply.versions(())["GStreamer"])
+
+
+def gstreamer_fits(version: str) -> Diagnosis:
+    """Whether a version of GStreamer, such as 1.22.0, is new enough."""
+    fits = tuple(map(int, version.split(".")))[:2] >= OLDEST_GSTREAMER
+    hint = ": too old; times of capture, and so latencies, need 1.22 or later, see docs/install.md"
+    return Diagnosis(fits, f"GStreamer {version}{'' if fits else hint}")
 
 
 def _elements(verb: str, setup: Setup) -> Iterator[Diagnosis]:
