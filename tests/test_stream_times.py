@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from runner.gst.stream_times import HZ, PACKET, WRAP, RestoredTimes, stream_times
+from runner.gst.stream_times import HZ, PACKET, WRAP, RestoredTimes, joined_units, stream_times
 from runner.system.clocks import SECOND_NS
 
 pytestmark = pytest.mark.gst
@@ -14,13 +14,13 @@ pytestmark = pytest.mark.gst
 MS = 1_000_000
 
 
-def unit(time: int, stream: int = 0xE0, *, adapted: bool = False) -> bytes:
+def unit(time: int, stream: int = 0xE0, *, adapted: bool = False, counter: int = 0) -> bytes:
     """A packet in which a unit of a stream begins, with its presentation time."""
     stamp = bytes(
         [0x21 | time >> 29 & 0x0E, time >> 22 & 0xFF, time >> 14 & 0xFE | 1, time >> 7 & 0xFF, time << 1 & 0xFE | 1]
     )
     header = b"\0\0\1" + bytes([stream, 0, 0, 0x80, 0x80, 5]) + stamp
-    front = b"\x47\x40\x41" + (b"\x30\x01\x40" if adapted else b"\x10")
+    front = b"\x47\x40\x41" + (bytes([0x30 | counter, 1, 0x40]) if adapted else bytes([0x10 | counter]))
     return (front + header).ljust(PACKET, b"\xff")
 
 
@@ -39,6 +39,14 @@ def test_files_other_than_transport_streams_have_no_times(tmp_path: Path, conten
     path = tmp_path / "video.ts"
     path.write_bytes(content)
     assert stream_times(path) == []
+
+
+def test_a_seam_of_joined_files_shows_in_the_counters(tmp_path: Path) -> None:
+    first, rest = ([unit(HZ * n, counter=n % 16) for n in range(count)] for count in (20, 5))
+    path = tmp_path / "video.ts"
+    for units, expected in ((first, 0), ([*first[:4], first[3], *first[4:]], 0), ([*first, *rest], 25), ([], 0)):
+        path.write_bytes(b"".join(units))
+        assert joined_units(path) == expected
 
 
 def restored(stated: list[int], demuxed: list[int]) -> list[int]:

@@ -10,12 +10,14 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from fractions import Fraction
+from pathlib import Path
 
 from gi.repository import GLib, Gst
 
 from runner.errors import RunError
 from runner.gst.caps import structure
 from runner.gst.pictures import LumaPlane, luma_of
+from runner.gst.stream_times import joined_units
 from runner.lanes import BAG, FRAMES, LaneSet
 
 POLL_NS = 200 * 1_000_000
@@ -82,9 +84,25 @@ def run_lanes(
         if pipeline.set_state(Gst.State.PLAYING) == Gst.StateChangeReturn.FAILURE:
             raise RunError(_message(pipeline.get_bus().pop_filtered(Gst.MessageType.ERROR)))
         _wait(pipeline, run, on_progress)
+        if not lanes.lanes:
+            _check_seams(pipeline)
     finally:
         pipeline.set_state(Gst.State.NULL)
     return results
+
+
+def _check_seams(pipeline: Gst.Pipeline) -> None:
+    """raises RunError if a picture behind a seam of joined files was left out, perhaps with a new size"""
+    by_kind = {element.get_factory().get_name(): element for element in pipeline.children}
+    if not {"filesrc", "videorate"} <= by_kind.keys():
+        return
+    read, units = (
+        by_kind["videorate"].get_property("in"),
+        joined_units(Path(by_kind["filesrc"].get_property("location"))),
+    )
+    if read < units:
+        made_anew = "`ffmpeg -i FILE -c copy WHOLE.ts` makes it one"
+        raise RunError(f"it was joined from several files, and only {read} of {units} pictures are read; {made_anew}")
 
 
 def _parsed(line: str) -> Gst.Pipeline:

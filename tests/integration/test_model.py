@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -423,7 +424,8 @@ def two_sizes(path: Path) -> None:
         ("/dev/zero", None, "must be a file"),
         ("empty.mp4", b"", "the file is empty"),
         ("noise.mp4", os.urandom(4096), "cannot be read as video"),
-        ("two.ts", two_sizes, "the size changes from 320x192 to 160x96 within the sequence"),
+        # GStreamer 1.28 leaves out the picture behind a seam, and with it the new size.
+        ("two.ts", two_sizes, "(size changes from 320x192 to 160x96 within|only 79 of 80 pictures are read)"),
     ],
 )
 def test_an_invalid_sequence_is_reported(tod, tmp_path, cache, monkeypatch, name, content, expected):
@@ -437,7 +439,7 @@ def test_an_invalid_sequence_is_reported(tod, tmp_path, cache, monkeypatch, name
     assert (status, out) == (2, "")
     line = err.splitlines()[-1]
     assert line.startswith("command line: sequence: ")
-    assert expected in line
+    assert re.search(expected, line)
 
 
 def test_a_clip_whose_video_begins_after_its_sound(tmp_path, cache):
