@@ -107,6 +107,7 @@ def _usage() -> str:
 
 
 def _run(words: list[str]) -> int:
+    from runner.system.files import directory_problem
     from runner.verbs import VERBS, Arguments, unknown_flag
 
     if not words or words[0] in ("-h", "--help", "help"):
@@ -134,8 +135,8 @@ def _run(words: list[str]) -> int:
     if name == "completion" and rest[:1] == ["words"] and len(rest) == 3:
         return int(module.words(*rest[1:]))
     arguments = Arguments.parse(name, rest)
-    if arguments.conf is not None and not arguments.conf.is_dir():
-        raise ArgumentError("conf", str(arguments.conf), "no such directory")
+    if arguments.conf is not None and (why := directory_problem(arguments.conf)):
+        raise ArgumentError("conf", str(arguments.conf), why)
     status: int = module.run(arguments)
     with suppress(BrokenPipeError):
         sys.stdout.flush()

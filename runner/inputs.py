@@ -16,9 +16,10 @@ def input_problem(camera: Camera) -> ModelError | None:
 def clip_problem(camera: Camera) -> ModelError | None:
     """Why the camera's clip cannot be read; None as for `input_problem`."""
     clip = _given(camera, "clip")
-    if clip is None or "clip" not in camera.source.needs or camera.source.render or Path(clip).is_file():
+    if clip is None or "clip" not in camera.source.needs or camera.source.render:
         return None
-    return ModelError("clip", repr(clip), file_problem(Path(clip)))
+    why = file_problem(Path(clip))
+    return ModelError("clip", repr(clip), why) if why else None
 
 
 def bag_problem(camera: Camera) -> ModelError | None:

@@ -8,13 +8,13 @@ import sys
 from pathlib import Path
 
 import pytest
-from helpers import CONF
+from helpers import CONF, out_of_reach
 
-from runner.system.files import unfinished_directory, whole_file, write_whole
+from runner.system.files import directory_problem, file_problem, unfinished_directory, whole_file, write_whole
 
 PRINT = """\
 from pathlib import Path
-from runner.system.files import unfinished_directory, whole_file, write_whole
+from runner.system.files import directory_problem, file_problem, unfinished_directory, whole_file, write_whole
 print("before", flush=True)
 with whole_file(Path("/dev/stdout")) as file:
     file.write("written\\n")
@@ -69,3 +69,16 @@ def test_files_of_a_directory_reach_the_disk_before_it_gets_its_name(
         part.mkdir()
         (part / "metadata.yaml").touch()
     assert seen == [("metadata.yaml", False), ("rosbag2", False), (tmp_path.name, True)]
+
+
+def test_a_path_out_of_reach_says_so_with_any_python(tmp_path: Path) -> None:
+    """From 3.14 on, Path.is_file, is_dir and exists say no there."""
+    closed, file = tmp_path / "closed", tmp_path / "closed" / "file"
+    closed.mkdir()
+    file.touch()
+    assert (file_problem(file), file_problem(closed)) == (None, "must be a file")
+    assert (directory_problem(closed), directory_problem(file)) == (None, "must be a directory")
+    assert file_problem(closed / "none") == file_problem(file / "none") == file_problem(Path("\0")) == "no such file"
+    assert directory_problem(closed / "none") == "no such directory"
+    with out_of_reach(closed):
+        assert file_problem(file) == directory_problem(file) == "permission denied"

@@ -19,6 +19,7 @@ from runner.bag.storage import Channel, UnreadableError
 from runner.core.model import DEPTH_M, ModelError
 from runner.errors import reason, suggest
 from runner.system.clocks import SECOND_NS
+from runner.system.files import directory_problem, file_problem
 
 if TYPE_CHECKING:
     from typing import Self
@@ -213,8 +214,8 @@ def check_topic(path: Path, topic: str | None) -> None:
 
 
 def _check_path(path: Path) -> None:
-    if not path.exists():
-        raise ModelError("bag", str(path), "no such file")
+    if (why := file_problem(path)) and directory_problem(path):
+        raise ModelError("bag", str(path), why)
     if path.is_dir() and not (path / METADATA).is_file():
         files = sorted(file.name for file in path.iterdir() if is_named_like_a_bag(file))
         name = f"; a recorder that was killed writes none: name its file, {', '.join(files)}" if files else ""

@@ -8,6 +8,7 @@ from typing import Any
 
 from runner.drive.statistics import Model, rate_curves
 from runner.errors import ArgumentError, UserError
+from runner.system.files import directory_problem
 
 
 def find_models(
@@ -21,8 +22,8 @@ def find_models(
     returns    models by camera, and a line about the cameras without one
     raises     UserError if the directory does not exist, or a file is not a model
     """
-    if directory is not None and not directory.is_dir():
-        raise ArgumentError("models", directory, "no such directory")
+    if directory is not None and (why := directory_problem(directory)):
+        raise ArgumentError("models", directory, why)
     found: dict[str, Model] = {}
     cameras = config.get("cameras") or {}
     for name, camera in cameras.items():

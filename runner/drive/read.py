@@ -24,6 +24,7 @@ from runner.records.operator import Sample
 from runner.records.reception import ReceptionReported
 from runner.schema import event_problem, log_problem, read_json
 from runner.system.clocks import KEPT_S
+from runner.system.files import directory_problem
 
 T = TypeVar("T")
 DRIVEN = {"vehicle", "operator"}  # sides without which a directory holds no drive
@@ -119,9 +120,8 @@ def read_drive(directory: Path) -> Drive:
     raises  UserError with file and line of the first error
     """
     where = str(directory)
-    if not directory.is_dir():
-        rule = "must be a directory that log= wrote" if directory.exists() else "no such directory"
-        raise UserError(where, "", None, rule)
+    if why := directory_problem(directory):
+        raise UserError(where, "", None, why.replace("a directory", "a directory that log= wrote"))
     warnings: list[str] = []
     files = {side: directory / name for side, name in FILES.items()}
     present = {side: path for side, path in files.items() if path.is_file()}

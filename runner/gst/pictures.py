@@ -34,8 +34,8 @@ def decode_video(path: Path, width: int, height: int) -> Iterator[tuple[int, Lum
 
     raises  RunError if the path names no file or nothing can be decoded. Damaged pictures come as they were decoded
     """
-    if not path.is_file():
-        raise RunError(f"{path}: {file_problem(path)}")
+    if why := file_problem(path):
+        raise RunError(f"{path}: {why}")
     form = f"video/x-raw,format=I420,width={width},height={height},pixel-aspect-ratio=1/1"
     pipeline = Gst.parse_launch(
         "filesrc name=file ! parsebin ! identity name=units ! decodebin ! videoconvert ! videoscale add-borders=false"

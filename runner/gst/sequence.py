@@ -57,8 +57,8 @@ def discover(path: Path, where: str) -> Form:
     where   the argument that names it, for messages
     raises  UserError if it is not a readable video
     """
-    if not path.is_file():
-        raise ArgumentError(where, path, file_problem(path))
+    if why := file_problem(path):
+        raise ArgumentError(where, path, why)
     if path.stat().st_size == 0:
         raise ArgumentError(where, path, "the file is empty")
     discoverer = GstPbutils.Discoverer.new(TIMEOUT_S * Gst.SECOND)

@@ -41,8 +41,8 @@ def read_video(path: Path) -> Iterator[Unit]:
 
     raises  RunError if there is no such file or it is damaged; units already yielded stay valid
     """
-    if not path.is_file():
-        raise RunError(f"{path}: {file_problem(path)}")
+    if why := file_problem(path):
+        raise RunError(f"{path}: {why}")
     with os_errors_as(lambda why: RunError(f"{path}: {why}")):
         times = RestoredTimes(stream_times(path))
     pipeline = Gst.parse_launch("filesrc name=file ! tsdemux name=demux  appsink name=out sync=false max-buffers=8")

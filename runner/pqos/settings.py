@@ -35,8 +35,8 @@ def find_file(settings: Mapping[str, Any], key: str, bases: Sequence[Path]) -> P
     raises  ModelError
     """
     path = find_path(settings, key, bases)
-    if not path.is_file():
-        raise ModelError(key, settings[key], file_problem(path))
+    if why := file_problem(path):
+        raise ModelError(key, settings[key], why)
     if path.stat().st_size > MOST_BYTES:
         raise ModelError(key, settings[key], f"must be at most {MOST_BYTES // 1_000_000} MB long")
     return path

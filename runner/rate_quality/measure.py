@@ -140,9 +140,10 @@ def _read_mask(path: Path, name: str, camera: Camera) -> Mask:
     import cv2
 
     where = f"masks.{name}"
-    picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
+    why = file_problem(path)
+    picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if why is None else None
     if picture is None:
-        raise ArgumentError(where, path, "cannot be read as a picture" if path.is_file() else file_problem(path))
+        raise ArgumentError(where, path, why or "cannot be read as a picture")
     if picture.shape != (camera.height, camera.width):
         found = f"{picture.shape[1]}x{picture.shape[0]}"
         raise ArgumentError(where, found, f"must be {camera.width}x{camera.height}, as the full image is")

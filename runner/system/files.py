@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import stat
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from functools import partial
 from importlib.util import find_spec
@@ -17,6 +17,7 @@ from runner.errors import ArgumentError, RunError, UserError, os_errors_as, reas
 from runner.system.signals import urgent
 
 MAX_LINKS = 40  # as the kernel follows
+ABSENT = (errno.ENOENT, errno.ENOTDIR, errno.ELOOP)
 
 
 def flush(path: Path) -> None:
@@ -116,9 +117,24 @@ def _opened(part: Path, path: Path, argument: str, descriptor: int | None) -> Te
         return part.open("w", encoding="utf-8")
 
 
-def file_problem(path: Path) -> str:
-    """The rule that a path breaks which is not a regular file but, for example, a device, a pipe or a directory."""
-    return "must be a file" if path.exists() else "no such file"
+def file_problem(path: Path) -> str | None:
+    """Why a path names no regular file but, for example, nothing, a device or a directory; None if it does."""
+    return _problem(path, stat.S_ISREG, "file")
+
+
+def directory_problem(path: Path) -> str | None:
+    """Why a path names no directory; None if it does."""
+    return _problem(path, stat.S_ISDIR, "directory")
+
+
+def _problem(path: Path, fits: Callable[[int], bool], kind: str) -> str | None:
+    """Path.is_file and the like say no, from Python 3.14 on, where permission is denied."""
+    try:
+        return None if fits(path.stat().st_mode) else f"must be a {kind}"
+    except OSError as error:
+        return f"no such {kind}" if error.errno in ABSENT else reason(error)
+    except ValueError:  # a name with a null character
+        return f"no such {kind}"
 
 
 def read_file(path: Path, most_bytes: int) -> bytes:
@@ -127,8 +143,8 @@ def read_file(path: Path, most_bytes: int) -> bytes:
     raises  ValueError with the rule that it breaks
     """
     with os_errors_as(ValueError):
-        if not path.is_file():
-            raise ValueError(file_problem(path))
+        if why := file_problem(path):
+            raise ValueError(why)
         with path.open("rb") as file:
             content = file.read(most_bytes + 1)
     if len(content) > most_bytes:

@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING
 from runner.configuration.files import conf_directories
 from runner.errors import ArgumentError
 from runner.system.extras import require
+from runner.system.files import directory_problem, write_whole
 from runner.verbs import Arguments
 from runner.verbs.screen import progress_bar
 
@@ -69,7 +70,6 @@ def report(
     from runner.drive.html import page
     from runner.drive.print import write_figures
     from runner.rate_quality.artefact import dumps
-    from runner.system.files import write_whole
     from runner.verbs.report_table import show
 
     with progress_bar() as progress:
@@ -96,8 +96,8 @@ def check_report(output: Path, models: Path | None) -> None:
     if (output / PAGE).exists() and not _is_report(output / PAGE):
         rule = "exists and was not written by tod-runner report; choose another directory"
         raise ArgumentError("output", output / PAGE, rule)
-    if models and not models.is_dir():
-        raise ArgumentError("models", models, "no such directory")
+    if models and (why := directory_problem(models)):
+        raise ArgumentError("models", models, why)
     require("report")
 
 

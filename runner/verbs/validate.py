@@ -53,6 +53,7 @@ from runner.configuration.yaml_file import read as read_yaml
 from runner.core.model import ModelError
 from runner.errors import COMMAND_LINE, ArgumentError, ConfigError, MissingBindings, Problem, RunError, suggest
 from runner.graph import Plan, may_lack_parameter_sets
+from runner.system.files import file_problem
 from runner.verbs import Arguments
 
 if TYPE_CHECKING:
@@ -165,8 +166,8 @@ def _directories(arguments: Arguments) -> dict[Path | None, list[Path] | None]:
         file = Path(word)
         if not _is_yaml(file.name):
             raise ArgumentError("", word, "must be NAME=VALUE, or a file that ends in .yaml or .yml")
-        if not file.is_file():
-            raise ArgumentError("", word, "no such file")
+        if why := file_problem(file):
+            raise ArgumentError("", word, why)
         inside = [arguments.conf] if arguments.conf else [*file.parents, *file.absolute().parents]
         above = [conf for conf in inside if _inside(conf, file) and any((conf / folder).is_dir() for folder in FOLDERS)]
         if not above:
