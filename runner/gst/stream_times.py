@@ -61,7 +61,8 @@ def _packets(path: Path) -> NDArray[np.uint8]:
 
 
 def _starts(packets: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    return (packets[:, 0] == SYNC) & (packets[:, 1] & STARTS != 0)
+    found: NDArray[np.bool_] = (packets[:, 0] == SYNC) & (packets[:, 1] & STARTS != 0)
+    return found
 
 
 def _time(packet: bytes) -> int | None:
