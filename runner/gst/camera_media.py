@@ -10,7 +10,7 @@ from gi.repository import Gst, GstRtsp, GstRtspServer, GstSdp
 from runner.graph import FEEDBACK, Plan
 from runner.gst.patient_media import PatientMedia
 from runner.gst.pipeline import CameraPipeline
-from runner.gst.srtp import set_master_key
+from runner.gst.srtp import set_master_key, write_keys
 from runner.settings import Media
 from runner.system.ports import ip_address_of
 
@@ -48,7 +48,10 @@ class CameraMedia(PatientMedia):
         plain, feedback = _profiles(bool(offered & _SECURE))
         sdp.add_attribute("range", self.get_range_string(False, GstRtsp.RTSPRangeUnit.NPT))
         wanted = feedback if is_wanted and offered & feedback else plain
-        return bool(GstRtspServer.rtsp_sdp_make_media(sdp, info, stream, caps, wanted))
+        if not GstRtspServer.rtsp_sdp_make_media(sdp, info, stream, caps, wanted):
+            return False
+        write_keys(sdp.get_media(0))
+        return True
 
 
 class CameraFactory(GstRtspServer.RTSPMediaFactory):  # type: ignore[misc]
