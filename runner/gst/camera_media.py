@@ -11,6 +11,7 @@ from runner.graph import FEEDBACK, Plan
 from runner.gst.patient_media import PatientMedia
 from runner.gst.pipeline import CameraPipeline
 from runner.gst.srtp import set_master_key, write_keys
+from runner.gst.understanding import state_version
 from runner.settings import Media
 from runner.system.ports import ip_address_of
 
@@ -46,6 +47,7 @@ class CameraMedia(PatientMedia):
         if caps is None:
             return False
         plain, feedback = _profiles(bool(offered & _SECURE))
+        state_version(sdp)
         sdp.add_attribute("range", self.get_range_string(False, GstRtsp.RTSPRangeUnit.NPT))
         wanted = feedback if is_wanted and offered & feedback else plain
         if not GstRtspServer.rtsp_sdp_make_media(sdp, info, stream, caps, wanted):

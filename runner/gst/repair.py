@@ -15,6 +15,7 @@ from runner.core.model import GraphSettings
 from runner.gst.arriving import HEADER_BYTES, ArrivingFrames, Lateness, Packet, read_packet
 from runner.gst.packet_times import received_at, state_arrivals
 from runner.gst.probes import BufferProbe, PassingBuffer
+from runner.gst.understanding import Understanding
 from runner.records.reception import Arrival, ArrivedPacket
 from runner.system.recent import RecentValue
 
@@ -81,6 +82,12 @@ class RepairBuffer:
         lost: int = self._buffer.get_property("stats").get_value("num-lost")
         # The buffer counts those, too, that come by a slower uplink after it has given them up, and before their turn.
         return min(lost, self.frames.missing) if self._merge else lost
+
+    @property
+    def unanswered(self) -> int:
+        """How many requests for lost packets there were, if none was answered in time."""
+        stats = self._buffer.get_property("stats")
+        return 0 if stats.get_value("rtx-success-count") else int(stats.get_value("rtx-count"))
 
     def adapt(self) -> int:
         """Adapt the wait for missing packets to the round trip; returns it, ms. A few times a second."""
@@ -204,6 +211,7 @@ class RtpSession:
     ) -> None:
         self._graph, self._on_report, self.uplinks = graph, on_report, uplinks
         self._counted = (0, 0)  # packets received and missing, as last read
+        self._understanding = Understanding(on_report)
         self.begin()
 
     def begin(self) -> None:
@@ -213,6 +221,7 @@ class RtpSession:
         self._kernel_times = False  # whether packets state when the kernel received them
         self._may_use_udp = False  # until it is known whether it does
         self._may_use_uplinks = self.uplinks is not None  # likewise
+        self._understanding.begin()
         if self.uplinks:
             self.uplinks.begin()
 
@@ -228,6 +237,8 @@ class RtpSession:
             reorder_ms = self._graph.jitter_buffer_ms
             merge = self.uplinks.merge if self.uplinks else None
             self._buffers.append(RepairBuffer(element, reorder_ms, kernel_times=self._kernel_times, merge=merge))
+        if factory == "srtpdec":
+            self._understanding.add(element)
         if factory == "udpsrc":
             self._over_udp = True
             try:
@@ -246,7 +257,10 @@ class RtpSession:
         """Adapt the wait for missing packets; returns it, ms, or None without repair. A few times a second."""
         if self.uplinks:
             self.uplinks.look()
-        return max((buffer.adapt() for buffer in self._repairing()), default=None)
+        repairing = self._repairing()
+        received = sum(buffer.frames.received for buffer in self._buffers)
+        self._understanding.look(received, sum(buffer.unanswered for buffer in repairing))
+        return max((buffer.adapt() for buffer in repairing), default=None)
 
     def waited_ms(self) -> float | None:
         """How long the end of a recent frame waited; None: unknown. A few times a second."""
@@ -290,7 +304,8 @@ class RtpSession:
         return self._buffers if self._graph.retransmission_ms and self._over_udp and self._feedback else []
 
     def _on_description(self, _client: Gst.Element, sdp: GstSdp.SDPMessage) -> None:
-        """Note whether the vehicle grants the profile with feedback."""
+        """Note whether the vehicle grants the profile with feedback, and its version."""
+        self._understanding.read(sdp)
         media = range(sdp.medias_len())
         self._feedback = any(sdp.get_media(number).get_proto().endswith("AVPF") for number in media)
         if self.uplinks and media:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import os
+import random
 import re
 import shutil
 import socket
@@ -18,6 +19,7 @@ from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
+import inside
 import pytest
 from helpers import out_of_reach
 from mcap.reader import make_reader
@@ -31,6 +33,7 @@ from runner.drive.read import read_drive
 from runner.gst.pipeline import encrypt
 from runner.gst.secure import StreamLogin
 from runner.gst.server import NO_PASSWORD
+from runner.gst.understanding import VERSION
 from runner.link import Limit, limited_link
 from runner.mqtt.broker import private_broker
 from runner.mqtt.link import ControlLink
@@ -526,6 +529,36 @@ def test_a_revoked_holder_starts_no_camera(keys, monkeypatch):
         changed(keys, "revoke", "bob")
         assert bob.ask("DESCRIBE", Accept="application/sdp") == 403
         assert not any("pipeline built" in report for report in reports)
+
+
+def other_key(encoded):
+    """A message with keys (MIKEY) whose last key is another one, in base64."""
+    message = bytearray(base64.b64decode(encoded))
+    message[-2] ^= 0xFF  # the end of its salt, in front of the kind of the MAC
+    return base64.b64encode(message).decode()
+
+
+def test_keys_that_do_not_fit_are_reported_with_both_versions(keys, monkeypatch):
+    monkeypatch.setattr("runner.gst.srtp.in_one_piece", other_key)
+    with sending(keys) as (plans, _), watching(plans, keys / "bob") as (seen, messages):
+        until(lambda: max(seen().values()) > 0 or messages, every_s=0.1)
+        fault = "packets arrive, but none can be decrypted"
+        versions = f"GStreamer {VERSION} here, {VERSION} on the vehicle"
+        assert messages[0] == f"front, rear: {fault}; {versions}; install the same tod-runner on both sides"
+        assert max(seen().values()) == 0
+
+
+def test_feedback_that_the_vehicle_does_not_understand_is_reported(keys, monkeypatch):
+    """Pictures arrive, but none that is lost is sent again."""
+    chance = random.Random(1)
+    inside.losing(monkeypatch, "udpsrc", "src", lambda packet: packet.get_size() > 200 and chance.random() < 0.1)
+    monkeypatch.setattr("runner.gst.camera_media.write_keys", lambda _: None)
+    monkeypatch.setattr("runner.gst.srtp.in_one_piece", other_key)  # of the key for feedback
+    monkeypatch.setattr("runner.gst.understanding.REQUESTS", 10)
+    with sending(keys) as (plans, _), watching(plans, keys / "bob") as (seen, messages):
+        until(lambda: min(seen().values()) >= 0 and messages, every_s=0.1)
+        assert "nothing that was lost is repaired" in messages[0]
+        assert min(seen().values()) > 0
 
 
 def test_srtp_keys_come_from_the_systems_generator(keys, monkeypatch):
