@@ -248,7 +248,16 @@ def test_maps_are_read(tod: Command, conf: UserConf, rows: str | None, expected:
         ("element: x264enc", "element: x264encc", "encoder[0].element: 'x264encc'"),
         ("quantizer: 10", "quantiser: 10", "encoder[0].properties.quantiser"),
         ("quantizer: 10", "quantizer: 100", "encoder[0].properties.quantizer"),
-        ("medium: {preset: superfast", "medium: {preset: superfst", "encoder[0].properties.speed-preset"),
+        (
+            "medium: {preset: superfast",
+            "medium: {preset: superfst",
+            "encoder[0].properties.speed-preset: 'superfst': must be one of None, ultrafast, superfast, veryfast, ",
+        ),
+        (
+            "tune: zerolatency",
+            "tune: zerolatenci",
+            "encoder[0].properties.tune: 'zerolatenci': must be one of stillimage, fastdecode, zerolatency",
+        ),
         ("property: bitrate, value: kbps", "property: threads, value: kbps", "knobs.bitrate[0].property"),
         ("property: bitrate, value: kbps", "property: bitrat, value: kbps", "knobs.bitrate[0].property"),
     ],

@@ -13,6 +13,7 @@ from runner.core.commands import KnobValue
 from runner.core.model import Element, ModelError, Value
 from runner.errors import RunError, suggest
 from runner.graph import Plan, assignments, launch, text
+from runner.gst.enums import enum_values
 
 PACKAGES = {  # elements by Debian package; `doctor` and messages on missing plugins name the package
     "gstreamer1.0-plugins-base": "videoconvert videoscale videorate videotestsrc decodebin appsrc appsink",
@@ -253,7 +254,7 @@ def _property_problem(factory: str, key: str, value: Value) -> str | None:
         return f"{key} of {factory} is read-only"
     kind = spec.value_type.name
     if not _readable(kind, text(value)):
-        nicks = _nicks(spec)
+        nicks = [value.nick for value in enum_values(spec.value_type)]
         return f"must be one of {', '.join(nicks)}" if nicks else f"must be a {kind.removeprefix('g')}"
     if hasattr(spec, "minimum") and not spec.minimum <= float(value) <= spec.maximum:
         return f"must be from {spec.minimum} to {spec.maximum}"
@@ -282,18 +283,11 @@ def _readable(kind: str, value: str) -> bool:
     return False
 
 
-def _nicks(spec: GObject.ParamSpec) -> list[str]:
-    if hasattr(spec, "enum_class"):
-        return [value.value_nick for value in spec.enum_class.__enum_values__.values()]
-    if hasattr(spec, "flags_class"):
-        return [nick for value in spec.flags_class.__flags_values__.values() for nick in value.value_nicks]
-    return []
-
-
 @cache
 def _template(factory: str) -> Gst.Element | None:
-    """An element of a factory, to inspect its properties."""
-    return Gst.ElementFactory.make(factory, None)
+    """An element of a factory, to inspect its properties; None: there is no such factory on this machine."""
+    found = Gst.ElementFactory.find(factory)  # `make` raises on 1.28 where it returned None before
+    return found and found.create(None)
 
 
 def _factory_names(like: str) -> list[str]:
