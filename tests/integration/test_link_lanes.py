@@ -319,9 +319,9 @@ def test_lanes_of_a_relay_are_addresses_of_the_vehicle():
 def test_a_vehicle_uses_both_lanes_of_a_relay(tmp_path):
     """The redundant camera goes on over one while the other is cut."""
     path, ports = tmp_path / "drive", (f"media.port={free_port()}", f"control.port={free_port()}")
-    cut = "link.cuts=[{lane: b, at_s: 2, for_s: 2, how: silence}]"
+    cut = "link.cuts=[{lane: b, at_s: 3, for_s: 2, how: silence}]"
     words = ("experiment=two_uplinks", "~experiment.runs", cut, "link.queue_ms=2000", *SMALL_ROBOT[1:], "source=test")
-    done = run("demo", *words, "page.serve=false", *ports, f"log={path}", "duration_s=4.5")
+    done = run("demo", *words, "page.serve=false", *ports, f"log={path}", "duration_s=5.5")
     assert done.returncode == 0, done.stderr
     sides = read_drive(path).sides
     carried = {line.lane: line.packets for line in sides["link"].of(LinkSample)}
