@@ -43,11 +43,17 @@ class Encoded:
 
 @dataclass(slots=True)
 class _Run:
-    """State of one run, shared by its streaming threads."""
+    """State of one run, shared by its streaming threads.
+
+    frames, read  pictures that have passed at the constant rate of the sequence, and before it was made constant
+    ends_ns       when the last one that was read is over
+    """
 
     fps: Fraction
     form: str = ""
     frames: int = 0
+    read: int = 0
+    ends_ns: int = 0
     first_ns: int = 0  # running time of the first frame: in a clip with sound it may be later than 0
     last_frame: float = field(default_factory=time.monotonic)  # time at which a frame last passed
     error: BaseException | None = None
@@ -74,6 +80,8 @@ def run_lanes(
         Gst.PadProbeType.BUFFER | Gst.PadProbeType.EVENT_DOWNSTREAM,
         lambda pad, info: _on_source(run, pad, info, on_frame),
     )
+    for rate in _elements(pipeline, "videorate"):
+        rate.get_static_pad("sink").add_probe(Gst.PadProbeType.BUFFER, lambda _, info: _on_read(run, info.get_buffer()))
     results = [Encoded() for _ in lanes.lanes]
     for number, lane in enumerate(lanes.lanes):
         _watch_encoder(pipeline.get_by_name(lane.encoder), results[number])
@@ -85,21 +93,19 @@ def run_lanes(
             raise RunError(_message(pipeline.get_bus().pop_filtered(Gst.MessageType.ERROR)))
         _wait(pipeline, run, on_progress)
         if not lanes.lanes:
-            _check_seams(pipeline)
+            _check_seams(pipeline, run.read)
     finally:
         pipeline.set_state(Gst.State.NULL)
     return results
 
 
-def _check_seams(pipeline: Gst.Pipeline) -> None:
+def _elements(pipeline: Gst.Pipeline, factory: str) -> list[Gst.Element]:
+    return [element for element in pipeline.children if element.get_factory().get_name() == factory]
+
+
+def _check_seams(pipeline: Gst.Pipeline, read: int) -> None:
     """raises RunError if a picture behind a seam of joined files was left out, perhaps with a new size"""
-    by_kind = {element.get_factory().get_name(): element for element in pipeline.children}
-    if not {"filesrc", "videorate"} <= by_kind.keys():
-        return
-    read, units = (
-        by_kind["videorate"].get_property("in"),
-        joined_units(Path(by_kind["filesrc"].get_property("location"))),
-    )
+    units = sum(joined_units(Path(file.get_property("location"))) for file in _elements(pipeline, "filesrc"))
     if read < units:
         made_anew = "`ffmpeg -i FILE -c copy WHOLE.ts` makes it one"
         raise RunError(f"it was joined from several files, and only {read} of {units} pictures are read; {made_anew}")
@@ -137,12 +143,20 @@ def _message(message: Gst.Message | None) -> str:
     return f"{where}: {error.message}" + (f" ({reason[-1]})" if reason else "")
 
 
+def _on_read(run: _Run, picture: Gst.Buffer) -> Gst.PadProbeReturn:
+    lasts = round(Gst.SECOND / run.fps) if picture.duration == Gst.CLOCK_TIME_NONE else picture.duration
+    run.read, run.ends_ns = run.read + 1, picture.pts + lasts
+    return Gst.PadProbeReturn.OK
+
+
 def _on_source(run: _Run, pad: Gst.Pad, info: Gst.PadProbeInfo, on_frame: OnFrame) -> Gst.PadProbeReturn:
     event = info.get_event() if info.type & Gst.PadProbeType.EVENT_DOWNSTREAM else None
     if event is not None:
         if event.type == Gst.EventType.CAPS:
             _check_form(run, event.parse_caps())
         return Gst.PadProbeReturn.OK
+    if 0 < run.read <= run.frames and info.get_buffer().pts >= run.ends_ns:
+        return Gst.PadProbeReturn.DROP  # GStreamer 1.28 repeats the last picture even if the rate was right
     number, run.frames, run.last_frame = run.frames, run.frames + 1, time.monotonic()
     if number == 0:
         segment = pad.get_sticky_event(Gst.EventType.SEGMENT, 0).parse_segment()
