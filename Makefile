@@ -71,6 +71,7 @@ lint: $(TEST_READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/mypy --python-version 3.10 runner/ros/node
 	$(BIN)/lint-imports --no-logo
 	$(BIN)/check-jsonschema --check-metaschema schemas/*.json
 

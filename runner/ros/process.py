@@ -227,7 +227,7 @@ class NodeProcess:
         with ExitStack() as stack, own, its:
             own.send(json.dumps(self._task).encode())
             process = subprocess.Popen(
-                children.bound([self._settings.interpreter, "-P", str(SCRIPT), str(its.fileno())]),
+                children.bound([self._settings.interpreter, str(SCRIPT), str(its.fileno())]),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,  # rclpy also writes this to its own log
