@@ -32,12 +32,11 @@ from runner.gst.probes import PassingBuffer
 from runner.gst.receiver import OnPicture, OnUnit, Receiver, Reception
 from runner.gst.recorder import Recorded, Recorder, Stage
 from runner.gst.registry import (
+    LIVE,
     check_operator,
     check_plan,
     check_recorders,
     check_vehicle,
-    missing_plugins,
-    missing_recorders,
     require_plugins,
     versions,
 )
@@ -66,6 +65,7 @@ if TYPE_CHECKING:
     from runner.security.keyring import Keyring
 
 __all__ = [
+    "LIVE",
     "TYPELIBS",
     "OnUnit",
     "OperatorSide",
@@ -83,8 +83,6 @@ __all__ = [
     "check_vehicle",
     "decode_video",
     "discover",
-    "missing_plugins",
-    "missing_recorders",
     "parameter_set_notes",
     "read_again",
     "read_video",

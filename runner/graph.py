@@ -6,7 +6,7 @@ import math
 import re
 import shlex
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import lru_cache
 
@@ -94,6 +94,7 @@ class Plan:
     wire_*     what `print` adds in place of RTSP server and client
     recorder   elements that follow the source when it is recorded, without the file; empty if it is not recorded
     bag        pictures that are pushed into the first element of the source; None: none
+    needs      by element that only the vehicle may have, the package that provides it
     video      whether each side also writes what it sends or receives into a file
     """
 
@@ -108,6 +109,7 @@ class Plan:
     wire_operator: tuple[Element, ...]
     recorder: tuple[Element, ...] = ()
     bag: BagTopic | None = None
+    needs: Mapping[str, str] = field(default_factory=dict)
     video: bool = False
 
     @property
@@ -163,8 +165,11 @@ class Plan:
 
     def recording(self, path: str) -> str:
         """The pipeline that records the source into a file, as GStreamer parses it."""
-        writer = replace(_WRITER, properties={"location": path})
-        return launch((*self.source, *_RECORDED, *self.recorder, writer))
+        return launch(self.recorded(path))
+
+    def recorded(self, path: str) -> tuple[Element, ...]:
+        """The elements of that pipeline."""
+        return (*self.source, *_RECORDED, *self.recorder, replace(_WRITER, properties={"location": path}))
 
     def vehicle_line(self, knobs: Mapping[str, KnobValue]) -> str:
         """Arguments for gst-launch-1.0 with the knobs turned, quoted for a shell, ending in a network sink."""
@@ -217,6 +222,7 @@ def compile_graph(
         wire_operator=fill(graph.wire_operator, "graph.wire.operator"),
         recorder=fill(recorder, "recording.elements"),
         bag=bag_topic(camera),
+        needs={**source.needs, **graph.needs, **(recording.needs if recording else {})},
     )
 
 
@@ -255,14 +261,16 @@ def assignments(camera: Camera, knob: str, value: KnobValue, pace: float = 1.0) 
     turned: list[Assignment] = []
     for target in camera.graph.knobs[knob]:
         quantities = of_frames if target.element in count_frames else of_time
-        if PLACEHOLDER.search(target.value) and "width" in quantities:
-            filled: Value = PLACEHOLDER.sub(lambda match: str(of_time[match[1]]), target.value)
-        elif target.value in quantities:
-            filled = quantities[target.value]
-        else:
-            raise ModelError(f"graph.knobs.{knob}", repr(target.value), f"{knob} offers {', '.join(quantities)}")
-        turned.append((target.element, target.property, filled))
+        turned.append((target.element, target.property, _turned(knob, target.value, quantities)))
     return turned
+
+
+def _turned(knob: str, wanted: str, quantities: Mapping[str, Value]) -> Value:
+    """What a knob sets: the quantity of that name, or a text with quantities in place of {placeholders}."""
+    names = PLACEHOLDER.findall(wanted)
+    if not quantities.keys() >= set(names or [wanted]):
+        raise ModelError(f"graph.knobs.{knob}", repr(wanted), f"{knob} offers {', '.join(quantities)}")
+    return PLACEHOLDER.sub(lambda match: text(quantities[match[1]]), wanted) if names else quantities[wanted]
 
 
 def is_restarted_after_gaps(graph: Graph) -> bool:
@@ -331,7 +339,8 @@ def _quantities(camera: Camera, value: KnobValue, pace: float = 1.0) -> dict[str
         return {"on": value, "off": not value}
     if isinstance(value, int):
         bps = round(1000 * value * pace)
-        return {"kbps": max(1, round(bps / 1000)), "bps": bps, **_buffer(camera, value)}
+        of_frames = _per_frame_rate(camera.graph.settings, camera.fps)
+        return {"kbps": max(1, round(bps / 1000)), "bps": bps, **of_frames, **_buffer(of_frames, value)}
     if isinstance(value, Roi):
         # The crop element sees the native picture; an ROI is relative to the full image inside it.
         native_width, native_height = camera.source_size
@@ -342,13 +351,12 @@ def _quantities(camera: Camera, value: KnobValue, pace: float = 1.0) -> dict[str
     return dict(zip(("width", "height"), value, strict=True))
 
 
-def _buffer(camera: Camera, kbps: int) -> dict[str, Value]:
+def _buffer(of_frames: Mapping[str, int], kbps: int) -> dict[str, Value]:
     """Length of the rate control's buffer, ms, if the graph states it in frames.
 
     At least 1 kbit: x264 rounds down to whole kbit, and treats 0 as unlimited.
     """
-    values = _per_frame_rate(camera.graph.settings, camera.fps)
-    return {"vbv_ms": max(values["vbv_ms"], math.ceil(1000 / kbps))} if "vbv_ms" in values else {}
+    return {"vbv_ms": max(of_frames["vbv_ms"], math.ceil(1000 / kbps))} if "vbv_ms" in of_frames else {}
 
 
 @lru_cache  # needed several times for each new bitrate

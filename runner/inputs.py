@@ -16,7 +16,7 @@ def input_problem(camera: Camera) -> ModelError | None:
 def clip_problem(camera: Camera) -> ModelError | None:
     """Why the camera's clip cannot be read; None as for `input_problem`."""
     clip = _given(camera, "clip")
-    if clip is None or "clip" not in camera.source.needs or camera.source.render:
+    if clip is None or "clip" not in camera.source.placeholders or camera.source.render:
         return None
     why = file_problem(Path(clip))
     return ModelError("clip", repr(clip), why) if why else None

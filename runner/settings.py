@@ -203,11 +203,13 @@ class Recording:
     codec     its name, for display and for recording.json
     of_raw    upper bound of a file's size as a share of the raw frames' size
     elements  from raw frames to a Matroska stream, may hold {placeholders}
+    needs     by element that only the vehicle may have, the Debian package that provides it
     """
 
     codec: str
     of_raw: float
     elements: tuple[Element, ...]
+    needs: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_unique("elements", [element.name for element in self.elements])

@@ -26,8 +26,8 @@ OWN = "files of your own need conf=DIR"
 SWEEP = "a,b,c is a sweep, which print, replay and demo run with -m; write [a,b,c] for a list"
 QUOTE = """; quote a value with special characters: 'key="value"'"""
 KNOB_VALUES = (
-    "kbps, bps, vbv_ms, left, right, top, bottom, on, off (quote these two), or a caps template over"
-    " {width} and {height}"
+    "kbps, bps, vbv_ms, left, right, top, bottom, on, off (quote these two), or a template over {width} and"
+    " {height}, or over {kbps}, {bps}, {vbv_ms} and {key_interval_frames}"
 )
 MINE = """# @package _global_
 defaults:
@@ -364,7 +364,11 @@ REAR, GRAPH, PAPER, ROBOT = (
             "knobs.sending[0].element: 'gaet': no such element, did you mean gate?",
         ),
         (GRAPH, {"value: kbps": "value: kbit"}, f"knobs.bitrate[0].value: 'kbit': {KNOB_VALUES}"),
-        (GRAPH, {"value: kbps": "value: left"}, "knobs.bitrate: 'left': bitrate offers kbps, bps, vbv_ms"),
+        (
+            GRAPH,
+            {"value: kbps": "value: left"},
+            "knobs.bitrate: 'left': bitrate offers kbps, bps, key_interval_frames, vbv_ms",
+        ),
         (GRAPH, {'value: "off"': "value: off"}, 'knobs.sending[0].value: false: must be text, quote it: "on" or "off"'),
         (
             GRAPH,

@@ -294,6 +294,20 @@ def test_a_graph_is_valid_once_built(changes: dict[str, Any], message: str) -> N
     assert str(refused.value) == message
 
 
+def test_a_template_of_several_quantities() -> None:
+    settings = GraphSettings(5600, key_interval_s=1.5, vbv_frames=2)
+    value = "controls,video_bitrate={bps},period={key_interval_frames},x={kbps}/{vbv_ms}"
+    target = KnobTarget("pay0", "extra-controls", value)
+    camera = replace(LEFT, fps=Fraction(20), graph=replace(graph(), knobs={"bitrate": (target,)}, settings=settings))
+    expected = ("pay0", "extra-controls", "controls,video_bitrate=700000,period=30,x=700/100")
+    assert assignments(camera, "bitrate", 700) == [expected]
+    wrong = replace(camera, graph=replace(camera.graph, knobs={"bitrate": (replace(target, value="{bps}{width}"),)}))
+    with pytest.raises(ModelError) as refused:
+        assignments(wrong, "bitrate", 700)
+    rule = "bitrate offers kbps, bps, key_interval_frames, vbv_ms"
+    assert str(refused.value) == f"graph.knobs.bitrate: '{{bps}}{{width}}': {rule}"
+
+
 def test_a_knob_that_cannot_offer_the_requested_value() -> None:
     wrong = replace(graph(), knobs={"bitrate": (KnobTarget("pay0", "x", "left"),)})
     with pytest.raises(ModelError) as refused:

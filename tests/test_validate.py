@@ -272,14 +272,15 @@ def test_against_the_registry(tod: Command, conf: UserConf, old: str, new: str, 
 @pytest.mark.skipif(importlib.util.find_spec("gi") is None, reason="PyGObject is not installed")
 def test_elements_of_the_packaged_graphs_have_a_package() -> None:
     """So that a machine that lacks one is told what to install."""
-    from runner.gst import Gst, registry
+    from runner.elements.packages import PACKAGE_OF
+    from runner.gst import Gst
 
     for graph in (file.stem for file in (CONF / "graph").glob("*.yaml")):
         for plan in compile_plans(configuration([f"graph={graph}", "source=test"]).setup()):
             for element in (*plan.vehicle, *plan.operator):
                 found = Gst.ElementFactory.find(element.factory)
                 is_core = found is not None and found.get_plugin_name() == "coreelements"
-                assert is_core or element.factory in registry.PACKAGE_OF, element.factory
+                assert is_core or element.factory in {*PACKAGE_OF, *plan.needs}, element.factory
 
 
 @pytest.mark.gst

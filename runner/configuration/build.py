@@ -63,7 +63,7 @@ TOPIC_RULE = "must be the name of a topic: letters, digits and _ between slashes
 CAMERA_NEEDS = ("width_px", "height_px", "fps", "rate_quality")  # keys that the schema requires, set by the kind
 GRAPH_STRUCTURE = (
     *("defaults", "transport", "verified", "key_frame", "vehicle", "operator", "wire", "knobs", "mutable"),
-    *("effort", "efforts"),
+    *("effort", "efforts", "needs"),
 )
 GRAPH_SETTINGS = [part.name for part in fields(GraphSettings)]
 SECTIONS = ("media", "control", "page", "log", "latency", "keys", "insecure", "metrics", "ros", "strict", "uplinks")
@@ -131,7 +131,7 @@ class Builder:
                 self.attempt(("cameras", camera.name), lambda c=camera: view(c))  # type: ignore[misc]
             if self.runnable:
                 self._check_inputs(camera)
-            if camera.source.plays_bags or "clip" in camera.source.needs:
+            if camera.source.plays_bags or "clip" in camera.source.placeholders:
                 self._check_files(camera)
         if self.problems or recording is None:
             return None
@@ -304,7 +304,7 @@ class Builder:
     def _check_inputs(self, camera: Camera) -> None:
         """Check that the clip, device or address that a camera's source needs is configured."""
         source = camera.source
-        needs = {"bag"} if source.plays_bags else source.needs.intersection(MOUNT_KEYS)
+        needs = {"bag"} if source.plays_bags else source.placeholders.intersection(MOUNT_KEYS)
         needs |= {"topic"} if source.subscribes else set()
         for key in () if source.render else sorted(needs):
             given = camera.mount.get(key, source.settings.get(key))
@@ -469,7 +469,7 @@ def _graph(data: Mapping[str, Any]) -> Graph:
         settings=GraphSettings(**_given(named, GRAPH_SETTINGS)),
         placeholders=named,
         mutable=tuple((entry["element"], entry["property"]) for entry in data.get("mutable") or ()),
-        **_given(data, ("verified", "key_frame")),
+        **_given(data, ("verified", "key_frame", "needs")),
     )
 
 
@@ -482,14 +482,14 @@ def _source(data: Mapping[str, Any]) -> Source:
         plays_bags="bag" in data,
         subscribes=data.get("ros", False),
         **_given(data, ("loop", "frozen_s", "repeated_s", "depth_m", "credentials", "medium", "first_reply_s")),
-        render=render["drive"] if render else "",
-        render_s=render["seconds"] if render else 0,
+        needs=data.get("needs") or {},
+        **({"render": render["drive"], "render_s": render["seconds"]} if render else {}),
         stand_in=_elements(data.get("stand_in")),
     )
 
 
 def _recording(data: Mapping[str, Any]) -> Recording:
-    return Recording(data["codec"], data["of_raw"], _elements(data["elements"]))
+    return Recording(data["codec"], data["of_raw"], _elements(data["elements"]), data.get("needs") or {})
 
 
 def _split(key: str) -> schema.Path:

@@ -170,7 +170,7 @@ class Element:
 
 @dataclass(frozen=True, slots=True)
 class KnobTarget:
-    """One property that a knob sets, and its value: a quantity of the knob (see `runner.graph`) or a caps template."""
+    """One property that a knob sets, and its value: a quantity of the knob (see `runner.graph`) or a text with some."""
 
     element: str
     property: str
@@ -215,6 +215,7 @@ class Graph:
     verified      False: only checked against its schema, never run by this project's tests
     key_frame     how to request a key frame after unrecovered packet loss: "event", GStreamer's own; "caps", a pixel
                   aspect ratio that differs imperceptibly, for an encoder that ignores the event; None: not at all
+    needs         by element that only the vehicle may have, the Debian package that provides it
     """
 
     transport: str
@@ -228,6 +229,7 @@ class Graph:
     mutable: tuple[tuple[str, str], ...] = ()
     verified: bool = True
     key_frame: str | None = None
+    needs: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         names = [element.name for element in (*self.vehicle, *self.wire_vehicle)]
@@ -280,6 +282,7 @@ class Source:
     subscribes  the same for a ROS topic
     depth_m     distance that is shown white in pictures of distances, m, in both
     stand_in    elements that `print` shows if gst-launch cannot produce the frames (from Python, or not yet rendered)
+    needs       by element that only the vehicle may have, the Debian package that provides it
     """
 
     elements: tuple[Element, ...]
@@ -297,6 +300,7 @@ class Source:
     subscribes: bool = False
     depth_m: float = DEPTH_M
     stand_in: tuple[Element, ...] = ()
+    needs: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if (self.plays_bags or self.subscribes) and self.elements[0].factory != "appsrc":
@@ -305,7 +309,7 @@ class Source:
             raise ModelError("elements[0].element", repr(self.elements[0].factory), rule, "bag", "ros")
 
     @property
-    def needs(self) -> frozenset[str]:
+    def placeholders(self) -> frozenset[str]:
         """Names of the placeholders in its elements."""
         values = (value for element in self.elements for value in element.properties.values())
         return frozenset(name for value in values if isinstance(value, str) for name in PLACEHOLDER.findall(value))
@@ -451,13 +455,13 @@ class Camera:
     def address(self) -> str | None:
         """The address of its IP camera; None if it is none, or no address is configured."""
         address = self.mount.get("address", self.source.settings.get("address"))
-        return str(address) if "address" in self.source.needs and address else None
+        return str(address) if "address" in self.source.placeholders and address else None
 
     @property
     def device(self) -> str | None:
         """The device file that its source opens; None if it opens none, or none is configured."""
         device = self.mount.get("device", self.source.settings.get("device"))
-        return str(device) if "device" in self.source.needs and device is not None else None
+        return str(device) if "device" in self.source.placeholders and device is not None else None
 
     @property
     def topic(self) -> str | None:

@@ -3,17 +3,11 @@
 from __future__ import annotations
 
 import ctypes
-from typing import Any, NamedTuple
+from typing import Any
 
 from gi.repository import GObject
 
-
-class EnumValue(NamedTuple):
-    """One value of an enumeration, or one flag: "zerolatency", 4, "Zero latency" of x264enc's tune."""
-
-    nick: str
-    number: int
-    name: str
+from runner.elements.description import EnumValue
 
 
 class _Enum(ctypes.Structure):  # GEnumClass

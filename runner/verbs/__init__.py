@@ -61,7 +61,7 @@ VERBS = {
     "validate": Verb(
         "check configuration files and their combinations",
         "runner.verbs.validate",
-        ("all",),
+        ("all", "target"),
         "FILE",
         choices={"all": NO_YES},
     ),
@@ -134,7 +134,7 @@ VERBS = {
         choices={"overwrite": NO_YES},
     ),
     "keys": Verb("keys and passwords for vehicles and operators", "runner.verbs.keys", KEYS, composes=False),
-    "doctor": Verb("list missing dependencies of this machine", "runner.verbs.doctor", (), "VERB"),
+    "doctor": Verb("list missing dependencies of this machine", "runner.verbs.doctor", ("registry",), "VERB"),
     "completion": Verb("the completion script for bash or zsh", "runner.verbs.completion", (), "SHELL", composes=False),
 }
 

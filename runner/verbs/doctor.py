@@ -1,12 +1,16 @@
-"""usage: tod-runner doctor [VERB] [OVERRIDE ...]
+"""usage: tod-runner doctor [VERB] [OVERRIDE ...] [registry=FILE]
 
 Lists what this machine lacks to run a verb with this configuration, and how to install it: Python packages, GStreamer
 and its bindings, elements, broker, free ports, certificates that are valid for 30 more days, cameras and the USB
 bandwidth they share, uplinks, cores. The default verb is `demo`, which needs everything that both sides need. Ends with
 status 1 if something is missing.
 
+registry=FILE keeps what GStreamer offers on this machine, a vehicle for example, for `tod-runner validate target=FILE`
+on another.
+
   tod-runner doctor
   tod-runner doctor vehicle source=v4l2 graph=h264_va_rtsp
+  tod-runner doctor vehicle registry=van.registry
   tod-runner doctor model metric=vmaf
 """
 
@@ -66,7 +70,22 @@ def run(arguments: Arguments) -> int:
         print(f"{'ok     ' if fine else 'MISSING'} {what}")
     if not findings:
         print(f"ok      {verb} needs only this package")
+    if path := arguments.path("registry"):
+        _keep_registry(path)
     return 0 if all(fine for fine, _ in findings) else 1
+
+
+def _keep_registry(path: Path) -> None:
+    """raises  RunError if the file cannot be written"""
+    try:
+        from runner.apply import LIVE
+    except MissingBindings as error:
+        raise RunError(f"{path}: nothing was written: {error}") from None
+    from runner.elements.dump import write_dump
+
+    dump = LIVE.dump()
+    write_dump(path, dump)
+    print(f"written {path}: {len(dump.elements)} elements of GStreamer {dump.gstreamer}")
 
 
 def _verb(arguments: Arguments) -> str:
@@ -169,19 +188,20 @@ def gstreamer_fits(version: str) -> Diagnosis:
 
 def _elements(verb: str, setup: Setup) -> Iterator[Diagnosis]:
     """GStreamer elements: those of one side for its own verb, otherwise all."""
-    from runner.apply import missing_plugins, missing_recorders
+    from runner.apply import LIVE
+    from runner.elements.packages import missing_plugins, missing_recorders
 
     lines, missing = [], dict[str, None]()
     for plan in compile_plans(setup):
         if verb == "operator":
             lines += [plan.operator]
-            missing |= dict.fromkeys(missing_plugins(plan, ("operator",)))
+            missing |= dict.fromkeys(missing_plugins(LIVE, plan, ("operator",)))
         elif verb == "vehicle":
             lines += [plan.source, plan.vehicle]
-            missing |= dict.fromkeys(missing_plugins(plan, ("vehicle",)))
+            missing |= dict.fromkeys(missing_plugins(LIVE, plan, ("vehicle",)))
         else:
             lines += [plan.source, plan.vehicle, plan.operator, plan.recorder]
-            missing |= dict.fromkeys((*missing_plugins(plan), *missing_recorders(plan)))
+            missing |= dict.fromkeys((*missing_plugins(LIVE, plan), *missing_recorders(LIVE, plan)))
     names = {element.factory for line in lines for element in line}
     yield from (Diagnosis(False, sentence) for sentence in missing)
     if not missing:

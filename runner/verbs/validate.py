@@ -1,4 +1,4 @@
-"""usage: tod-runner validate [OVERRIDE ...] [FILE ...] [conf=DIR] [all=true]
+"""usage: tod-runner validate [OVERRIDE ...] [FILE ...] [conf=DIR] [all=true] [target=NAME|FILE]
 
 Checks the files of your directory against their schemas, then the configurations composed from them: each file once
 with the choices of the command line, otherwise the defaults; each vehicle also with each of your graphs and sources.
@@ -11,14 +11,17 @@ FILE, a word that ends in .yaml or .yml, limits the check to that file and the f
 conf=DIR, otherwise the nearest one above it that has folders of groups.
 
 If GStreamer is installed, configurations are also checked against its registry: elements, properties, types, ranges,
-and whether the properties that knobs set may change while playing. Maps, traces and tracks of pqos files are read. If
-there are problems, all of them are reported and the verb ends with status 2. If DIR/.schemas, which your editor uses,
-comes from another version of tod-runner, a warning is printed to standard error.
+and whether the properties that knobs set may change while playing. With target= the registry is that of another
+machine: gstreamer-1.22 (Debian 12), gstreamer-1.26 (Debian 13) and gstreamer-1.28 (Debian testing) come with this
+package, and `tod-runner doctor registry=FILE` writes that of your vehicle. Maps, traces and tracks of pqos files are
+read. If there are problems, all of them are reported and the verb ends with status 2. If DIR/.schemas, which your
+editor uses, comes from another version of tod-runner, a warning is printed to standard error.
 
   tod-runner validate conf=my_vehicles                       your files, for example in CI
   tod-runner validate my_vehicles/vehicle/van.yaml           one of them, for example before a commit
   tod-runner validate conf=my_vehicles vehicle=van           one of your vehicles with your graphs and sources
   tod-runner validate vehicle=tum_q7 pqos.file=yard.csv      one configuration
+  tod-runner validate conf=my_vehicles target=gstreamer-1.28 for a vehicle with that GStreamer
   tod-runner validate all=true                               everything that is packaged
 """
 
@@ -29,6 +32,7 @@ import re
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
+from functools import cache
 from itertools import chain, product, repeat
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -51,6 +55,9 @@ from runner.configuration.overrides import choosable
 from runner.configuration.yaml_file import label, load_file, load_node
 from runner.configuration.yaml_file import read as read_yaml
 from runner.core.model import ModelError
+from runner.elements.check import check_plan
+from runner.elements.description import Registry
+from runner.elements.packages import missing_plugins, missing_recorders
 from runner.errors import COMMAND_LINE, ArgumentError, ConfigError, MissingBindings, Problem, RunError, suggest
 from runner.graph import Plan, may_lack_parameter_sets
 from runner.system.files import file_problem
@@ -123,7 +130,9 @@ class Result(NamedTuple):
 
 
 def run(arguments: Arguments) -> int:
-    everything = arguments.choice("all") == "true"
+    everything, target = arguments.choice("all") == "true", arguments.values.get("target")
+    if target:
+        registry_of(target)
     files, configurations, notes = 0, 0, dict[str, None]()
     for conf, named in _directories(arguments).items():
         _warn_of_other_schemas(conf)
@@ -131,7 +140,7 @@ def run(arguments: Arguments) -> int:
         found, checked = check_files(directories if everything else directories[:1], named)
         if found:
             raise ConfigError(found)
-        results = _check_all(_Tasks(tuple(arguments.overrides), conf, everything, named).selected(), conf)
+        results = _check_all(_Tasks(tuple(arguments.overrides), conf, everything, named).selected(), conf, target)
         if problems := [problem for result in results.values() for problem in result.problems]:
             raise ConfigError(problems)
         files, configurations = files + checked, configurations + len({task.words for task in results})
@@ -358,7 +367,7 @@ def _reaches(path: Path) -> set[str]:
     return named.intersection(GROUPS) - {path.parent.name, "cameras"}
 
 
-def _check_all(tasks: Sequence[ValidationTask], user: Path | None) -> dict[ValidationTask, Result]:
+def _check_all(tasks: Sequence[ValidationTask], user: Path | None, target: str | None) -> dict[ValidationTask, Result]:
     """What was found in each configuration, and in the runs of experiments, in the order of the tasks.
 
     A file that is invalid alone is combined with no other, and the runs of an invalid experiment are not checked.
@@ -368,7 +377,7 @@ def _check_all(tasks: Sequence[ValidationTask], user: Path | None) -> dict[Valid
 
     alone = [task for task in tasks if len(task.choices) < 2]
     try:
-        with _Workers(user) as workers:
+        with _Workers(user, target) as workers:
             found = workers.check(alone)
             broken = {choice for task in alone if found[task].problems for choice in task.choices}
             runs = {task: [task._replace(run=run) for run in found[task].runs] for task in alone}
@@ -382,15 +391,15 @@ def _check_all(tasks: Sequence[ValidationTask], user: Path | None) -> dict[Valid
 class _Workers(ExitStack):
     """Checks configurations: in worker processes on all cores, once there are enough to be worth their start."""
 
-    def __init__(self, user: Path | None) -> None:
+    def __init__(self, user: Path | None, target: str | None) -> None:
         super().__init__()
-        self._user = user
+        self._user, self._target = user, target
         self._pool: Executor | None = None
 
     def check(self, tasks: Sequence[ValidationTask]) -> dict[ValidationTask, Result]:
         self._pool = self._pool or self._open_pool(len(tasks))
         in_order = self._pool.map if self._pool else map
-        return dict(zip(tasks, in_order(_check, tasks, repeat(self._user)), strict=True))
+        return dict(zip(tasks, in_order(_check, tasks, repeat(self._user), repeat(self._target)), strict=True))
 
     def _open_pool(self, tasks: int) -> Executor | None:
         workers = min(len(os.sched_getaffinity(0)), tasks // PER_WORKER, MOST_WORKERS)
@@ -404,12 +413,12 @@ class _Workers(ExitStack):
             return None
 
 
-def _check(task: ValidationTask, user: Path | None) -> Result:
+def _check(task: ValidationTask, user: Path | None, target: str | None) -> Result:
     notes: dict[str, None] = {}
     runs: list[ExperimentRun] = []
     try:
         composed = compose(task.words, user)
-        config = Configuration(composed, user, runnable=False, bags=True, check=_registry_check(notes))
+        config = Configuration(composed, user, runnable=False, bags=True, check=_registry_check(notes, target))
         problems = _problems(config, task.readers)
         runs = [] if problems else list(_runs(task, composed.document, user))
     except ConfigError as error:
@@ -436,22 +445,44 @@ def _problems(config: Configuration, readers: Iterable[ConfigReader]) -> list[Pr
     return problems
 
 
-def _registry_check(notes: dict[str, None]) -> PlanCheck | None:
-    """The check against GStreamer's registry; anything it could not check goes to the notes."""
+def _registry_check(notes: dict[str, None], target: str | None) -> PlanCheck | None:
+    """The check against a registry; anything it could not check goes to the notes."""
     try:
-        from runner.apply import check_plan, missing_plugins, missing_recorders
+        registry = registry_of(target)
     except MissingBindings as error:
         notes[f"nothing was checked against the GStreamer registry: {error}"] = None
         return None
 
     def check(plan: Plan) -> list[ModelError]:
-        missing = (*missing_plugins(plan), *missing_recorders(plan))
+        missing = (*missing_plugins(registry, plan), *missing_recorders(registry, plan))
         notes.update({f"not checked: {sentence}": None for sentence in missing})
-        problems = check_plan(plan)
-        if not problems and may_lack_parameter_sets(plan):
+        if registry.origin:
+            notes[f"checked against {registry.origin}"] = None
+        problems = check_plan(registry, plan)
+        if not problems and target is None and may_lack_parameter_sets(plan):
             from runner.apply import parameter_set_notes
 
             notes.update(dict.fromkeys(parameter_set_notes(plan)))
         return problems
 
     return check
+
+
+@cache
+def registry_of(target: str | None) -> Registry:
+    """The registry of a target, or of this machine.
+
+    raises  ArgumentError for an unknown target, MissingBindings
+    """
+    if target is None:
+        from runner.apply import LIVE
+
+        return LIVE
+    from runner.elements.dump import DumpedRegistry, read_dump
+
+    dump = read_dump(target)
+    try:
+        from runner.apply import LIVE
+    except MissingBindings:
+        return DumpedRegistry(target, dump, lambda type_name, text: True)
+    return DumpedRegistry(target, dump, LIVE.reads)

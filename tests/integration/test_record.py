@@ -304,12 +304,11 @@ def test_bad_input_is_reported(tod, words, status, expected):
     assert done.err.startswith(expected)
 
 
-def test_an_encoder_that_is_not_installed_names_its_package(tmp_path, monkeypatch, capsys):
+def test_an_encoder_that_is_not_installed_names_its_package(tmp_path, capsys):
     from runner.__main__ import main
-    from runner.gst import registry
 
-    monkeypatch.setitem(registry.PACKAGE_OF, "lostenc", "gstreamer1.0-lost")
     words = ["source=test", "recording.elements=[{name: encoder, element: lostenc}]", f"output={tmp_path}"]
+    words.append("+recording.needs={lostenc: gstreamer1.0-lost}")
     assert main(["record", *ONE, *words]) == 1
     expected = "the GStreamer element lostenc is not installed; on Debian: apt-get install gstreamer1.0-lost\n"
     assert capsys.readouterr().err == expected
