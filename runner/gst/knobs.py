@@ -9,11 +9,12 @@ from typing import Any
 from gi.repository import Gst
 
 from runner.core.commands import KnobValue
-from runner.core.model import Camera
+from runner.core.model import Camera, Value
 from runner.graph import Assignment, assignments, text
 from runner.gst.caps import structure
 from runner.gst.probes import IdleProbe
 
+_PARSERS = {"GstCaps": Gst.Caps.from_string, "GstStructure": Gst.Structure.new_from_string}
 ANOTHER_RATIO = (60001, 60000)  # of 16 bits each; below 30000 px no player rounds it to another pixel
 
 
@@ -110,18 +111,23 @@ class KnobPanel:
         name, key, value = assignment
         element = self._by_name[name]
         if self._differs(assignment):
-            element.set_property(key, _property(assignment))
+            element.set_property(key, _parsed(element, key, value))
             if self._differs(assignment):
                 actual = text(str(element.get_property(key)))
                 return f"{name}.{key} is {actual} after it was set to {text(value)}"
         return None
 
     def _differs(self, assignment: Assignment) -> bool:
-        name, key, _ = assignment
-        actual, wanted = self._by_name[name].get_property(key), _property(assignment)
-        return not actual.is_equal(wanted) if key == "caps" else bool(actual != wanted)
+        name, key, value = assignment
+        actual, wanted = self._by_name[name].get_property(key), _parsed(self._by_name[name], key, value)
+        if actual is None or wanted is value:
+            return bool(actual != wanted)
+        return not actual.is_equal(wanted)
 
 
-def _property(assignment: Assignment) -> Any:
-    _, key, value = assignment
-    return Gst.Caps.from_string(value) if key == "caps" else value
+def _parsed(element: Gst.Element, key: str, value: Value) -> Any:
+    """A value as the property takes it: text for caps or a structure is parsed."""
+    if not isinstance(value, str):
+        return value
+    parse = _PARSERS.get(element.find_property(key).value_type.name)
+    return parse(value) if parse else value
