@@ -156,7 +156,7 @@ def test_values_are_read_as_gstreamer_reads_them() -> None:
     from runner.apply import LIVE
 
     numbers = ("1", "-1", "0x10", "010", "1.5", ".5", "1e3", "abc", "", "true", "No", "min", "MAX", "nan")
-    words = ("superfast", "3", "99", "0x1", "zerolatency", "zerolatency+fastdecode", "1+zerolatency", "none", "")
+    words = ("superfast", "3", "99", "0x1", "zerolatency", "zerolatency+fastdecode", "1+zerolatency", "nil", "")
     for name, kind in LIVE.properties("x264enc").items():
         unbounded = Property(kind.type, enum=kind.enum, flags=kind.flags)
         for text in () if kind.type == "gchararray" else words if kind.enum or kind.flags else numbers:

@@ -63,7 +63,7 @@ def _whole(found: re.Match[str]) -> int:
 
 
 def _is_listed(word: str, listed: Iterable[EnumValue], *, any_number: bool) -> bool:
-    """Whether a word names one of the values, or is the number of one."""
+    """Whether a word names one of the values, or is the number of one. GStreamer 1.28 alone ignores upper case."""
     if any(word in (each.nick, each.name) for each in listed):
         return True
     number = _WHOLE.fullmatch(word)
