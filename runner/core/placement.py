@@ -26,7 +26,7 @@ GAIN = 0.05  # by how much a move raises the weighted mean of ln(b_alloc / b_dem
 LEAST = 1e-3  # share of its demand that a camera without any bitrate counts as having
 # An uplink carries copies of redundant cameras from this share of what the best uplink would give them, and then down
 # to the second one: with less, the copies would cost these cameras more than they protect.
-COPIED, KEPT = 0.6, 0.4
+COPIED, KEPT = 0.3, 0.15
 
 
 class Wanted(NamedTuple):
