@@ -68,7 +68,7 @@ def _range(drive: Series, line: TimeSeries, what: str) -> ClaimCheck:
     known = line.y[np.isfinite(line.y) & (line.t > 1)]
     if not known.size:
         return ClaimCheck(claim, "not logged", None)
-    low, high = float(known.min()), float(known.max())
+    low, high = float(np.min(known)), float(np.max(known))
     wide = low < RANGE_KBPS[0] * 1.2 and high > RANGE_KBPS[1] * 0.8
     inside = what != "predicted" or (low >= RANGE_KBPS[0] and high <= RANGE_KBPS[1])
     return ClaimCheck(claim, f"{low:.0f} to {high:.0f} kbit/s", wide and inside)

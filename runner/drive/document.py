@@ -433,8 +433,8 @@ def _latency(latency: Latency) -> Latencies | None:
 
 def _link(link: LinkSeries) -> Link:
     return {
-        "min_kbps": rounded(link.kbps.min(), 1),
-        "max_kbps": rounded(link.kbps.max(), 1),
+        "min_kbps": rounded(np.min(link.kbps), 1),
+        "max_kbps": rounded(np.max(link.kbps), 1),
         "queue_p95_ms": rounded(float(np.percentile(link.queue_ms, 95)), 2),
         "dropped": int(link.dropped[-1]),
     }

@@ -347,7 +347,7 @@ def _by_panel(
 
 def _spread(title: str, shown: FloatSeries) -> Axis:
     """An axis for some latencies: logarithmic if they spread widely and all are above 0."""
-    low, high = float(shown.min()), float(shown.max())
+    low, high = float(np.min(shown)), float(np.max(shown))
     if low <= 0 or high / low <= WIDE:
         return Axis(title, min(0.0, low), high * 1.05)
     digits = (1, 3) if high > DECADES * low else (1, 2, 5)
@@ -420,7 +420,7 @@ def _limits(places: Positions) -> tuple[tuple[float, float], tuple[float, float]
     room = 0.06 * max(*spans, SMALLEST_TRACK_M)
     found = []
     for values, span in zip((places.east, places.north), spans, strict=True):
-        middle, half = float(values.min() + values.max()) / 2, max(span, least) / 2 + room
+        middle, half = float(np.min(values) + np.max(values)) / 2, max(span, least) / 2 + room
         found.append((middle - half, middle + half))
     return found[0], found[1]
 

@@ -59,7 +59,7 @@ class BandwidthMap:
         self._errors = None if errors is None else errors[order]
         self._keys, first = np.unique(key[order], return_index=True)
         self._first = np.append(first, len(order)).astype(np.int64)
-        self._rows = int(row.min()), int(row.max())
+        self._rows = int(np.min(row)), int(np.max(row))
 
     def lowest(self, way: Way) -> float | None:
         """Lowest rate, in kbit/s, of the points within the radius of a path; None: the path is off the map."""
@@ -72,7 +72,7 @@ class BandwidthMap:
         first = self._first[cells]
         inside = self._inside(first, way)
         found = first[inside]
-        best = self._kbps[found].min(initial=np.inf)
+        best = np.min(self._kbps[found], initial=np.inf)
         # The first point of a cell is its lowest: only if it is outside can a later one be inside and lower.
         cells = cells[~inside & (self._kbps[first] < best)]
         rest = _spans(self._first[cells] + 1, self._first[cells + 1])
@@ -80,7 +80,7 @@ class BandwidthMap:
         found = np.concatenate([found, rest[self._inside(rest, way)]])
         if not found.size:
             return None
-        at = found[self._kbps[found].argmin()]
+        at = found[np.argmin(self._kbps[found])]
         return Point(float(self._kbps[at]), *(() if self._errors is None else self._errors[at].tolist()))
 
     def _key(self, row: Ints, lon: Floats) -> Ints:

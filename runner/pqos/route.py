@@ -96,7 +96,7 @@ def _way(distance: Floats, start: int, goals: NDArray[np.bool_]) -> list[int]:
         cost = best[k] + distance[k] ** 2
         better = cost < best
         best[better], before[better] = cost[better], k
-        k = int(np.where(done, np.inf, best).argmin())
+        k = int(np.argmin(np.where(done, np.inf, best)))
     way = [k]
     while before[way[-1]] != start:
         way.append(int(before[way[-1]]))

@@ -246,7 +246,7 @@ def build_ladder(curves: Curves, scaling: Sequence[Fraction]) -> Ladder | None:
     regret = (best - quality)[np.isfinite(best)]
     # The first range reaches down to 0 and the last has no end: only those in between can be narrow.
     width = min((b / a for a, b in pairwise(found)), default=np.inf)
-    return Ladder(tuple(scaling), tuple(found), float(regret.max()), float(regret.mean()), width)
+    return Ladder(tuple(scaling), tuple(found), float(np.max(regret)), float(regret.mean()), width)
 
 
 def ladder_quality(curves: Curves, scaling: Sequence[Fraction], bounds: Sequence[float]) -> Values:

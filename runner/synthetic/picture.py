@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -244,6 +244,11 @@ def trace(x: Array, y: Array, per_m: Array, azimuth: Array, level: Array, scene:
     log2_width, log2_height = scene.atlas.log2_width, scene.atlas.log2_height
     fine, one, clouds = scene.atlas.per_m * np.float32(256), np.float32(1), np.float32(-SKY_M) / scene.eye[2]
     eye_x, eye_y, eye_z, cos, sin = scene.eye[0], scene.eye[1], scene.eye[2], scene.heading[0], scene.heading[1]
+    texture: Any  # to the types of NumPy 2.5, a number of 32 bits can neither be shifted nor become an int
+    mip: Any
+    along: Any
+    up: Any
+    surface: Any
     for i in range(len(x)):
         before, surface = np.int32(-1), np.int32(-1)
         for slot in range(LAYERS):
