@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any
 
 from runner.core.model import Camera, Element, ModelError, Vehicle, check_unique
 
 if TYPE_CHECKING:
     from ipaddress import IPv4Network, IPv6Network
+
+
+PREFIX = "tod"  # of topics
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,6 +25,58 @@ class Endpoint:
     def __str__(self) -> str:
         """As in a URL: an IPv6 address is in brackets (RFC 3986, section 3.2.2)."""
         return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
+
+
+@dataclass(frozen=True, slots=True)
+class ForeignBroker:
+    """How a side logs in to a broker that `tod-runner keys` did not set up, which proves its name by its certificate.
+
+    ca              file with certificates of its authority, and the revocation list if that counts; None: that of the
+                    keys, without keys those of the system
+    credentials     file with one line user:password; None: none
+    certificate     file with the certificate that this side presents; None: that of the keys, if there are no
+                    credentials
+    key             file with its private key; None: the same file
+    topics_guarded  whether it lets everybody write to their own topics only
+    """
+
+    ca: str | None = None
+    credentials: str | None = None
+    certificate: str | None = None
+    key: str | None = None
+    topics_guarded: bool = False
+
+    def __post_init__(self) -> None:
+        if self.key and not self.certificate:
+            raise ModelError("key", self.key, "must come with the certificate that it belongs to", "certificate")
+
+
+@dataclass(frozen=True, slots=True)
+class Control(Endpoint):
+    """The MQTT broker.
+
+    prefix   what all topics begin with
+    foreign  None: `tod-runner keys` set it up, or it asks for no keys
+    """
+
+    prefix: str = PREFIX
+    foreign: ForeignBroker | None = None
+
+    @staticmethod
+    def of(data: Mapping[str, Any]) -> Control:
+        """From the section `control` of a configuration.
+
+        raises  ModelError for keys of a foreign broker although it is none, and for a password in place of its file
+        """
+        given = {each.name: data[each.name] for each in fields(ForeignBroker) if data.get(each.name)}
+        if given and not data.get("foreign"):
+            first, *others = given
+            rule = "is for a broker that `tod-runner keys` did not set up: give control.foreign=true"
+            raise ModelError(first, given[first], rule, *others)
+        if ":" in given.get("credentials", ""):
+            raise ModelError("credentials", "***", "must be the name of a file with one line user:password, not these")
+        foreign = ForeignBroker(**given) if data.get("foreign") else None
+        return Control(data["host"], data["port"], data.get("prefix", PREFIX), foreign)
 
 
 @dataclass(frozen=True, slots=True)
@@ -261,7 +316,7 @@ class Setup:
 
     vehicle: Vehicle
     media: Media
-    control: Endpoint
+    control: Control
     page: PageSettings
     recording: Recording
     expires_s: float

@@ -39,8 +39,8 @@ from runner.errors import ConfigError, Problem, suggest
 from runner.graph import Plan, assignments, check_video, compile_graph
 from runner.redact import has_password, redacted
 from runner.settings import (
+    Control,
     Dimensions,
-    Endpoint,
     Inputs,
     LatencyLimit,
     Media,
@@ -103,13 +103,12 @@ class Builder:
         cameras = {name: self._camera(name) for name in mounted} if isinstance(mounted, dict) else {}
         if not all(map(self.is_valid, SECTIONS)):
             return None
-        media = self.part(("media",), _media)
-        if media is None:
+        media, control = self.part(("media",), _media), self.part(("control",), Control.of)
+        if media is None or control is None:
             return None
         keys, insecure = document.get("keys"), document.get("insecure", False)
         private = None if isinstance(insecure, bool) else self.part(("insecure",), _network)
         media = replace(media, secure=keys is not None)
-        control = Endpoint(document["control"]["host"], document["control"]["port"])
         built = {name: camera for name, camera in cameras.items() if camera}
         recording = self.part(("recording",), _recording)
         page = PageSettings(**document["page"])

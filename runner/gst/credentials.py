@@ -13,10 +13,9 @@ from gi.repository import GLib, Gst
 from runner.graph import Plan
 from runner.gst.rtspsrc import is_rtsp_client
 from runner.system.backoff import pause_s
-from runner.system.files import exposure, read_file
+from runner.system.files import read_credentials
 from runner.system.rtsp import describe
 
-LONGEST = 1000  # bytes
 REFUSED_S = (60.0, 1800.0)  # after a refused login, until the next one: doubled from the first value up to the second
 ASKED_S = 10.0  # how long the camera may take to say which logins it accepts
 
@@ -111,7 +110,7 @@ def log_in(pipeline: Gst.Bin, plan: Plan) -> str | None:
         return None
     path = Path(plan.camera.credentials)
     try:
-        user, password = _read(path)
+        user, password = read_credentials(path)
     except ValueError as error:
         return f"credentials {path}: {error}"
     for element in (pipeline.get_by_name(element.name) for element in plan.source):
@@ -119,14 +118,3 @@ def log_in(pipeline: Gst.Bin, plan: Plan) -> str | None:
             element.set_property("user-id", user)
             element.set_property("user-pw", password)
     return None
-
-
-def _read(path: Path) -> tuple[str, str]:
-    """raises  ValueError with the rule that the file breaks"""
-    lines = read_file(path, LONGEST).decode(errors="replace").splitlines()
-    if exposed := exposure(path):
-        raise ValueError(exposed)
-    user, _, password = lines[0].partition(":") if len(lines) == 1 else ("", "", "")
-    if not user or not password:
-        raise ValueError("must contain one line user:password")
-    return user, password

@@ -6,17 +6,17 @@ not by the address at which it is reached.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from secrets import token_urlsafe
 
-from cryptography import x509
-from cryptography.x509.oid import NameOID
 from gi.repository import Gio, GLib, Gst, GstRtsp, GstRtspServer
 
 from runner.core.roles import Role
 from runner.errors import RunError, UserError
 from runner.gst.pipeline import encrypt
 from runner.gst.srtp import provide_rtcp_key
+from runner.security.identities import Identities, Presented
 from runner.security.keyring import MEDIA_SECRET, Holder, Keyring, Watched, rtsp_password, srt_passphrase
 
 USER = "user"  # field of a token of the server library: whose password it stands for
@@ -31,7 +31,7 @@ class PeerCheck:
 
     def __init__(self, keyring: Keyring, on_report: Callable[[str], None]) -> None:
         self._authority = Gio.TlsCertificate.new_from_file(str(keyring.authority))
-        self._revoked = keyring.watched_revoked(on_report)
+        self._identities = Identities(keyring, on_report)
 
     def verify(self, certificate: Gio.TlsCertificate | None) -> Holder | str:
         """The holder of the certificate that a new connection presents, or why it is not accepted."""
@@ -44,14 +44,7 @@ class PeerCheck:
 
     def holder(self, certificate: Gio.TlsCertificate) -> Holder | str:
         """The holder of an open connection's certificate, or why it must end; expiry is not checked again."""
-        read = x509.load_der_x509_certificate(bytes(certificate.props.certificate))
-        if read.serial_number in self._revoked.get():
-            return "its certificate is revoked"
-        name, role = (
-            str(read.subject.get_attributes_for_oid(oid)[0].value)
-            for oid in (NameOID.COMMON_NAME, NameOID.ORGANIZATIONAL_UNIT_NAME)
-        )
-        return Holder(name, Role(role))
+        return self._identities.holder(Presented.of(bytes(certificate.props.certificate)))
 
 
 class _Certificate(Gio.TlsInteraction):  # type: ignore[misc]
@@ -76,6 +69,19 @@ def own_certificate(keyring: Keyring) -> Gio.TlsCertificate:
         raise RunError(str(error)) from None
     except GLib.Error as error:
         raise RunError(f"{keyring.directory}: {error.message}") from None
+
+
+def _signing_nothing(own: Gio.TlsCertificate) -> Gio.TlsDatabase:
+    """A database of this certificate alone, without those that it was issued by.
+
+    It has signed no other, so that GLib accepts none by itself, and the signal decides about all of them.
+    """
+    file = os.memfd_create("own.crt")
+    try:
+        os.write(file, own.props.certificate_pem.encode())
+        return Gio.TlsFileDatabase.new(f"/proc/self/fd/{file}")
+    finally:
+        os.close(file)
 
 
 class StreamLogin:
@@ -115,9 +121,9 @@ class StreamLogin:
 
     def _prepare_rtsp(self, client: Gst.Element) -> None:
         keyring = self._keyring
-        client.set_property("tls-interaction", _Certificate(own_certificate(keyring)))
-        # No certificate is signed by this one, so the signal decides about all of them.
-        client.set_property("tls-database", Gio.TlsFileDatabase.new(str(keyring.certificate.absolute())))
+        own = own_certificate(keyring)
+        client.set_property("tls-interaction", _Certificate(own))
+        client.set_property("tls-database", _signing_nothing(own))
         client.set_property("user-id", keyring.holder.name)
         client.set_property("user-pw", rtsp_password(keyring.secret, self._vehicle))
         client.connect("accept-certificate", self._accept)

@@ -60,10 +60,11 @@ class Broker:
         self, endpoint: Endpoint, keys: Path | None = None, on_report: Callable[[str], None] = lambda line: None
     ) -> None:
         self._endpoint, self._keys = endpoint, keys
+        self._listed = keys is not None and (keys / REVOKED).exists()  # another authority may have no revocation list
         self._loaded = self._versions()
         self._stderr_lines: deque[str] = deque(maxlen=KEPT_LINES)
         listener = (
-            broker_settings(str(keys.absolute()), endpoint.host, endpoint.port).splitlines()
+            broker_settings(str(keys.absolute()), endpoint.host, endpoint.port, listed=self._listed).splitlines()
             if keys
             else (f"listener {endpoint.port} {endpoint.host}", *OPEN)
         )
@@ -100,7 +101,8 @@ class Broker:
 
     def _versions(self) -> list[tuple[int, int, int] | None]:
         """Of the files that mosquitto reads again; None while one is just being replaced."""
-        return [version_of(self._keys / name) for name in RELOADED] if self._keys else []
+        named = [name for name in RELOADED if name != REVOKED or self._listed]
+        return [version_of(self._keys / name) for name in named] if self._keys else []
 
     def wait_until_it_answers(self) -> None:
         """raises RunError if it does not answer within `START_S`"""

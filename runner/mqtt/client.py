@@ -15,7 +15,7 @@ from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode
 
 from runner.errors import RunError, UserError
-from runner.mqtt.login import Login
+from runner.mqtt.login import BrokerLogin
 from runner.settings import Uplink
 from runner.system.interfaces import addresses_by
 
@@ -39,7 +39,7 @@ class BrokerClient(Client):
     _error: OSError | None = None  # of its socket before it was in use; None: none occurred
 
     def __init__(
-        self, login: Login | None, on_broken: Callable[[Exception], None], uplink: Uplink | None = None
+        self, login: BrokerLogin | None, on_broken: Callable[[Exception], None], uplink: Uplink | None = None
     ) -> None:
         # With a fixed id, a new connection ends the old one, whose will the broker would otherwise publish later.
         super().__init__(CallbackAPIVersion.VERSION2, client_id=f"tod{uuid.uuid4().hex[:20]}")
@@ -56,7 +56,8 @@ class BrokerClient(Client):
         self.__dict__["_sock_recv"] = self._recv_first  # of this instance only
         if self._login:
             try:
-                self.username_pw_set(self._login.user, self._login.refresh())
+                password = self._login.refresh()  # and the user
+                self.username_pw_set(self._login.user, password)
             except UserError as error:
                 raise ConnectionError(str(error)) from None  # the loop tries again after an OSError only
 

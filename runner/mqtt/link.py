@@ -14,9 +14,9 @@ from typing import Any
 from paho.mqtt.client import Client, MQTTMessage, MQTTMessageInfo
 
 from runner.mqtt.client import RETRY_S, BrokerClient
-from runner.mqtt.login import Login
+from runner.mqtt.login import BrokerLogin
 from runner.mqtt.messages import JsonObject, MqttMessage
-from runner.settings import Endpoint, Uplink
+from runner.settings import PREFIX, Endpoint, Uplink
 from runner.system.reports import LimitedReports
 
 KEEPALIVE_S = 1  # s without a message before a ping; the broker publishes a will after one and a half of these
@@ -37,6 +37,7 @@ class ControlLink:
     on_report     called with one line when the broker is unreachable, once per reason, and when it is back
     login         credentials of this side; None: the broker does not authenticate
     uplink        name and way of this connection, if it is one of several; None: the system's routes decide
+    prefix        what topics begin with at the broker, in place of PREFIX
 
     A message whose callback raises is reported and counted in `dropped`; the link continues.
     """
@@ -48,10 +49,11 @@ class ControlLink:
         listen: Mapping[str, Callable[[MqttMessage], None]],
         on_connected: Callable[[bool], None],
         on_report: Callable[[str], None],
-        login: Login | None = None,
+        login: BrokerLogin | None = None,
         uplink: tuple[str, Uplink] | None = None,
+        prefix: str = PREFIX,
     ) -> None:
-        self._login, self._uplink = login, uplink
+        self._login, self._uplink, self._prefix = login, uplink, prefix
         self._by = f" by uplink {uplink[0]}" if uplink else ""
         self._most_reasons = 1 if uplink else MOST_REASONS  # whether there is one at all matters more than why
         self._broker, self._will, self._listen = broker, will, listen
@@ -141,15 +143,22 @@ class ControlLink:
         client = BrokerClient(self._login, self._on_broken, self._uplink[1] if self._uplink else None)
         if self._will:
             topic, message = self._will
-            client.will_set(topic, json.dumps(message), qos=1, retain=_is_retained(topic))
+            client.will_set(self._there(topic), json.dumps(message), qos=1, retain=_is_retained(topic))
         client.on_pre_connect = self._begin
         client.on_connect_fail = lambda *_: self._on_connect_fail(sys.exception())
         client.on_connect = self._on_connect
         client.on_subscribe = self._on_subscribe
         client.on_disconnect = self._on_disconnect
         for topic_filter, function in self._listen.items():
-            client.message_callback_add(topic_filter, self._guarded(function))
+            client.message_callback_add(self._there(topic_filter), self._guarded(function))
         return client
+
+    def _there(self, topic: str) -> str:
+        """A topic as the broker has it."""
+        return self._prefix + topic.removeprefix(PREFIX)
+
+    def _here(self, topic: str) -> str:
+        return PREFIX + topic.removeprefix(self._prefix)
 
     def _begin(self, _client: Client, _data: object) -> None:
         self._is_explained = False
@@ -158,7 +167,7 @@ class ControlLink:
     def _guarded(self, function: Callable[[MqttMessage], None]) -> Callable[[Client, object, MQTTMessage], None]:
         def on_message(_client: Client, _data: object, message: MQTTMessage) -> None:
             try:
-                function(MqttMessage(message.topic, bytes(message.payload), message.retain))
+                function(MqttMessage(self._here(message.topic), bytes(message.payload), message.retain))
             except ValueError as error:  # from the parser: the message is invalid
                 self._drop(message, str(error))
             except Exception as error:
@@ -172,19 +181,19 @@ class ControlLink:
 
     def _send(self, topic: str, message: JsonObject) -> MQTTMessageInfo:
         qos = 0 if is_one_of(PERIODIC, topic) else 1
-        return self._client.publish(topic, json.dumps(message), qos=qos, retain=_is_retained(topic))
+        return self._client.publish(self._there(topic), json.dumps(message), qos=qos, retain=_is_retained(topic))
 
     def _on_connect(self, _client: Client, _data: object, _flags: object, code: Any, _properties: object) -> None:
         if code.is_failure:
-            self._failed_to_connect(f"refused: {code}".lower())
+            self._failed_to_connect(f"refused: {code}".lower(), self._login.source if self._login else "")
         else:
             self._subscribe()
 
     def _subscribe(self) -> None:
-        self._client.subscribe([(topic_filter, 1) for topic_filter in self._listen])
+        self._client.subscribe([(self._there(topic_filter), 1) for topic_filter in self._listen])
 
     def _on_subscribe(self, _client: Client, _data: object, _mid: int, codes: Any, _properties: object) -> None:
-        if refused := [each for each, code in zip(self._listen, codes, strict=False) if code.is_failure]:
+        if refused := [self._there(each) for each, code in zip(self._listen, codes, strict=False) if code.is_failure]:
             self._failed_to_connect(f"refused to subscribe to {', '.join(refused)}")
             retry = threading.Timer(RETRY_S[-1], self._subscribe)
             retry.daemon = True
@@ -225,7 +234,8 @@ class ControlLink:
     def _on_connect_fail(self, error: BaseException | None) -> None:
         from runner.mqtt import refusal
 
-        why, remedy = refusal.of_failure(error, tls=self._login is not None), refusal.remedy(error, self._broker)
+        demands = self._login.demands if self._login else None
+        why, remedy = refusal.of_failure(error, demands), refusal.remedy(error, self._broker)
         self._failed_to_connect(why, remedy, perhaps_keys=isinstance(error, ssl.SSLError))
 
     def _failed_to_connect(self, why: str, remedy: str = "", perhaps_keys: bool = False) -> None:

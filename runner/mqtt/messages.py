@@ -1,6 +1,6 @@
 """Control link between operators and vehicle over MQTT: requests, replies, applied state, telemetry.
 
-Topics of a vehicle, below tod/<vehicle>/:
+Topics of a vehicle, below tod/<vehicle>/ (`control.prefix` replaces tod, on the way to the broker):
 
     request/<operator>   to the vehicle: an event of schemas/event.schema.json with `id` and `as_of`, without `t`; never
                          retained. The vehicle stamps it on receipt.
@@ -39,6 +39,7 @@ from runner.records.vehicle import (
     VehicleState,
 )
 from runner.schema import message_problem, read_json, shortened
+from runner.settings import PREFIX
 
 OFFLINE = {"online": False}
 OPERATOR_GONE = {"id": "will", "event": "operator_disconnected"}  # by the broker, when the connection has broken
@@ -78,7 +79,7 @@ def run_of(identity: str) -> int | None:
 
 def topic(vehicle: str, *parts: str) -> str:
     """A topic of a vehicle, or a filter if a part is +."""
-    return "/".join(("tod", vehicle, *parts))
+    return "/".join((PREFIX, vehicle, *parts))
 
 
 def answer_s(expires_s: float) -> float:

@@ -16,14 +16,18 @@ TLS_RECORDS = (b"\x15\x03", b"\x16\x03")  # RFC 8446, section 5.1: an alert, a h
 PROGRAMS = {b"HTTP/": "an HTTP server", b"SSH-": "an SSH server", b"RTSP/": "an RTSP server"}
 # X509_V_ERR_... of OpenSSL, about the broker's certificate.
 CERTIFICATE = {
+    7: "the broker's certificate is of another authority than {demands}",  # of the same name
     9: "the broker's certificate is not valid yet, by this machine's clock",
     10: "the broker's certificate has expired, by this machine's clock",
     11: "the revocation list is not valid yet, by this machine's clock",
     12: "the revocation list has expired, by this machine's clock",
-    18: "the broker's certificate is of another authority than these keys",
-    19: "the broker's certificate is of another authority than these keys",
-    20: "the broker's certificate is of another authority than these keys",
+    18: "the broker's certificate is of another authority than {demands}",
+    19: "the broker's certificate is of another authority than {demands}",
+    20: "the broker's certificate is of another authority than {demands}",
+    3: "no revocation list of the authority that issued the broker's certificate is in {demands}",
     23: "the broker's certificate is revoked",
+    62: "control.host is not in the broker's certificate, which must name it",
+    64: "control.host is not in the broker's certificate, which must name it",
 }
 # Alerts (RFC 8446, section 6.2) by which a broker refuses this side, as in the names of OpenSSL's errors.
 ALERTS = {
@@ -35,18 +39,19 @@ ALERTS = {
 }
 
 
-def of_failure(error: BaseException | None, tls: bool) -> str:
+def of_failure(error: BaseException | None, demands: str | None) -> str:
     """Why no connection came about, up to and with the TLS handshake.
 
-    tls  whether this side speaks TLS
+    demands  the authority that must have issued the broker's certificate; None: this side does not speak TLS
     """
     if isinstance(error, ssl.SSLCertVerificationError):
-        return CERTIFICATE.get(error.verify_code, f"the broker's certificate is refused: {error.verify_message}")
+        other = f"the broker's certificate is refused: {error.verify_message}"
+        return CERTIFICATE.get(error.verify_code, other).replace("{demands}", str(demands))
     if isinstance(error, TimeoutError) and "handshake" in str(error):
         return SILENT
     if isinstance(error, ssl.SSLError):
         return _of_alert(error) or NO_TLS
-    return NO_TLS if tls and isinstance(error, ConnectionResetError) else str(_text(error)).lower()
+    return NO_TLS if demands and isinstance(error, ConnectionResetError) else str(_text(error)).lower()
 
 
 def of_end(heard: bytes, error: OSError | None, silent: bool, tls: bool) -> str:

@@ -8,11 +8,10 @@ from collections.abc import Callable, Mapping
 
 from runner.mqtt.copies import FirstCopies
 from runner.mqtt.link import PERIODIC, ControlLink, is_one_of
-from runner.mqtt.login import Login
+from runner.mqtt.login import BrokerLogin
 from runner.mqtt.messages import JsonObject, MqttMessage
 from runner.security.exposure import is_loopback
-from runner.security.keyring import Keyring
-from runner.settings import Endpoint, Uplink
+from runner.settings import PREFIX, Endpoint, Uplink
 
 
 def ways_to(broker: Endpoint, uplinks: Mapping[str, Uplink]) -> dict[str, Uplink]:
@@ -28,7 +27,8 @@ class ControlLinks:
     counts. Each connection has a will of its own, which names its uplink.
 
     on_connected  called with True whenever a connection has been made, with False when the last one is lost
-    keyring       of the vehicle; None: the broker does not authenticate
+    new_login     returns a login of the vehicle that reports its problems; None: the broker does not authenticate
+    prefix        as in `ControlLink`
     """
 
     def __init__(
@@ -39,7 +39,8 @@ class ControlLinks:
         listen: Mapping[str, Callable[[MqttMessage], None]],
         on_connected: Callable[[bool], None],
         on_report: Callable[[str], None],
-        keyring: Keyring | None = None,
+        new_login: Callable[[Callable[[str], None]], BrokerLogin | None] = lambda on_report: None,
+        prefix: str = PREFIX,
     ) -> None:
         self._on_connected, self._copies = on_connected, FirstCopies()
         self._lock = threading.Lock()  # held by callbacks: they run one at a time, in order
@@ -47,10 +48,12 @@ class ControlLinks:
         self._links: dict[str, ControlLink] = {}
         for name, uplink in uplinks.items():
             # Each connection loads keys of its own. They are the same files, so one of them reports their problems.
-            login = Login(keyring, (lambda what: None) if self._links else on_report) if keyring else None
+            login = new_login((lambda what: None) if self._links else on_report)
             own = {each: self._first(name, function) for each, function in listen.items()}
             named = (will[0], {**will[1], "uplink": name})
-            self._links[name] = ControlLink(broker, named, own, self._on_changed, on_report, login, (name, uplink))
+            self._links[name] = ControlLink(
+                broker, named, own, self._on_changed, on_report, login, (name, uplink), prefix
+            )
 
     @property
     def is_connected(self) -> bool:

@@ -15,7 +15,7 @@ from runner.core.decision import NOTHING
 from runner.core.events import Attention
 from runner.mqtt.copies import Newest
 from runner.mqtt.link import ControlLink
-from runner.mqtt.login import Login
+from runner.mqtt.logins import login_of
 from runner.mqtt.messages import (
     OPERATOR_GONE,
     SIGNED_OFF,
@@ -135,8 +135,8 @@ class Station:
     def __init__(self, setup: Setup, settings: agreement.SettingsByPath, keyring: Keyring | None = None) -> None:
         vehicle = setup.vehicle
         self._vehicle, self._settings = vehicle, settings
-        login = Login(keyring, self.note) if keyring else None
-        self.user = login.user if login else None  # this operator's name in its keys; None: it has none
+        control, login = setup.control, login_of(setup.control, keyring, self.note)
+        self.user = login.identity or None if login else None  # this operator's name in its keys; None: it has none
         self.identity = self.user or uuid.uuid4().hex[:12]  # of this operator
         self.answer_s = answer_s(setup.expires_s)
         self.listeners: list[Listener] = []
@@ -176,7 +176,7 @@ class Station:
             topic(vehicle.name, "configuration"): self._on_configuration,
         }
         will = (self._to_request, of_run(OPERATOR_GONE, self._run))
-        self.link = ControlLink(setup.control, will, listen, self._on_connected, self.note, login)
+        self.link = ControlLink(control, will, listen, self._on_connected, self.note, login, prefix=control.prefix)
 
     def connect(self) -> None:
         """Connect to the broker, and stay connected; returns immediately."""

@@ -14,7 +14,7 @@ from typing import Any
 from runner.graph import rtsp_url
 from runner.mqtt.copies import Newest
 from runner.mqtt.link import ControlLink
-from runner.mqtt.login import Login
+from runner.mqtt.logins import login_of
 from runner.mqtt.messages import (
     OPERATOR_GONE,
     SIGNED_OFF,
@@ -55,11 +55,11 @@ class Bridge:
         check_names(vehicle)
         self._prediction, self._on_report = ros.prediction, on_report
         self._report_refusal, self._report_publisher = LimitedReports(on_report), LimitedReports(on_report)
-        login = Login(keyring, on_report) if keyring else None
-        self.identity = login.user if login else uuid.uuid4().hex[:12]
+        control, login = setup.control, login_of(setup.control, keyring, on_report)
+        self.identity = login.identity if login and login.identity else uuid.uuid4().hex[:12]
         self._vehicle_time = (0.0, -math.inf)  # in the newest telemetry, and when it arrived by time.monotonic
         self._answer_s = answer_s(setup.expires_s)
-        self._has_keys = login is not None
+        self._has_keys = keyring is not None
         self._pending: dict[str, float] = {}  # by id of a request, until when it may be answered
         self._calls: dict[str, str] = {}  # by id of a request, the service call that waits for its answer
         self._numbers = itertools.count(1)  # of requests without an id of their own
@@ -79,7 +79,7 @@ class Bridge:
         }
         # With keys an operator's side may have the same name; after a crash its silence shows that it is gone.
         will = None if self._has_keys else (self._requests, OPERATOR_GONE)
-        self._link = ControlLink(setup.control, will, listen, self._on_connected, on_report, login)
+        self._link = ControlLink(control, will, listen, self._on_connected, on_report, login, prefix=control.prefix)
         inputs = {REQUEST: "text", **{name: operator_input.kind for name, operator_input in self._topics.items()}}
         if not self._reports:
             inputs[PRESENCE] = "sign"

@@ -1,6 +1,7 @@
 """The directory of a small certificate authority: one directory for each key holder, to be copied to its machine.
 
     authority/   the authority's certificate and key, and the list of issued certificates; never copied
+    requests/    what another authority is to sign, if there is one (`runner.security.company`)
     broker/      for mosquitto
     NAME/        for one vehicle, operator, predictor or positioner
 
@@ -41,7 +42,7 @@ from runner.security.certificates import (
 from runner.system.files import read_file, unfinished
 
 NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")  # as in MQTT topics; 64 is the longest common name of a certificate
-RESERVED = ("authority", "broker")
+RESERVED = ("authority", "broker", "requests")
 ISSUED, AUTHORITY_KEY, LOCK = "issued.json", "authority.key", ".lock"
 BROKER_SETTINGS = "mosquitto.conf"
 VALID = timedelta(days=365)
@@ -126,7 +127,7 @@ class Authority:
         known   by argument, a name that must have keys, or be among those wanted
         raises  UserError for a name that is taken by another role, or unknown
         """
-        roles = {issued.name: issued.role for issued in self.holders()}
+        roles = self._roles()
         for name, role, _ in wanted:
             if roles.setdefault(name, role) is not role:
                 raise ArgumentError(role, repr(name), f"is taken: {name} is a {roles[name]}")
@@ -176,27 +177,34 @@ class Authority:
     @property
     def _pair(self) -> Pair:
         certificate, key = self._own / keyring.AUTHORITY, self._own / AUTHORITY_KEY
-        pair = Pair(_read(certificate), _read(key))
-        with _damage_reported(certificate):
+        pair = Pair(read(certificate), read(key))
+        with damage_reported(certificate):
             serial_of(pair.certificate)
-        with _damage_reported(key):
+        with damage_reported(key):
             signing_key(pair.key)
         return pair
 
     def _create(self) -> None:
         pair = new_authority("tod-runner authority", self.now())
-        _write(self._own / keyring.AUTHORITY, pair.certificate)
-        _write(self._own / AUTHORITY_KEY, pair.key)
-        _write(self._own / keyring.MEDIA_SECRET, _secret())
+        write(self._own / keyring.AUTHORITY, pair.certificate)
+        write(self._own / AUTHORITY_KEY, pair.key)
+        self._complete()
+
+    def _complete(self) -> None:
+        write(self._own / keyring.MEDIA_SECRET, _secret())
         self._write_issued([])  # last: marks the authority as complete
+
+    def _roles(self) -> dict[str, Role]:
+        """By name, of everybody who was ever named."""
+        return {issued.name: issued.role for issued in self.holders()}
 
     def _issued(self) -> list[Issued]:
         path = self._own / ISSUED
-        with _damage_reported(path):
-            return msgspec.json.decode(_read(path), type=list[Issued])
+        with damage_reported(path):
+            return msgspec.json.decode(read(path), type=list[Issued])
 
     def _write_issued(self, issued: list[Issued]) -> None:
-        _write(self._own / ISSUED, msgspec.json.format(msgspec.json.encode(issued)))
+        write(self._own / ISSUED, msgspec.json.format(msgspec.json.encode(issued)))
 
     def _known(self, name: str, argument: str, revoked: bool = False) -> Issued:
         """The certificate in use of a name; raises UserError for an unknown one.
@@ -222,22 +230,27 @@ class Authority:
         certificate = self.directory / issued.name / keyring.CERTIFICATE
         if issued.revoked or not certificate.exists():
             return False
-        with _damage_reported(certificate, f"rotate={issued.name} renews it"):
-            return serial_of(_read(certificate)) == int(issued.serial, 16)
+        with damage_reported(certificate, f"rotate={issued.name} renews it"):
+            return serial_of(read(certificate)) == int(issued.serial, 16)
 
     def _renew(self, name: str, role: Role, hosts: tuple[str, ...]) -> None:
         # Listed before anybody has it: a serial number unknown to the authority could never be revoked.
         serial, until = secrets.randbits(159) | 1, self.now() + VALID
         pair = new_certificate(self._pair, name, role, hosts, serial, self.now(), VALID)
-        if any(issued.name == name for issued in self.holders()):
+        self._install(Issued(name, role, f"{serial:x}", hosts, until), pair)
+
+    def _install(self, issued: Issued, pair: Pair, company: bool = False) -> None:
+        """Make the directory of a holder with a new certificate and key. company: as in `keyring.Holder`"""
+        name, role = issued.name, issued.role
+        if any(known.name == name for known in self.holders()):
             self._renew_media_secret(role)
-        self._write_issued([*self._revoked(name), Issued(name, role, f"{serial:x}", hosts, until)])
+        self._write_issued([*self._revoked(name), issued])
         files = {
-            keyring.AUTHORITY: self._pair.certificate,
+            keyring.AUTHORITY: read(self._own / keyring.AUTHORITY),
             keyring.CERTIFICATE: pair.certificate,
             keyring.KEY: pair.key,
             keyring.SECRET: _secret(),
-            keyring.HOLDER: msgspec.json.encode(keyring.Holder(name, role, hosts)),
+            keyring.HOLDER: msgspec.json.encode(keyring.Holder(name, role, issued.hosts, company)),
             **({keyring.TOKEN: _secret()} if role in VIEWERS else {}),
         }
         self._replace(name, files)
@@ -246,7 +259,7 @@ class Authority:
     def _renew_media_secret(self, role: Role) -> None:
         """Withdraw what the keys of a role reveal about SRT streams: SRT has no certificates that could be revoked."""
         if role is Role.VEHICLE or role in VIEWERS:
-            _write(self._own / keyring.MEDIA_SECRET, _secret())
+            write(self._own / keyring.MEDIA_SECRET, _secret())
 
     def _replace(self, name: str, files: Mapping[str, bytes]) -> None:
         """Replace a holder's directory as a whole."""
@@ -257,7 +270,7 @@ class Authority:
             _remove(leftover)
         new.mkdir(mode=0o700)
         for file, content in files.items():
-            _write(new / file, content)
+            write(new / file, content)
         if final.exists():
             final.rename(old)
         new.rename(final)
@@ -265,28 +278,35 @@ class Authority:
 
     def _distribute(self) -> None:
         """Write the accepted holders, revocations and secrets of SRT to all directories that need them."""
-        media_secret = _read(self._own / keyring.MEDIA_SECRET)
-        issued, holders = self._issued(), list(filter(self._in_use, self.holders()))
-        revoked = [each for each in issued if each.revoked and each.until > self.now()]
-        serials = [(int(each.serial, 16), each.revoked) for each in revoked if each.revoked]
-        known = self._own / keyring.REVOKED
-        with _damage_reported(known):
-            crl = revocation_list(self._pair, serials, self.now(), _read(known) if known.exists() else None)
-        _write(known, crl)
-        passwords = {each.name: _read(self.directory / each.name / keyring.SECRET) for each in holders}
+        media_secret = read(self._own / keyring.MEDIA_SECRET)
+        holders = list(filter(self._in_use, self.holders()))
+        common = self._common(holders)
+        passwords = {each.name: read(self.directory / each.name / keyring.SECRET) for each in holders}
         for holder in holders:
             directory = self.directory / holder.name
-            _write(directory / keyring.REVOKED, crl)
+            for name, content in common.items():
+                write(directory / name, content)
             if holder.role in VIEWERS:
-                _write(directory / keyring.MEDIA_SECRET, media_secret)
+                write(directory / keyring.MEDIA_SECRET, media_secret)
             if holder.role is Role.VEHICLE:
-                _write(directory / keyring.PASSPHRASE, keyring.srt_passphrase(media_secret, holder.name).encode())
-                _write(directory / keyring.PEOPLE, self._people(holder.name, holders, passwords))
+                write(directory / keyring.PASSPHRASE, keyring.srt_passphrase(media_secret, holder.name).encode())
+                write(directory / keyring.PEOPLE, self._people(holder.name, holders, passwords))
             elif holder.role is Role.BROKER:
                 lines = (_password_line(name, keyring.mqtt_password(own)) for name, own in passwords.items())
-                _write(directory / PASSWORDS, "".join(lines).encode())
-                _write(directory / ACCESS, access_list((each.name, each.role) for each in holders).encode())
-                _write(directory / BROKER_SETTINGS, broker_settings(self.installed).encode())
+                write(directory / PASSWORDS, "".join(lines).encode())
+                write(directory / ACCESS, access_list((each.name, each.role) for each in holders).encode())
+                settings = broker_settings(self.installed, listed=keyring.REVOKED in common)
+                write(directory / BROKER_SETTINGS, settings.encode())
+
+    def _common(self, holders: Sequence[Issued]) -> dict[str, bytes]:
+        """The files that are the same for all holders, and change: here, the revocation list."""
+        revoked = [each for each in self._issued() if each.revoked and each.until > self.now()]
+        serials = [(int(each.serial, 16), each.revoked) for each in revoked if each.revoked]
+        known = self._own / keyring.REVOKED
+        with damage_reported(known):
+            crl = revocation_list(self._pair, serials, self.now(), read(known) if known.exists() else None)
+        write(known, crl)
+        return {keyring.REVOKED: crl}
 
     def _people(self, vehicle: str, holders: Sequence[Issued], secret: Mapping[str, bytes]) -> bytes:
         people = {
@@ -310,7 +330,7 @@ def _secret() -> bytes:
     return secrets.token_urlsafe(32).encode()
 
 
-def _read(path: Path) -> bytes:
+def read(path: Path) -> bytes:
     try:
         return read_file(path, keyring.MOST_BYTES)
     except ValueError as error:
@@ -323,7 +343,7 @@ def _remove(directory: Path) -> None:
         shutil.rmtree(directory)
 
 
-def _write(path: Path, content: bytes) -> None:
+def write(path: Path, content: bytes) -> None:
     """Write a file atomically; only its owner may read it, unless it is public."""
     with unfinished(path) as part:
         part.unlink(missing_ok=True)
@@ -333,7 +353,7 @@ def _write(path: Path, content: bytes) -> None:
 
 
 @contextmanager
-def _damage_reported(path: Path, remedy: str = "restore it from a backup") -> Iterator[None]:
+def damage_reported(path: Path, remedy: str = "restore it from a backup") -> Iterator[None]:
     """raises RunError for a file with content that `tod-runner keys` does not write"""
     try:
         yield

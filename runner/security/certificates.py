@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import ipaddress
 import re
 from collections.abc import Iterable, Sequence
@@ -13,6 +14,7 @@ from cryptography import x509
 from cryptography.exceptions import UnsupportedAlgorithm
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.asymmetric.types import CertificatePublicKeyTypes
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from runner.core.roles import Role
@@ -20,6 +22,7 @@ from runner.security.validity import Validity
 
 LABEL = r"[A-Za-z0-9_](?:[A-Za-z0-9_-]*[A-Za-z0-9_])?"
 DNS_NAME = re.compile(rf"(?:\*\.)?{LABEL}(?:\.{LABEL})*\.?")
+LIST_BEGIN = b"-----BEGIN X509 CRL-----"
 BACKDATED = timedelta(hours=1)  # a holder's clock may be behind when it gets its certificate
 AUTHORITY_YEARS = 20
 YEAR = timedelta(days=365)
@@ -56,11 +59,8 @@ def new_certificate(
     """
     issuer, signer = _loaded(authority)
     key = ec.generate_private_key(ec.SECP256R1())
-    subject = x509.Name(
-        [x509.NameAttribute(NameOID.ORGANIZATIONAL_UNIT_NAME, role), x509.NameAttribute(NameOID.COMMON_NAME, name)]
-    )
     builder = (
-        _builder(subject, issuer.subject, key, serial, now, valid)
+        _builder(_subject(name, role), issuer.subject, key, serial, now, valid)
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(_usage(digital_signature=True), critical=True)
         .add_extension(x509.ExtendedKeyUsage(USES.get(role, BOTH)), critical=False)
@@ -71,6 +71,20 @@ def new_certificate(
         )
     )
     return Pair(_pem(builder.sign(signer, hashes.SHA256())), _key_pem(key))
+
+
+def new_request(name: str, role: Role, hosts: Sequence[str]) -> Pair:
+    """A request for a holder's certificate (PKCS #10, RFC 2986), for another authority, and its key."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    builder = (
+        x509.CertificateSigningRequestBuilder()
+        .subject_name(_subject(name, role))
+        .add_extension(_usage(digital_signature=True), critical=True)
+        .add_extension(x509.ExtendedKeyUsage(USES.get(role, BOTH)), critical=False)
+    )
+    if hosts:
+        builder = builder.add_extension(x509.SubjectAlternativeName(list(map(_general_name, hosts))), critical=False)
+    return Pair(builder.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM), _key_pem(key))
 
 
 def revocation_list(
@@ -119,11 +133,28 @@ def validity_of(certificate: bytes) -> Validity:
 
 
 def serials_of(crl: bytes) -> frozenset[int]:
-    """Serial numbers in a revocation list, PEM.
+    """Serial numbers in revocation lists, PEM, one after another.
 
     raises  ValueError
     """
-    return frozenset(entry.serial_number for entry in x509.load_pem_x509_crl(crl))
+    lists = [LIST_BEGIN + each for each in crl.split(LIST_BEGIN)[1:]] or [crl]
+    return frozenset(entry.serial_number for each in lists for entry in x509.load_pem_x509_crl(each))
+
+
+def fingerprint(key: CertificatePublicKeyTypes) -> str:
+    """Of a public key: SHA-256 of its SubjectPublicKeyInfo (RFC 5280), hexadecimal."""
+    encoded = key.public_bytes(serialization.Encoding.DER, serialization.PublicFormat.SubjectPublicKeyInfo)
+    return hashlib.sha256(encoded).hexdigest()
+
+
+def fingerprint_of(certificate: bytes) -> str:
+    """Of the public key of a certificate, PEM; raises ValueError"""
+    return fingerprint(x509.load_pem_x509_certificate(certificate).public_key())
+
+
+def fingerprint_of_key(key: bytes) -> str:
+    """Of the public key that belongs to a private one, PEM; raises ValueError"""
+    return fingerprint(signing_key(key).public_key())
 
 
 def signing_key(key: bytes) -> ec.EllipticCurvePrivateKey:
@@ -157,6 +188,12 @@ def _builder(
         .not_valid_before(now - BACKDATED)
         .not_valid_after(now + valid)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
+    )
+
+
+def _subject(name: str, role: Role) -> x509.Name:
+    return x509.Name(
+        [x509.NameAttribute(NameOID.ORGANIZATIONAL_UNIT_NAME, role), x509.NameAttribute(NameOID.COMMON_NAME, name)]
     )
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from runner.core.roles import VIEWERS, Role
 from runner.errors import ArgumentError, UserError
 from runner.security.keyring import HOLDER, MEDIA_SECRET, PASSPHRASE, PEOPLE, TOKEN, Keyring
-from runner.settings import Setup
+from runner.settings import Control, Setup
 
 
 def keyring_of(setup: Setup, *needed: str) -> Keyring | None:
@@ -17,11 +17,12 @@ def keyring_of(setup: Setup, *needed: str) -> Keyring | None:
 
     needed  files that this side needs in addition to those that every holder has
     raises  UserError if keys are incomplete, or missing although video or control leave this machine; for an address of
-            media.host that they do not work with
+            media.host that they do not work with; for a foreign broker that does not guard its topics
     """
+    check_guarded(setup.control)
     if setup.keys is not None:
         _check_server_name(setup)
-        return Keyring.of(Path(setup.keys), *needed)
+        return _with_broker(setup, Keyring.of(Path(setup.keys), *needed))
     reached = {"media.host": setup.media.host, "control.host": setup.control.host}
     exposed = [
         f"{key} {host}" for key, host in reached.items() if not is_loopback(host) and not _is_private(host, setup)
@@ -30,7 +31,29 @@ def keyring_of(setup: Setup, *needed: str) -> Keyring | None:
         found = "is not a loopback address" if len(exposed) == 1 else "are not loopback addresses"
         rule = f"{found}: give keys=DIR, created by `tod-runner keys`, or insecure=true"
         raise ArgumentError("keys", None, f"{' and '.join(exposed)} {rule}")
-    return None
+    return _with_broker(setup, None)
+
+
+def check_guarded(control: Control) -> None:
+    """Which operator a message is from is known by its topic alone.
+
+    raises  UserError for a foreign broker beyond this machine that is not said to guard its topics
+    """
+    if control.foreign and not control.foreign.topics_guarded and not is_loopback(control.host):
+        rule = (
+            f"the broker at {control.host} must let nobody write to the topics of another: give it the rules that "
+            "`tod-runner keys output=DIR rules=true` prints, and then control.topics_guarded=true"
+        )
+        raise ArgumentError("control.topics_guarded", "false", rule)
+
+
+def _with_broker(setup: Setup, keyring: Keyring | None) -> Keyring | None:
+    """The keys; raises ConfigError for files that do not work for a foreign broker."""
+    if setup.control.foreign:
+        from runner.security.foreign import ForeignFiles
+
+        ForeignFiles.of(setup.control.foreign, keyring).check()
+    return keyring
 
 
 def may_listen(setup: Setup, address: str) -> bool:
@@ -65,6 +88,8 @@ class KeysOfAll(NamedTuple):
 
         raises  UserError, also if keys are missing although video or control leave this machine
         """
+        if setup.control.foreign:
+            raise ArgumentError("control.foreign", "true", "this verb starts a broker of its own")
         if setup.keys is None:
             keyring_of(setup)
             return None

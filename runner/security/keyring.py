@@ -5,7 +5,8 @@ own.crt         the holder's certificate: name, role, hosts
 own.key         its private key
 own.json        its name and role
 own.secret      from which its passwords are derived, see `derived`
-crl.pem         revoked certificates
+crl.pem         revoked certificates; if another authority signs them, it may be missing
+holders.json    only if another authority signs certificates: by public key, its holder
 people.json     vehicle only: by name, role and RTSP password of those who may reach it
 srt.passphrase  vehicle only
 media.secret    controllers and watchers only: from which the SRT passphrase of each vehicle is derived
@@ -35,9 +36,9 @@ if TYPE_CHECKING:
     from runner.security.validity import Validity
 
 AUTHORITY, CERTIFICATE, KEY, SECRET, HOLDER = "ca.crt", "own.crt", "own.key", "own.secret", "own.json"
-REVOKED, PEOPLE = "crl.pem", "people.json"
+REVOKED, PEOPLE, HOLDERS = "crl.pem", "people.json", "holders.json"
 PASSPHRASE, MEDIA_SECRET, TOKEN = "srt.passphrase", "media.secret", "page.token"
-PUBLIC = (AUTHORITY, CERTIFICATE, HOLDER, REVOKED)  # others may read these
+PUBLIC = (AUTHORITY, CERTIFICATE, HOLDER, REVOKED, HOLDERS)  # others may read these
 MOST_BYTES = 1_000_000  # of a file
 CHECK_S = 1.0  # between two checks of a file for changes
 
@@ -57,12 +58,14 @@ class Person(msgspec.Struct, frozen=True):
 class Holder(msgspec.Struct, frozen=True):
     """The owner of keys.
 
-    hosts  addresses and DNS names at which the holder is reached
+    hosts    addresses and DNS names at which the holder is reached
+    company  whether another authority than that of `tod-runner keys` signs certificates
     """
 
     name: str
     role: Role
     hosts: tuple[str, ...] = ()
+    company: bool = False
 
 
 def derived(secret: bytes, purpose: str) -> str:
@@ -149,7 +152,7 @@ class Keyring:
         raises  UserError
         """
         ring = Keyring(directory)
-        names = (AUTHORITY, CERTIFICATE, KEY, SECRET, HOLDER, REVOKED, *needed)
+        names = (AUTHORITY, CERTIFICATE, KEY, SECRET, HOLDER, HOLDERS if ring._is_of_company() else REVOKED, *needed)
         problems = [f"{name}: {problem}" for name in names if (problem := ring._problem(name))]
         if problems:
             rule = "must be a directory that `tod-runner keys` made, copied as it is"
@@ -177,6 +180,12 @@ class Keyring:
     @property
     def holder(self) -> Holder:
         return self._decoded(HOLDER, Holder)
+
+    def _is_of_company(self) -> bool:
+        try:
+            return self.holder.company
+        except UserError:  # is reported as a problem of that file
+            return False
 
     @property
     def secret(self) -> bytes:
@@ -217,6 +226,8 @@ class Keyring:
         """Serial numbers of revoked certificates."""
         from runner.security.certificates import serials_of
 
+        if self.holder.company and not self.revocation_list.exists():
+            return frozenset()
         try:
             return serials_of(self.read(REVOKED))
         except ValueError as error:
@@ -237,6 +248,10 @@ class Keyring:
 
     def watched_people(self, on_report: Callable[[str], None]) -> Watched[Mapping[str, Person]]:
         return Watched(self.directory / PEOPLE, self.people, on_report)
+
+    def watched_holders(self, on_report: Callable[[str], None]) -> Watched[Mapping[str, Holder]]:
+        """By fingerprint of the public key, see `Presented`."""
+        return Watched(self.directory / HOLDERS, lambda: self._decoded(HOLDERS, dict[str, Holder]), on_report)
 
     def watched_holder(self, on_report: Callable[[str], None]) -> Watched[Holder]:
         return Watched(self.directory / HOLDER, lambda: self.holder, on_report)

@@ -18,6 +18,7 @@ from runner.system.signals import urgent
 
 MAX_LINKS = 40  # as the kernel follows
 ABSENT = (errno.ENOENT, errno.ENOTDIR, errno.ELOOP)
+MOST_CREDENTIALS = 1000  # bytes of a file with user and password
 
 
 def flush(path: Path) -> None:
@@ -162,6 +163,20 @@ def exposure(path: Path) -> str | None:
     if mode & (stat.S_IRWXG | stat.S_IRWXO):
         return f"others may read it (mode {stat.S_IMODE(mode):o}); chmod 600"
     return None
+
+
+def read_credentials(path: Path) -> tuple[str, str]:
+    """User and password, from a file with one line user:password.
+
+    raises  ValueError with the rule that the file breaks
+    """
+    lines = read_file(path, MOST_CREDENTIALS).decode(errors="replace").splitlines()
+    if exposed := exposure(path):
+        raise ValueError(exposed)
+    user, _, password = lines[0].partition(":") if len(lines) == 1 else ("", "", "")
+    if not user or not password:
+        raise ValueError("must contain one line user:password")
+    return user, password
 
 
 def write_whole(path: Path, content: bytes) -> None:

@@ -29,7 +29,7 @@ from runner.errors import RunError
 from runner.graph import rtsp_url
 from runner.metrics.side import SideMetrics
 from runner.mqtt.link import ControlLink
-from runner.mqtt.login import Login
+from runner.mqtt.logins import login_of
 from runner.mqtt.messages import (
     OFFLINE,
     JsonObject,
@@ -326,13 +326,13 @@ def _link(
     keyring: Keyring | None,
 ) -> ControlLink | ControlLinks:
     """The control link, over each of several uplinks."""
+    control, new_login = setup.control, partial(login_of, setup.control, keyring)
     if len(setup.uplinks) > 1:
         from runner.mqtt.ways import ControlLinks, ways_to
 
-        if len(ways := ways_to(setup.control, setup.uplinks)) > 1:
-            return ControlLinks(setup.control, ways, will, listen, on_connected, on_report, keyring)
-    login = Login(keyring, on_report) if keyring else None
-    return ControlLink(setup.control, will, listen, on_connected, on_report, login)
+        if len(ways := ways_to(control, setup.uplinks)) > 1:
+            return ControlLinks(control, ways, will, listen, on_connected, on_report, new_login, control.prefix)
+    return ControlLink(control, will, listen, on_connected, on_report, new_login(on_report), prefix=control.prefix)
 
 
 def _check_ros(setup: Setup) -> None:

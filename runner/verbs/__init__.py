@@ -41,7 +41,8 @@ SIMULATED = (
     *("peak", "grant_ms"),
 )
 OF_SIMULATED = {"bursts": ("true", "false"), "control": ("true", "false")}
-KEYS = ("output", "vehicle", "controller", "watcher", "predictor", "positioner", "broker", "host", "rotate", "revoke")
+HOLDERS = ("vehicle", "controller", "watcher", "predictor", "positioner", "broker")
+KEYS = ("output", *HOLDERS, "host", "rotate", "revoke", "ca", "signed", "crl", "rules", "prefix")
 VERBS = {
     "print": Verb(
         "print pipelines and decisions without starting them",
@@ -133,7 +134,13 @@ VERBS = {
         composes=False,
         choices={"overwrite": NO_YES},
     ),
-    "keys": Verb("keys and passwords for vehicles and operators", "runner.verbs.keys", KEYS, composes=False),
+    "keys": Verb(
+        "keys and passwords for vehicles and operators",
+        "runner.verbs.keys",
+        KEYS,
+        composes=False,
+        choices={"rules": NO_YES},
+    ),
     "doctor": Verb("list missing dependencies of this machine", "runner.verbs.doctor", ("registry",), "VERB"),
     "completion": Verb("the completion script for bash or zsh", "runner.verbs.completion", (), "SHELL", composes=False),
 }

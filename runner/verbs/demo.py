@@ -194,7 +194,8 @@ def _prepare_run(
     config.pqos()
     setup = config.setup()
     # In network namespaces of its own, a link replaces the hosts.
-    keys = None if setup.keys is None and link and link.kind == "netns" else KeysOfAll.of(setup)
+    is_open = setup.keys is None and not setup.control.foreign
+    keys = None if is_open and link and link.kind == "netns" else KeysOfAll.of(setup)
     if keys and link and link.kind == "relay":
         rule = "rewrites ports in RTSP, which keys encrypt; link=netns passes it unread"
         raise ArgumentError("link", link.kind, rule)

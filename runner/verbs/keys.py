@@ -1,5 +1,6 @@
 """usage: tod-runner keys output=DIR [vehicle=NAME] [controller=NAME] [watcher=NAME] [predictor=NAME] [positioner=NAME]
                               [broker=HOST] [host=HOST[,HOST...]] [rotate=NAME] [revoke=NAME]
+                              [ca=FILE] [signed=FILE[,FILE...]] [crl=FILE] [rules=true] [prefix=TOPIC]
 
 Creates the keys that vehicles, operators and the broker need to communicate over a network: a certificate authority in
 DIR/authority, the broker's files in DIR/broker, and DIR/NAME for everyone else. Copy each directory unchanged to its
@@ -14,26 +15,75 @@ machine; DIR/authority stays where it is. Existing keys are kept, so names can b
 rotate=NAME replaces keys and passwords, revoke=NAME withdraws them. Both take effect on a machine once its changed
 directory has been copied there; the last line of the output lists these directories. A certificate is valid for a year.
 
+With another authority, such as a company's, ca=FILE names its certificates (PEM). DIR/requests then has a request for
+each certificate, NAME.csr, for the authority to sign. signed=FILE[,FILE...] takes in what it has signed, crl=FILE its
+revocation list, if it has one.
+
+rules=true prints the rules that a broker needs which these keys do not set up, in words and in mosquitto's form;
+prefix=acme/tod is what topics begin with there, as control.prefix of both sides.
+
   tod-runner keys output=keys vehicle=tum_q7 host=10.0.0.2 controller=alice broker=10.0.0.1
   tod-runner keys output=keys watcher=bob
   tod-runner keys output=keys revoke=bob
   tod-runner keys output=keys                      list what was issued
+  tod-runner keys output=keys rules=true
 """
 
 from __future__ import annotations
 
+import re
 from datetime import datetime
+from pathlib import Path
 
 from runner.core.roles import PEOPLE, Role
 from runner.errors import ArgumentError
 from runner.security.authority import Authority, Issued, Wanted
+from runner.security.broker_files import foreign_rules
+from runner.security.company import CompanyAuthority, is_of_company
+from runner.settings import PREFIX
 from runner.verbs import Arguments
 
 ROLES = (Role.VEHICLE, *PEOPLE)
+PREFIX_FORM = re.compile(r"[A-Za-z0-9._-]+(/[A-Za-z0-9._-]+)*")  # as in schemas/config.schema.json
 
 
 def run(arguments: Arguments) -> int:
     output = arguments.given_path("output", "the directory for all keys")
+    values = arguments.values
+    wanted = _wanted(arguments)
+    authority = _authority(output, arguments)
+    with authority.opened():
+        if arguments.choice("rules") == "true":
+            print(foreign_rules(_prefix(arguments), _named(authority)), end="")
+            return 0
+        authority.check(wanted, *((action, values.get(action)) for action in ("rotate", "revoke")))
+        changed = _change(authority, arguments, wanted)
+        for issued in authority.holders():
+            print(_described(issued, authority.now()))
+        to_copy = sorted(each.name for each in authority.holders() if not each.revoked)
+        asked = _asked(authority)
+    if changed and to_copy:
+        print(f"copy to their machines: {', '.join(f'{output}/{name}' for name in to_copy)}")
+    if asked:
+        print(f"to be signed: {', '.join(map(str, asked))}; then give signed=FILE[,FILE...]")
+    return 0
+
+
+def _authority(output: Path, arguments: Arguments) -> Authority:
+    bundle = arguments.path("ca")
+    if bundle and (output / "authority" / "authority.key").exists():
+        raise ArgumentError("ca", str(bundle), f"{output} has an authority of its own: choose another output")
+    if bundle or is_of_company(output):
+        return CompanyAuthority(output, bundle=bundle)
+    for argument in ("signed", "crl"):
+        if argument in arguments.values:
+            rule = "is for keys of another authority: give ca=FILE first, its certificates"
+            raise ArgumentError(argument, arguments.values[argument], rule)
+    return Authority(output)
+
+
+def _wanted(arguments: Arguments) -> list[Wanted]:
+    """The keys that are asked for, checked before the first file is written."""
     values = arguments.values
     hosts = tuple(filter(None, values.get("host", "").split(",")))
     named = [role for role in ROLES if role in values]
@@ -42,22 +92,48 @@ def run(arguments: Arguments) -> int:
     wanted = [Wanted(values[role], role, _hosts_of(role, named, hosts)) for role in named]
     if "broker" in values:
         wanted.append(Wanted("broker", Role.BROKER, (values["broker"],)))
-    for each in wanted:  # everything is checked before the first file is written
+    for each in wanted:
         each.check()
-    authority = Authority(output)
-    with authority.opened():
-        authority.check(wanted, *((action, values.get(action)) for action in ("rotate", "revoke")))
-        changed = [each.name for each in wanted if authority.issue(*each)]
-        for action in (authority.rotate, authority.revoke):
-            if name := values.get(action.__name__):
-                action(name)
-                changed.append(name)
-        for issued in authority.holders():
-            print(_described(issued, authority.now()))
-        to_copy = sorted(each.name for each in authority.holders() if not each.revoked)
-    if changed:
-        print(f"copy to their machines: {', '.join(f'{output}/{name}' for name in to_copy)}")
-    return 0
+    return wanted
+
+
+def _change(authority: Authority, arguments: Arguments, wanted: list[Wanted]) -> list[str]:
+    """Whose keys have changed, or were asked for."""
+    values, changed = arguments.values, list[str]()
+    if isinstance(authority, CompanyAuthority):
+        authority.prepare()
+        if signed := values.get("signed"):
+            changed += authority.take([Path(each) for each in signed.split(",")])
+        if listed := arguments.path("crl"):
+            authority.take_list(listed)
+            changed.append(str(listed))
+    changed += [each.name for each in wanted if authority.issue(*each)]
+    for action in (authority.rotate, authority.revoke):
+        if name := values.get(action.__name__):
+            action(name)
+            changed.append(name)
+    return changed
+
+
+def _named(authority: Authority) -> list[tuple[str, Role]]:
+    """Everybody who has keys, or has asked for them."""
+    names = {each.name: each.role for each in authority.holders() if not each.revoked}
+    waiting = authority.waiting() if isinstance(authority, CompanyAuthority) else {}
+    return list({**names, **{name: each.role for name, each in waiting.items()}}.items())
+
+
+def _asked(authority: Authority) -> list[Path]:
+    """Requests that wait for the other authority."""
+    return [*map(authority.request, authority.waiting())] if isinstance(authority, CompanyAuthority) else []
+
+
+def _prefix(arguments: Arguments) -> str:
+    if others := arguments.values.keys() - {"output", "rules", "prefix"}:
+        raise ArgumentError("rules", "true", f"must come without {', '.join(sorted(others))}: it changes nothing")
+    prefix = arguments.values.get("prefix", PREFIX)
+    if not PREFIX_FORM.fullmatch(prefix):
+        raise ArgumentError("prefix", prefix, "must be letters, digits, ., _ and - between slashes")
+    return prefix
 
 
 def _hosts_of(role: Role, named: list[Role], hosts: tuple[str, ...]) -> tuple[str, ...]:
