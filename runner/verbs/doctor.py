@@ -118,6 +118,10 @@ def examine(verb: str, setup: Setup, document: Mapping[str, Any]) -> Iterator[Di
     yield from _ports(verb, setup)
     if verb in CONNECTING and setup.keys is not None and find_spec("cryptography"):
         yield from _certificates(Path(setup.keys))
+    if verb in ("vehicle", "operator", "ros") and setup.control.foreign and find_spec("cryptography"):
+        from runner.verbs.doctor_broker import check_broker
+
+        yield from check_broker(setup, verb)
     if verb in ("vehicle", "demo", "record"):
         yield from _devices(vehicle)
         yield from _ip_cameras(vehicle)
@@ -140,7 +144,7 @@ def _extras(verb: str, setup: Setup, document: Mapping[str, Any]) -> Iterator[st
     if verb in ("vehicle", "demo", "record") and any(source.render for source in sources):
         yield "synthetic"
     if verb in CONNECTING:
-        yield from ["security"] if setup.keys is not None else []
+        yield from ["security"] if setup.keys is not None or setup.control.foreign else []
     ports = {"vehicle": setup.metrics.vehicle_port, "operator": setup.metrics.operator_port}
     if any(port is not None and verb in (side, "demo") for side, port in ports.items()):
         yield "metrics"
