@@ -14,9 +14,10 @@ from typing import Any
 from paho.mqtt.client import Client, MQTTMessage, MQTTMessageInfo
 
 from runner.mqtt.client import RETRY_S, BrokerClient
-from runner.mqtt.login import BrokerLogin
+from runner.mqtt.login import BrokerLogin, Login
 from runner.mqtt.messages import JsonObject, MqttMessage
-from runner.settings import PREFIX, Endpoint, Uplink
+from runner.security.keyring import Keyring
+from runner.settings import PREFIX, Control, Endpoint, Uplink
 from runner.system.reports import LimitedReports
 
 KEEPALIVE_S = 1  # s without a message before a ping; the broker publishes a will after one and a half of these
@@ -253,6 +254,19 @@ class ControlLink:
         if why not in self._reported and len(self._reported) < self._most_reasons:
             self._reported.add(why)
             self._on_report(f"{self.fault}{remedy}; retrying")
+
+
+def login_of(control: Control, keyring: Keyring | None, on_report: Callable[[str], None]) -> BrokerLogin | None:
+    """The login of a side with these keys; None: the broker does not authenticate.
+
+    on_report  as for `Login`
+    raises     UserError if files cannot be used
+    """
+    if control.foreign:
+        from runner.mqtt.foreign import ForeignLogin
+
+        return ForeignLogin(control.foreign, keyring, on_report)
+    return Login(keyring, on_report) if keyring else None
 
 
 def is_one_of(kinds: set[str], topic: str) -> bool:

@@ -14,8 +14,7 @@ from runner.configuration import agreement
 from runner.core.decision import NOTHING
 from runner.core.events import Attention
 from runner.mqtt.copies import Newest
-from runner.mqtt.link import ControlLink
-from runner.mqtt.logins import login_of
+from runner.mqtt.link import ControlLink, login_of
 from runner.mqtt.messages import (
     OPERATOR_GONE,
     SIGNED_OFF,

@@ -13,8 +13,7 @@ from typing import Any
 
 from runner.graph import rtsp_url
 from runner.mqtt.copies import Newest
-from runner.mqtt.link import ControlLink
-from runner.mqtt.logins import login_of
+from runner.mqtt.link import ControlLink, login_of
 from runner.mqtt.messages import (
     OPERATOR_GONE,
     SIGNED_OFF,

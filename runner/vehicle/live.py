@@ -28,8 +28,7 @@ from runner.drive.log import Log, check_free
 from runner.errors import RunError
 from runner.graph import rtsp_url
 from runner.metrics.side import SideMetrics
-from runner.mqtt.link import ControlLink
-from runner.mqtt.logins import login_of
+from runner.mqtt.link import ControlLink, login_of
 from runner.mqtt.messages import (
     OFFLINE,
     JsonObject,

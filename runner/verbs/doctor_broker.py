@@ -15,8 +15,8 @@ from paho.mqtt.enums import CallbackAPIVersion
 from runner.core.roles import Role
 from runner.errors import ConfigError, RunError, UserError
 from runner.mqtt import refusal
+from runner.mqtt.link import login_of
 from runner.mqtt.login import BrokerLogin
-from runner.mqtt.logins import login_of
 from runner.security.broker_files import permitted
 from runner.security.exposure import check_guarded
 from runner.security.foreign import ForeignFiles

@@ -13,8 +13,7 @@ from company import Company
 
 from rig import WAIT_S, free_port, passes, process, run, small_robot, until
 from runner.core.roles import Role
-from runner.mqtt.link import ControlLink
-from runner.mqtt.logins import login_of
+from runner.mqtt.link import ControlLink, login_of
 from runner.operator.live import live_operator
 from runner.security.broker_files import foreign_rules
 from runner.security.company import CompanyAuthority
