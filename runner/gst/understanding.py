@@ -12,6 +12,7 @@ from gi.repository import Gst, GstSdp
 VERSION = ".".join(map(str, Gst.version()[:3]))
 ATTRIBUTE = "x-gstreamer"  # of a description
 PACKETS, REQUESTS = 50, 40  # fewer prove nothing
+SAME = "install the same tod-runner on both sides"
 
 
 def state_version(sdp: GstSdp.SDPMessage) -> None:
@@ -49,12 +50,13 @@ class Understanding:
         """
         dropped = sum(decoder.get_property("stats").get_value("recv-drop-count") for decoder in self._decoders)
         if not received and dropped >= PACKETS:
-            self._report("packets arrive, but none can be decrypted")
+            self._report("packets arrive, but none can be decrypted", SAME)
         if unanswered >= REQUESTS:
-            self._report("nothing that was lost is repaired: the vehicle has answered no request in time")
+            fault = "nothing that was lost is repaired: the vehicle has answered no request in time"
+            self._report(fault, f"unless the round trip is too long, {SAME}")
 
-    def _report(self, fault: str) -> None:
+    def _report(self, fault: str, cure: str) -> None:
         if fault not in self._reported:
             self._reported.add(fault)
             versions = f"GStreamer {VERSION} here, {self._vehicle} on the vehicle"
-            self._on_report(f"{fault}; {versions}; install the same tod-runner on both sides")
+            self._on_report(f"{fault}; {versions}; {cure}")
