@@ -6,6 +6,7 @@
 # make deadspot UPLINK=FILE.csv  two drives over a recorded uplink: the picture of the README
 # make generated  the schemas and types that scripts/schemas makes of classes
 # make everywhere  HEAD on Debian 12, 13 and testing, in root directories made by debootstrap; SYSTEMS="trixie forky" selects
+# make packages  Debian packages of HEAD for this system, in dist; SYSTEMS="trixie forky" builds and tries them for others
 # make setup  install what driving needs; the command is then .venv/bin/tod-runner
 # make ros2   ROS 2 in an environment of its own, .venv-ros2; docs/ros.md
 # make ros1   ROS 1, which is end-of-life, as Debian's packages
@@ -19,7 +20,7 @@ NODE_READY := node_modules/.ready
 # Tests start hundreds of processes; without cached bytecode each would compile the project again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test generated timed untimed compiled golden units check fast coverage lint javascript setup bench deadspot uplink-given soak everywhere ros1 ros2 clean
+.PHONY: demo test generated timed untimed compiled golden units check fast coverage lint javascript setup bench deadspot uplink-given soak everywhere packages ros1 ros2 clean
 
 demo: $(READY)
 	$(BIN)/tod-runner demo
@@ -98,6 +99,9 @@ soak: $(TEST_READY) $(NODE_READY)
 everywhere:
 	scripts/everywhere $(SYSTEMS)
 
+packages:
+	$(if $(SYSTEMS),scripts/try-packages $(SYSTEMS),scripts/build-packages)
+
 setup: $(READY)
 
 # Tests with a version of ROS run only if its target has been made.
@@ -124,4 +128,4 @@ $(NODE_READY): package.json package-lock.json | $(TEST_READY)
 	touch $@
 
 clean:
-	rm -rf $(VENV) $(ROS2) node_modules build *.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(ROS2) node_modules build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
