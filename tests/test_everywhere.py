@@ -7,6 +7,7 @@ import importlib.util
 import os
 import subprocess
 import uuid
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
@@ -15,8 +16,20 @@ import pytest
 SCRIPT = Path(__file__).resolve().parents[1] / "scripts" / "everywhere"
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _path() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(SCRIPT.parent)
+        yield
+
+
 @pytest.fixture(scope="module")
-def everywhere() -> ModuleType:
+def roots() -> ModuleType:
+    return importlib.import_module("roots")
+
+
+@pytest.fixture(scope="module")
+def everywhere(_path: None) -> ModuleType:
     loader = importlib.machinery.SourceFileLoader("everywhere", str(SCRIPT))
     spec = importlib.util.spec_from_loader("everywhere", loader)
     assert spec
@@ -31,15 +44,15 @@ def marked(mark: str) -> list[str]:
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="needs root")
-def test_a_step_ends_with_all_that_it_started_and_leaves_nothing_mounted(everywhere, tmp_path: Path) -> None:
-    root, mark = everywhere.Root(Path("/"), tmp_path), f"mark{uuid.uuid4().hex}"
+def test_a_step_ends_with_all_that_it_started_and_leaves_nothing_mounted(roots, tmp_path: Path) -> None:
+    root, mark = roots.Root(Path("/"), tmp_path), f"mark{uuid.uuid4().hex}"
     mounts = Path("/proc/mounts").read_text()
     sleeping = f"setsid sh -c 'sleep 60; : {mark}' & sleep 60; : {mark}"
-    ended = root.run(everywhere.Step("too long", sleeping, 0.7))
+    ended = root.run(roots.Step("too long", sleeping, 0.7))
     assert (ended.status, str(ended)) == (None, "**failed**: ended after 1 s")
-    fine = root.run(everywhere.Step("fine", "ip -o link | wc -l; echo done", 20))
+    fine = root.run(roots.Step("fine", "ip -o link | wc -l; echo done", 20))
     assert (fine.fine, fine.log.read_text()) == (True, "1\ndone\n")  # only the loopback
-    assert str(root.run(everywhere.Step("bad", "exit 3", 20))) == "**failed**: status 3"
+    assert str(root.run(roots.Step("bad", "exit 3", 20))) == "**failed**: status 3"
     assert marked(mark) == []
     assert Path("/proc/mounts").read_text() == mounts
 
