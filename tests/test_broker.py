@@ -16,6 +16,9 @@ EXPIRED = "SSL routines::certificate verify failed"
         (f"OpenSSL Error[0]: error:0A000086:{EXPIRED}", (None, EXPIRED)),
         ("Client <unknown> disconnected, not authorised.", (None, "not authorised")),
         ("OpenSSL Error[0]: error:0A000126:SSL routines::unexpected eof while reading", None),
+        (f"OpenSSL Error while trying to get the error[0]: error:0A000086:{EXPIRED}", (None, EXPIRED)),
+        ("Client auto-1-2 [192.0.2.7:51798] disconnected: not authorised.", ("192.0.2.7", "not authorised")),
+        ("Client auto-1-2 [192.0.2.7:51798] disconnected: connection closed by client.", None),
         ("Client alice disconnected.", None),
     ],
 )

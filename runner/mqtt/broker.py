@@ -42,8 +42,8 @@ RELOADED = (PASSWORDS, ACCESS, REVOKED, CERTIFICATE)
 CONNECTED = re.compile(r"New connection from (?P<address>\S+):\d+ on port ")
 REFUSED = re.compile(
     r"Client connection from (?P<address>\S+) failed: (?:error:\w*:)?(?P<failed>.*)"
-    r"|OpenSSL Error(?: (?P<peer>\S+))?\[\d+\]: (?:error:\w*:)?(?P<tls>.*)"
-    r"|Client <unknown>(?: \[(?P<at>\S+):\d+\])? disconnected[,:] (?P<why>not authorised)\."
+    r"|OpenSSL Error[^[]*\[\d+\]: (?:error:\w*:)?(?P<tls>.*)"
+    r"|Client (?:<unknown> disconnected, |\S+ \[(?P<at>\S+):\d+\] disconnected: )(?P<why>not authorised)\."
 )
 CONNECTION = re.compile("New c|Client |OpenSSL Error")
 LEFT = "unexpected eof"  # a client that ended the connection itself
@@ -151,13 +151,12 @@ def refusal(line: str) -> tuple[str | None, str] | None:
     """The address, if stated, and the reason of a line about a refused client; None: it is about none.
 
     mosquitto has two wordings for the same reason: it depends on whether the client's first bytes come at once.
+    From 2.1 on it words them otherwise, and a client that it no longer accepts as one that it never did.
     """
     refused = REFUSED.match(line)
     if refused is None or LEFT in line:
         return None
-    return refused["address"] or refused["peer"] or refused["at"], (
-        refused["failed"] or refused["tls"] or refused["why"]
-    ).rstrip(".")
+    return refused["address"] or refused["at"], (refused["failed"] or refused["tls"] or refused["why"]).rstrip(".")
 
 
 @contextmanager
