@@ -41,6 +41,7 @@ class Company:
         self.issuing = _authority("Acme Issuing", self.root)
         self.ca = self._write("root.pem", _pem(self.root.certificate))
         self._write("issuing.pem", _pem(self.issuing.certificate))
+        self._write("issuing.key", _key_pem(self.issuing.key))
 
     def signed(self, key: ec.EllipticCurvePublicKey, names: Sequence[str], *, ends: timedelta = LONG) -> bytes:
         """A certificate with a subject of the company's own, and the intermediate; names: of hosts."""
@@ -65,9 +66,8 @@ class Company:
     def issue(self, name: str, *names: str, ends: timedelta = LONG) -> tuple[Path, Path]:
         """Files with a new certificate and its key."""
         key = ec.generate_private_key(ec.SECP256R1())
-        pem = key.private_bytes(PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
         certificate = self.signed(key.public_key(), names or [name], ends=ends)
-        return self._write(f"{name}.crt", certificate), self._write(f"{name}.key", pem)
+        return self._write(f"{name}.crt", certificate), self._write(f"{name}.key", _key_pem(key))
 
     def revocations(self, *serials: int) -> Path:
         """A list of the intermediate's."""
@@ -151,6 +151,10 @@ def _name(text: str) -> x509.GeneralName:
         return x509.IPAddress(ipaddress.ip_address(text))
     except ValueError:
         return x509.DNSName(text)
+
+
+def _key_pem(key: rsa.RSAPrivateKey | ec.EllipticCurvePrivateKey) -> bytes:
+    return key.private_bytes(PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
 
 
 def _pem(certificate: x509.Certificate) -> bytes:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
+import sys
 import time
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 
 import pytest
 from company import Company
+from recipes import lines
 
 from rig import WAIT_S, free_port, passes, process, run, small_robot, until
 from runner.core.roles import Role
@@ -79,30 +83,55 @@ def published(company, broker, user, topic, *words):
     return done.stdout + done.stderr
 
 
-def test_a_company_s_broker_and_authority_carry_a_drive_and_nobody_acts_for_another(company, keys):
+def followed(company, directory, **stand_ins):
+    """The recipe of docs/deployment.md, up to what starts; returns the words of each side, and of each doctor's."""
+    words = {}
+    for name in ("root.pem", "issuing.pem", "issuing.key"):
+        shutil.copy(company.directory / name, directory / f"acme-{name}")
+    for line in lines("A company's broker and authority"):
+        text = line.text
+        for written, here in {"tum_q7": NAME, "10.0.0.2": "127.0.0.1", "mqtt.acme.example": "localhost"}.items():
+            text = text.replace(written, here)
+        verb, *rest = text.removeprefix("tod-runner ").split()
+        if verb in ("vehicle", "operator", "doctor"):
+            login = company.credentials(NAME, NAME[::-1]) if line.where == "vehicle" else stand_ins["login"]
+            place = {"mqtt.login": str(login), "tod-keys": str(directory / "keys" / NAME), "8883": stand_ins["port"]}
+            place["keys/alice"] = str(directory / "keys" / "alice")
+            own = [word.replace(key, value) for word in rest for key, value in place.items() if key in word]
+            words[(verb, line.where)] = [*(word for word in rest if not any(k in word for k in place)), *own, *WORDS]
+        elif not text.startswith(("rsync", "chmod")):
+            text = text.replace("controller=alice", "controller=alice watcher=bob")
+            path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+            subprocess.run(["bash", "-ec", text], cwd=directory, env={**os.environ, "PATH": path}, check=True)
+    return words
+
+
+def test_a_company_s_broker_and_authority_carry_a_drive_and_nobody_acts_for_another(company, tmp_path, tod):
     broker, media = Endpoint("127.0.0.1", free_port()), f"media.port={free_port()}"
-    common = (media, f"control.port={broker.port}")
+    words = followed(company, tmp_path, login=company.credentials("alice", "ecila"), port=str(broker.port))
+    vehicle, operator, (_, *doctor) = (
+        [*words[key], media] for key in (("vehicle", "vehicle"), ("operator", "operator"), ("doctor", "operator"))
+    )
     forged = '{"id": "1", "as_of": 1, "event": "mode_selected", "mode": "single"}'
     requests = f"{PREFIX}/{NAME}/request"
-    with (
-        company.broker(broker, HOLDERS, RULES),
-        process("vehicle", *side(keys, company, NAME, *common)),
-        live_operator(side(keys, company, "alice", *common)) as alice,
-    ):
-        alice.start()
-        until(lambda: alice.station.samples and alice.station.samples["front"].frames > 10)
-        answers = []
-        alice.station.ask({"event": "mode_selected", "mode": "collective"}, answers.append)
-        assert until(lambda: answers)[0].result == "applied"
-        for topic, refused in ((f"{requests}/alice", True), (f"{requests}/bob", False)):
-            for version in ("mqttv311", "mqttv5"):
-                said = published(company, broker, "bob", topic, "-m", forged, "-V", version)
-                assert ("Not authorized" in said) == (refused and version == "mqttv5"), (topic, said)
-        alice.station.ask({"event": "operator_connected"}, answers.append)
-        assert until(lambda: answers[1:])[0].result == "applied"
-        assert alice.station.state.mode == "collective"
-        until(lambda: alice.station._telemetry.refused > 1)
-        assert alice.station._telemetry.refused == 2  # bob's own: those in alice's name have not come
+    with company.broker(broker, HOLDERS, (tmp_path / "tod.acl").read_text(), "localhost", "127.0.0.1"):
+        diagnosed = tod("doctor", "ros", *doctor).out
+        assert f"broker localhost:{broker.port}: lets nobody write in the name of another" in diagnosed
+        with process("vehicle", *vehicle), live_operator(operator) as alice:
+            alice.start()
+            until(lambda: alice.station.samples and alice.station.samples["front"].frames > 10)
+            answers = []
+            alice.station.ask({"event": "mode_selected", "mode": "collective"}, answers.append)
+            assert until(lambda: answers)[0].result == "applied"
+            for topic, refused in ((f"{requests}/alice", True), (f"{requests}/bob", False)):
+                for version in ("mqttv311", "mqttv5"):
+                    said = published(company, broker, "bob", topic, "-m", forged, "-V", version)
+                    assert ("Not authorized" in said) == (refused and version == "mqttv5"), (topic, said)
+            alice.station.ask({"event": "operator_connected"}, answers.append)
+            assert until(lambda: answers[1:])[0].result == "applied"
+            assert alice.station.state.mode == "collective"
+            until(lambda: alice.station._telemetry.refused > 1)
+            assert alice.station._telemetry.refused == 2  # bob's own: those in alice's name have not come
 
 
 def test_other_certificates_of_the_company_bring_no_pictures(company, keys, tmp_path):
