@@ -110,6 +110,12 @@ FAULTS = [
     Fault("drive/read.py", "if kind not in OF_SEVERAL_THREADS and t < ", "if False and t < ", "test_replay"),
     Fault("verbs/validate.py", 'not name.startswith(".") and name.lower()', "name.lower()", "test_validate"),
     Fault("security/authority.py", "in keyring.PUBLIC else 0o600", "in keyring.PUBLIC else 0o640", "test_keys"),
+    Fault(
+        "security/identities.py",
+        "if self._by_key else _stated(presented)",
+        "or _stated(presented)",
+        "test_company_keys",
+    ),
     Fault("security/authority.py", "if role is Role.VEHICLE or role in VIEWERS:", "if role in VIEWERS:", "test_keys"),
     Fault("system/clocks.py", "if exchange.answered < exchange.received:", "if False:", "test_clocks"),
     Fault("system/reports.py", "if most or text in self._passed_on:", "if text in self._passed_on:", "test_reports"),

@@ -43,11 +43,13 @@ class Company:
         self._write("issuing.pem", _pem(self.issuing.certificate))
         self._write("issuing.key", _key_pem(self.issuing.key))
 
-    def signed(self, key: ec.EllipticCurvePublicKey, names: Sequence[str], *, ends: timedelta = LONG) -> bytes:
-        """A certificate with a subject of the company's own, and the intermediate; names: of hosts."""
-        leaf = _certificate(
-            x509.Name([x509.NameAttribute(NameOID.ORGANIZATION_NAME, "Acme")]), key, self.issuing, ends
-        ).add_extension(x509.ExtendedKeyUsage(USES), critical=False)
+    def signed(
+        self, key: ec.EllipticCurvePublicKey, names: Sequence[str], *, ends: timedelta = LONG, common: str = "x"
+    ) -> bytes:
+        """A certificate and the intermediate. names: of hosts; common: its common name, in a unit called vehicle"""
+        subject = [(NameOID.ORGANIZATIONAL_UNIT_NAME, "vehicle"), (NameOID.COMMON_NAME, common)]
+        name = x509.Name([x509.NameAttribute(*each) for each in subject])
+        leaf = _certificate(name, key, self.issuing, ends).add_extension(x509.ExtendedKeyUsage(USES), critical=False)
         if names:
             leaf = leaf.add_extension(x509.SubjectAlternativeName([_name(each) for each in names]), critical=False)
         return _pem(leaf.sign(self.issuing.key, hashes.SHA256())) + _pem(self.issuing.certificate)
@@ -66,7 +68,7 @@ class Company:
     def issue(self, name: str, *names: str, ends: timedelta = LONG) -> tuple[Path, Path]:
         """Files with a new certificate and its key."""
         key = ec.generate_private_key(ec.SECP256R1())
-        certificate = self.signed(key.public_key(), names or [name], ends=ends)
+        certificate = self.signed(key.public_key(), names or [name], ends=ends, common=name)
         return self._write(f"{name}.crt", certificate), self._write(f"{name}.key", _key_pem(key))
 
     def revocations(self, *serials: int) -> Path:
