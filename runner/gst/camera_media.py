@@ -11,7 +11,6 @@ from runner.graph import FEEDBACK, Plan
 from runner.gst.patient_media import PatientMedia
 from runner.gst.pipeline import CameraPipeline
 from runner.gst.srtp import set_master_key, write_keys
-from runner.gst.understanding import state_version
 from runner.settings import Media
 from runner.system.ports import ip_address_of
 
@@ -42,6 +41,8 @@ class CameraMedia(PatientMedia):
     """
 
     def do_setup_sdp(self, sdp: GstSdp.SDPMessage, info: GstRtspServer.SDPInfo) -> bool:
+        from runner.gst.understanding import state_version
+
         stream, is_wanted = self.get_stream(0), _feedback.pop(threading.get_ident(), False)
         caps, offered = stream.get_caps(), stream.get_profiles()
         if caps is None:

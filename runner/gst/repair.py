@@ -15,7 +15,6 @@ from runner.core.model import GraphSettings
 from runner.gst.arriving import HEADER_BYTES, ArrivingFrames, Lateness, Packet, read_packet
 from runner.gst.packet_times import received_at, state_arrivals
 from runner.gst.probes import BufferProbe, PassingBuffer
-from runner.gst.understanding import Understanding
 from runner.records.reception import Arrival, ArrivedPacket
 from runner.system.recent import RecentValue
 
@@ -209,6 +208,8 @@ class RtpSession:
     def __init__(
         self, graph: GraphSettings, on_report: Callable[[str], None], uplinks: ReceivedUplinks | None = None
     ) -> None:
+        from runner.gst.understanding import Understanding
+
         self._graph, self._on_report, self.uplinks = graph, on_report, uplinks
         self._counted = (0, 0)  # packets received and missing, as last read
         self._understanding = Understanding(on_report)

@@ -10,8 +10,6 @@ from secrets import token_bytes
 
 from gi.repository import Gst, GstRtsp, GstSdp
 
-from runner.gst.mikey import in_one_piece
-
 MASTER_BYTES = 30  # AES-128 key and salt (RFC 3711, section 8.2)
 ALGORITHMS = ", ".join(
     f"{kind}-cipher=(string)aes-128-icm, {kind}-auth=(string)hmac-sha1-80" for kind in ("srtp", "srtcp")
@@ -40,6 +38,8 @@ def _rtcp_key(_client: Gst.Element, _stream: int) -> Gst.Caps:
 
 def _on_send(_client: Gst.Element, request: GstRtsp.RTSPMessage) -> bool:
     """Whether to send a request: always."""
+    from runner.gst.mikey import in_one_piece
+
     found, keys = request.get_header(KEY_HEADER, 0)
     if found == GstRtsp.RTSPResult.OK and (joined := KEY_DATA.sub(lambda data: in_one_piece(data[0]), keys)) != keys:
         request.remove_header(KEY_HEADER, -1)
@@ -49,6 +49,8 @@ def _on_send(_client: Gst.Element, request: GstRtsp.RTSPMessage) -> bool:
 
 def write_keys(media: GstSdp.SDPMedia) -> None:
     """Write the keys of a description so that every client reads them."""
+    from runner.gst.mikey import in_one_piece
+
     for number in range(media.attributes_len()):
         attribute = media.get_attribute(number)
         if attribute.key == KEY_ATTRIBUTE:

@@ -539,7 +539,7 @@ def other_key(encoded):
 
 
 def test_keys_that_do_not_fit_are_reported_with_both_versions(keys, monkeypatch):
-    monkeypatch.setattr("runner.gst.srtp.in_one_piece", other_key)
+    monkeypatch.setattr("runner.gst.mikey.in_one_piece", other_key)
     with sending(keys) as (plans, _), watching(plans, keys / "bob") as (seen, messages):
         until(lambda: max(seen().values()) > 0 or messages, every_s=0.1)
         versions = f"GStreamer {VERSION} here, {VERSION} on the vehicle"
@@ -553,7 +553,7 @@ def test_feedback_that_the_vehicle_does_not_understand_is_reported(keys, monkeyp
     chance = random.Random(1)
     inside.losing(monkeypatch, "udpsrc", "src", lambda packet: packet.get_size() > 200 and chance.random() < 0.1)
     monkeypatch.setattr("runner.gst.camera_media.write_keys", lambda _: None)
-    monkeypatch.setattr("runner.gst.srtp.in_one_piece", other_key)  # of the key for feedback
+    monkeypatch.setattr("runner.gst.mikey.in_one_piece", other_key)  # of the key for feedback
     monkeypatch.setattr("runner.gst.understanding.REQUESTS", 10)
     with sending(keys) as (plans, _), watching(plans, keys / "bob") as (seen, messages):
         until(lambda: min(seen().values()) >= 0 and messages, every_s=0.1)
