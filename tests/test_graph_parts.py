@@ -26,8 +26,9 @@ def names(graph: Graph) -> str:
 
 def test_packaged_graphs_state_only_what_differs() -> None:
     for name in BASED:
-        lines = (CONF / f"graph/{name}.yaml").read_text().splitlines()
-        assert len(lines) <= 21, name
+        every = (CONF / f"graph/{name}.yaml").read_text().splitlines()
+        lines = [line for line in every if not line.lstrip().startswith("#")]
+        assert len(lines) <= 19, name
         assert "defaults: [h264_rtsp, _self_]" in lines
 
 
