@@ -53,8 +53,10 @@ def believed_series(decisions: Decisions, uplink: str = "") -> BelievedSeries | 
 
 
 def _believed(line: DecisionMade | VehicleState, uplink: str) -> Believed | None:
-    decided = line if not uplink else line.uplinks.get(uplink) if line.uplinks is not UNSET else None
-    return None if decided is None or decided.believed is UNSET else decided.believed
+    known = line.believed
+    if uplink:
+        known = line.uplinks[uplink].believed if line.uplinks is not UNSET and uplink in line.uplinks else UNSET
+    return None if known is UNSET else known
 
 
 def _is_on(uplink: str, camera: CameraDecision) -> bool:

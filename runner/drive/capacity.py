@@ -58,11 +58,8 @@ def capacity_problem(drive: Series, uplink: str = "") -> str | None:
 
     uplink  one of several; "": the vehicle has one
     """
-    if uplink not in (drive.uplinks or [""]):
-        known = f"has the uplinks {', '.join(drive.uplinks)}: uplink=NAME chooses one" if drive.uplinks else ""
-        return known or f"has no uplink {uplink}: the vehicle had one"
-    if uplink and not drive.uplinks[uplink].believed:
-        return f"has nothing that was believed of uplink {uplink}: needs rules that measure it (modes=safe)"
+    if problem := _uplink_problem(drive, uplink):
+        return problem
     if _believed(drive, uplink):
         return None if drive.positions else "has no positions"
     if not any(camera.received for camera in drive.cameras.values()):
@@ -70,6 +67,16 @@ def capacity_problem(drive: Series, uplink: str = "") -> str | None:
     if not drive.measured_t.size:
         return "has no measurements of the link: needs the vehicle's log, and rules that measure it (modes=safe)"
     return None if drive.positions else "has no positions"
+
+
+def _uplink_problem(drive: Series, uplink: str) -> str | None:
+    if drive.uplinks and uplink not in drive.uplinks:
+        return f"has the uplinks {', '.join(drive.uplinks)}: uplink=NAME chooses one"
+    if uplink and not drive.uplinks:
+        return f"has no uplink {uplink}: the vehicle had one"
+    if uplink and not drive.uplinks[uplink].believed:
+        return f"has nothing that was believed of uplink {uplink}: needs rules that measure it (modes=safe)"
+    return None
 
 
 def _believed(drive: Series, uplink: str) -> BelievedSeries | None:

@@ -16,7 +16,7 @@ import numpy as np
 from msgspec import UNSET
 
 from runner.core.events import BitratePredicted, Event, LinkMeasured, PositionReported
-from runner.drive.believed_series import BelievedSeries, believed_series
+from runner.drive.believed_series import BelievedSeries, Decisions, believed_series
 from runner.drive.camera_series import CameraSeries, camera_series
 from runner.drive.log import FILES
 from runner.drive.panels import Panel, panels
@@ -146,8 +146,7 @@ def _series(drive: Drive, label: str) -> Series:
         raise UserError(str(drive.path), "", None, "is empty: only the first line was logged")
     sides = {name: _Shifted(side.lines, side.began_s - began) for name, side in drive.sides.items()}
     vehicle, operator, link = (sides.get(name, _Shifted((), 0.0)) for name in ("vehicle", "operator", "link"))
-    decisions: Sequence[tuple[float, DecisionMade | VehicleState]]
-    decisions = vehicle.of(DecisionMade) or operator.of(VehicleState)
+    decisions: Decisions = vehicle.of(DecisionMade) or operator.of(VehicleState)
     if not decisions:
         raise UserError(str(drive.path), "", None, "contains no decision")
     config = leading.began.config
