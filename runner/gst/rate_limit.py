@@ -9,14 +9,16 @@ from runner.gst.source import fixed_rate
 
 GAP_S = 0.25  # without a picture, after which the rate is counted anew
 GAP_INTERVALS = 2.5  # and at least this many intervals
+LATER = 2**62  # running time at which a segment begins, ns: none ends there
 
 
 class RateLimit:
     """Makes `videorate drop-only=true` count its rate anew after a gap.
 
     It lets as many pictures through as were due since it began to count. So after a gap in the times of its pictures
-    it makes up for what is missing: until then all pictures of a faster camera pass. It begins anew with a new segment,
-    and GStreamer sends the present one again before the next picture when the offset of a pad changes, here by 1 ns.
+    it makes up for what is missing: until then all pictures of a faster camera pass. It begins anew with a segment in
+    which the picture that is due would be in the past (GStreamer before 1.24: with any), so it gets such a segment just
+    before its own. GStreamer sends that again, before the next picture, when the offset of a pad changes, here by 1 ns.
     The encoder goes on as before, without a key frame.
 
     fps  its rate, Hz
@@ -24,6 +26,8 @@ class RateLimit:
 
     def __init__(self, rate: Gst.Element, fps: float) -> None:
         self._rate, self._fps = rate, fps
+        self._above = rate.get_static_pad("sink").get_peer()
+        self._above.add_probe(Gst.PadProbeType.EVENT_DOWNSTREAM, _on_event)
         self._passed, self._passed_at = 0, 0.0
         self._allowance = Allowance()
 
@@ -39,9 +43,7 @@ class RateLimit:
             self._passed_at = now
 
     def _begin_anew(self) -> None:
-        above = self._rate.get_static_pad("sink").get_peer()
-        if above:
-            above.set_offset(above.get_offset() ^ 1)
+        self._above.set_offset(self._above.get_offset() ^ 1)
 
 
 class RateLimits:
@@ -60,3 +62,12 @@ class RateLimits:
         """As `RateLimit.look`."""
         for limit in self._limits:
             limit.look(now)
+
+
+def _on_event(pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
+    event = info.get_event()
+    if event.type == Gst.EventType.SEGMENT:
+        later = event.parse_segment().copy()
+        later.base = LATER
+        pad.get_peer().send_event(Gst.Event.new_segment(later))
+    return Gst.PadProbeReturn.OK
