@@ -15,6 +15,7 @@ EXPIRED = "SSL routines::certificate verify failed"
         (f"Client connection from 192.0.2.7 failed: error:0A000086:{EXPIRED}.", ("192.0.2.7", EXPIRED)),
         (f"OpenSSL Error[0]: error:0A000086:{EXPIRED}", (None, EXPIRED)),
         ("Client <unknown> disconnected, not authorised.", (None, "not authorised")),
+        ("Client auto-1-2 disconnected, not authorised.", (None, "not authorised")),
         ("OpenSSL Error[0]: error:0A000126:SSL routines::unexpected eof while reading", None),
         (f"OpenSSL Error while trying to get the error[0]: error:0A000086:{EXPIRED}", (None, EXPIRED)),
         ("Client auto-1-2 [192.0.2.7:51798] disconnected: not authorised.", ("192.0.2.7", "not authorised")),

@@ -43,7 +43,7 @@ CONNECTED = re.compile(r"New connection from (?P<address>\S+):\d+ on port ")
 REFUSED = re.compile(
     r"Client connection from (?P<address>\S+) failed: (?:error:\w*:)?(?P<failed>.*)"
     r"|OpenSSL Error[^[]*\[\d+\]: (?:error:\w*:)?(?P<tls>.*)"
-    r"|Client (?:<unknown> disconnected, |\S+ \[(?P<at>\S+):\d+\] disconnected: )(?P<why>not authorised)\."
+    r"|Client (?:\S+ disconnected, |\S+ \[(?P<at>\S+):\d+\] disconnected: )(?P<why>not authorised)\."
 )
 CONNECTION = re.compile("New c|Client |OpenSSL Error")
 LEFT = "unexpected eof"  # a client that ended the connection itself
@@ -151,7 +151,7 @@ def refusal(line: str) -> tuple[str | None, str] | None:
     """The address, if stated, and the reason of a line about a refused client; None: it is about none.
 
     mosquitto has two wordings for the same reason: it depends on whether the client's first bytes come at once.
-    From 2.1 on it words them otherwise, and a client that it no longer accepts as one that it never did.
+    Later versions name the client (2.0.21) or word it otherwise (2.1), also for one that they no longer accept.
     """
     refused = REFUSED.match(line)
     if refused is None or LEFT in line:
