@@ -9,6 +9,7 @@ python bench/bare.py watch URL...  receives every stream and decodes none; a lin
 from __future__ import annotations
 
 import json
+import re
 import sys
 import threading
 import time
@@ -66,8 +67,8 @@ def _receiver(number: int, url: str) -> Gst.Pipeline:
 def _on_frame(pad: Gst.Pad, info: Gst.PadProbeInfo, number: int) -> Gst.PadProbeReturn:
     now, meta = time.time(), info.get_buffer().get_reference_timestamp_meta(None)
     age_ms = 1000 * (now - meta.timestamp / Gst.SECOND + NTP_EPOCH_S) if meta else None
-    width = pad.get_current_caps().get_structure(0).get_int("width")[1]
-    sys.stdout.write(json.dumps([number, now, age_ms, width]) + "\n")
+    width = re.search(r"width=\(int\)(\d+)", pad.get_current_caps().to_string())
+    sys.stdout.write(json.dumps([number, now, age_ms, int(width[1]) if width else 0]) + "\n")
     sys.stdout.flush()
     return Gst.PadProbeReturn.OK
 

@@ -184,8 +184,10 @@ def _client(setup: Setup, transport: str = "udp+tcp") -> Iterator[tuple[list[Sam
         return Gst.PadProbeReturn.OK
 
     def on_message(_bus: Any, message: Any) -> Any:
-        if message.type in (Gst.MessageType.ERROR, Gst.MessageType.WARNING):
-            errors.append(message.get_structure().to_string())
+        kinds = Gst.MessageType
+        parse = {kinds.ERROR: message.parse_error, kinds.WARNING: message.parse_warning}.get(message.type)
+        if parse:
+            errors.append(parse()[0].message)
         return Gst.BusSyncReply.PASS
 
     pipeline.get_by_name("received").get_static_pad("src").add_probe(Gst.PadProbeType.BUFFER, on_unit)

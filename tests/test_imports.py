@@ -42,7 +42,7 @@ def loaded(*words: str) -> tuple[int, set[str]]:
 RUNNING = {  # modules of the project and heavy packages; `validate` reads maps and queries GStreamer's registry
     "print": (53, COMPOSING),
     "replay": (60, COMPOSING),
-    "validate": (132, COMPOSING | {"numpy", "gi"}),
+    "validate": (132, COMPOSING | {"numpy", "gi", "asyncio"}),  # asyncio: by PyGObject from 3.50 on
 }
 HELP = {
     "vehicle": {"paho"},

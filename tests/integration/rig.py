@@ -467,8 +467,10 @@ class Client:
         return self.gst.PadProbeReturn.OK
 
     def _on_message(self, _bus: Any, message: Any) -> Any:
-        if message.type in (self.gst.MessageType.ERROR, self.gst.MessageType.WARNING):
-            self.errors.append(message.get_structure().to_string())
+        kinds = self.gst.MessageType
+        parse = {kinds.ERROR: message.parse_error, kinds.WARNING: message.parse_warning}.get(message.type)
+        if parse:
+            self.errors.append(parse()[0].message)
         return self.gst.BusSyncReply.PASS
 
     def picture(self) -> Any:

@@ -43,6 +43,7 @@ def shown(bag, topic, form="RGB"):
     """The pictures that come out of GStreamer, and their times in ns."""
     from runner.gst import Gst
     from runner.gst.bag_feed import read_bag
+    from runner.gst.caps import structure
 
     sink = "appsink name=sink sync=false"
     line = f"appsrc name=bag format=time max-buffers=2 ! decodebin ! videoconvert ! video/x-raw,format={form} ! {sink}"
@@ -52,7 +53,7 @@ def shown(bag, topic, form="RGB"):
     pictures, times = [], []
     try:
         while sample := pipeline.get_by_name("sink").emit("try-pull-sample", 20 * Gst.SECOND):
-            caps, buffer = sample.get_caps().get_structure(0), sample.get_buffer()
+            caps, buffer = structure(sample.get_caps()), sample.get_buffer()
             width, height = caps.get_int("width")[1], caps.get_int("height")[1]
             data = np.frombuffer(buffer.extract_dup(0, buffer.get_size()), np.uint8).reshape(height, -1)
             pictures.append(data[:, : 3 * width].reshape(height, width, 3))

@@ -22,7 +22,7 @@ def printed(tod, *words):
 
 def start(line):
     return subprocess.Popen(
-        ["sh", "-c", f"exec gst-launch-1.0 -e -v {line}"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        ["sh", "-c", f"exec gst-launch-1.0 -v {line}"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )
 
 

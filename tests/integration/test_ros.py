@@ -118,6 +118,7 @@ def watched(plans, reported):
 def shown(picture):
     """A shared picture as GStreamer converts it, as RGB."""
     from runner.gst import Gst
+    from runner.gst.caps import structure
     from runner.gst.shared import push_shared
 
     pipeline = Gst.parse_launch(
@@ -128,7 +129,7 @@ def shown(picture):
     try:
         assert push_shared(pipeline.get_by_name("source"), replace(picture, captured=time.monotonic_ns()), Fraction(25))
         sample = pipeline.get_by_name("sink").emit("try-pull-sample", 20 * Gst.SECOND)
-        caps, buffer = sample.get_caps().get_structure(0), sample.get_buffer()
+        caps, buffer = structure(sample.get_caps()), sample.get_buffer()
         width, height = caps.get_int("width")[1], caps.get_int("height")[1]
         rows = np.frombuffer(buffer.extract_dup(0, buffer.get_size()), np.uint8).reshape(height, -1)
         return rows[:, : 3 * width].reshape(height, width, 3)

@@ -769,8 +769,7 @@ def test_requests_for_key_frames_reach_the_encoder_once_a_second():
     granted = []
 
     def note(_pad, info):
-        structure = info.get_event().get_structure()
-        if structure and structure.get_name() == "GstForceKeyUnit":
+        if info.get_event().has_name("GstForceKeyUnit"):
             granted.append(time.monotonic())
         return Gst.PadProbeReturn.OK
 

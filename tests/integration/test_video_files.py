@@ -111,7 +111,7 @@ def test_both_sides_store_what_they_send_and_receive(sides, tmp_path):
         whole = received[name].decoded >= received[name].frames - 1 and received[name].lost == 0
         found, count = decoded(tmp_path / f"video/{name}.operator.0.ts", whole)
         # A receiver that joins a running stream begins with the next parameter sets.
-        assert found == sizes or (not whole and found == sizes[1:])
+        assert found[-4:] == sizes or (not whole and found == sizes[1:])
         assert received[name].decoded - 2 <= count <= received[name].decoded + more
     assert not [line for line in sides.reported if "kept" in line or "slow" in line]
 
