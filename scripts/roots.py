@@ -37,8 +37,8 @@ PASSED = re.compile(
 FILES = ("/etc/resolv.conf", "/etc/pip.conf", "/usr/local/share/ca-certificates")
 APT = re.compile(r"Acquire::(https?|Check-|Retries|ForceIPv)", re.IGNORECASE)
 
-# A root directory, "net" for the network of this machine, recordings or nothing, and a command to run there. Commands
-# that make namespaces expect a mount at their root. The shell stays process 1, which waits for orphans.
+# A root directory, "net" for the network of this machine, recordings or nothing, and a command to run there. It becomes
+# the root of the mount namespace, into which nsenter leads. The shell stays process 1, which waits for orphans.
 ENTER = r"""
 set -eu
 root=$1 net=$2 data=$3
@@ -50,7 +50,10 @@ mount --rbind /dev "$root/dev"
 mount -t tmpfs -o mode=1777 shm "$root/dev/shm"
 if [ "$net" != net ]; then ip link set lo up; fi
 if [ -n "$data" ]; then mount --bind -o ro "$data" "$root/root/shared/data"; fi
-chroot "$root" "$@"
+cd "$root"
+pivot_root . .
+umount --lazy .
+chroot . "$@"
 exit $?
 """
 
