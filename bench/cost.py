@@ -87,7 +87,7 @@ def main() -> None:
 
 def rows(pairs: int = 5, seconds: float = 15, words: Sequence[str] = ()) -> list[Row]:
     """Medians of the pairs."""
-    costs = [(_bare([*WORDS, *words], seconds), _own([*WORDS, *words], seconds)) for _ in range(pairs)]
+    costs = [(bare_cost([*WORDS, *words], seconds), vehicle_cost([*WORDS, *words], seconds)) for _ in range(pairs)]
 
     def row(what: str, unit: str, key: str, *, compared: bool = True) -> Row:
         bare, own = (median(getattr(pair[side], key) for pair in costs) for side in (0, 1))
@@ -107,7 +107,8 @@ def rows(pairs: int = 5, seconds: float = 15, words: Sequence[str] = ()) -> list
 # --- the two servers --------------------------------------------------------------------------------------------------
 
 
-def _bare(words: Sequence[str], seconds: float) -> Cost:
+def bare_cost(words: Sequence[str], seconds: float) -> Cost:
+    """Of a bare server with the launch lines of a vehicle. words: the vehicle's overrides"""
     port = free_port()
     setup = _setup([*words, f"media.port={port}"])
     decision = decide(setup.vehicle, None)
@@ -129,7 +130,8 @@ def _bare(words: Sequence[str], seconds: float) -> Cost:
         return _measured(setup, server.pid, began, seconds, resize)
 
 
-def _own(words: Sequence[str], seconds: float) -> Cost:
+def vehicle_cost(words: Sequence[str], seconds: float) -> Cost:
+    """Of the vehicle's side. words: its overrides"""
     media, broker = free_port(), Endpoint("127.0.0.1", free_port())
     words = [*words, f"media.port={media}", f"control.port={broker.port}"]
     setup = _setup(words)
