@@ -37,13 +37,14 @@ PASSED = re.compile(
 FILES = ("/etc/resolv.conf", "/etc/pip.conf", "/usr/local/share/ca-certificates")
 APT = re.compile(r"Acquire::(https?|Check-|Retries|ForceIPv)", re.IGNORECASE)
 
-# A root directory, "net" for the network of this machine, recordings or nothing, and a command to run there. It becomes
-# the root of the mount namespace, into which nsenter leads. The shell stays process 1, which waits for orphans.
+# A root directory, "net" for the network of this machine, recordings or nothing, and a command to run there. A mount of
+# it becomes the root of the namespace, into which nsenter leads. The shell stays process 1, which waits for orphans.
 ENTER = r"""
 set -eu
 root=$1 net=$2 data=$3
 shift 3
-mount --bind "$root" "$root"
+mount --bind "$root" "$root/mnt"
+root=$root/mnt
 mount -t proc proc "$root/proc"
 mount -t sysfs sysfs "$root/sys"
 mount --rbind /dev "$root/dev"
