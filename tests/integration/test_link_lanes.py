@@ -223,9 +223,8 @@ def test_a_lane_is_cut_and_restored_while_another_goes_on():
         assert is_answered(begin, end) <= {comes}
         assert not [each for each in operator.arrivals if each.way == "a" and begin < each.sent and each.at < end]
     for _, begin, end in stretches[::2]:
-        first = next(at for way, number, at, _ in sent if way == "a" and at > begin and ("a", number) in arrived)
-        assert fate("a", first - 0.001, end) == (None, True)
-        assert is_answered(first, end) <= {True}
+        first = min(at for way, number, at, _ in sent if way == "a" and at > begin and ("a", number) in arrived)
+        assert (fate("a", first - 0.001, end), is_answered(first, end) <= {True}) == ((None, True), True)
     assert set(fates("b", 0, inf)) == {(None, True)}
     _, begin, end = stretches[1]
     assert of_a[-1][1].lost >= len(fates("a", begin, end))
