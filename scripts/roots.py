@@ -28,7 +28,7 @@ DATA = Path(os.environ.get("TOD_SHARED_DATA") or CHECKOUT.parent / "shared" / "d
 INSIDE, RECORDINGS = "/root/tod-runner", "/root/shared/data"  # the clone; where its tests expect recordings
 DEBOOTSTRAP_S = 1200.0
 SHOWN_S = 30.0  # a long step shows its last line so often
-TOOLS = ("debootstrap", "git", "ip", "setpriv", "unshare")
+TOOLS = ("debootstrap", "git", "ip", "pivot_root", "setpriv", "unshare")
 
 # Of the settings of this machine, what a root needs to reach the same network.
 PASSED = re.compile(

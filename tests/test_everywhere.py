@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.machinery
 import importlib.util
 import os
+import shutil
 import subprocess
 import uuid
 from collections.abc import Iterator
@@ -43,7 +44,7 @@ def marked(mark: str) -> list[str]:
     return subprocess.run(["pgrep", "-af", mark], capture_output=True, text=True, check=False).stdout.splitlines()
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="needs root")
+@pytest.mark.skipif(os.geteuid() != 0 or not shutil.which("pivot_root"), reason="needs root and pivot_root")
 def test_a_step_ends_with_all_that_it_started_and_leaves_nothing_mounted(roots, tmp_path: Path) -> None:
     root, mark = roots.Root(Path("/"), tmp_path), f"mark{uuid.uuid4().hex}"
     mounts = Path("/proc/mounts").read_text()

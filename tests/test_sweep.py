@@ -110,8 +110,9 @@ def test_without_the_flag_a_comma_is_an_error(tod: Command, verb: str) -> None:
 # --- flags ------------------------------------------------------------------------------------------------------------
 
 
-def test_every_flag_of_hydra_has_an_answer(tod: Command, tmp_path: Path) -> None:
-    """One line and status 2, with and without a verb; --help and --version are supported, and -m by three verbs."""
+@pytest.mark.skipif(sys.version_info >= (3, 14), reason="Hydra 1.3 cannot show its help there")
+def test_all_flags_of_hydra_are_known(tmp_path: Path) -> None:
+    """--help and --version are supported, and -m by three verbs."""
     app = tmp_path / "app.py"
     app.write_text("import hydra\n\n\n@hydra.main(version_base=None, config_path=None)\ndef app(_): ...\n\n\napp()\n")
     command = [sys.executable, app, "--hydra-help"]
@@ -119,6 +120,10 @@ def test_every_flag_of_hydra_has_an_answer(tod: Command, tmp_path: Path) -> None
     known = {flag for flags in re.findall(r"(?m)^(-\S+)", listed) for flag in flags.strip(":").split(",")}
     answered = {flag for flags in HYDRA_FLAGS for flag in flags}
     assert known - {"--help", "-h", "--version", "-m"} == answered
+
+
+def test_every_flag_of_hydra_has_an_answer(tod: Command) -> None:
+    """One line and status 2, with and without a verb."""
     for flags, instead in HYDRA_FLAGS.items():
         for flag in flags:
             expected = (2, "", f"command line: {flag}: flags are not supported; {instead}\n")
