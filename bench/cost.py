@@ -43,7 +43,7 @@ from runner.verbs.print import decide
 WORDS = ("vehicle=delivery_robot", "source=test", "mode=single", "modes=open_loop", "pqos=constant", "pqos.kbps=3000")
 SETTLE_S = 3.0
 SIZES = (0.75, 0.5)  # scaling factors that alternate, for the time until a new size arrives
-RESIZE_S = 0.7
+RESIZES, RESIZE_S = 20, 0.7
 WAIT_S = 30.0
 HERE = Path(__file__).parent
 
@@ -107,7 +107,7 @@ def rows(pairs: int = 5, seconds: float = 15, words: Sequence[str] = ()) -> list
 # --- the two servers --------------------------------------------------------------------------------------------------
 
 
-def bare_cost(words: Sequence[str], seconds: float) -> Cost:
+def bare_cost(words: Sequence[str], seconds: float, resizes: int = RESIZES) -> Cost:
     """Of a bare server with the launch lines of a vehicle. words: the vehicle's overrides"""
     port = free_port()
     setup = _setup([*words, f"media.port={port}"])
@@ -127,10 +127,10 @@ def bare_cost(words: Sequence[str], seconds: float) -> Cost:
             for element, key, value in assignments(camera, "size", size):
                 write_line(server.stdin, [name, element, key, str(value)])  # type: ignore[arg-type]
 
-        return _measured(setup, server.pid, began, seconds, resize)
+        return _measured(setup, server.pid, began, seconds, resizes, resize)
 
 
-def vehicle_cost(words: Sequence[str], seconds: float) -> Cost:
+def vehicle_cost(words: Sequence[str], seconds: float, resizes: int = RESIZES) -> Cost:
     """Of the vehicle's side. words: its overrides"""
     media, broker = free_port(), Endpoint("127.0.0.1", free_port())
     words = [*words, f"media.port={media}", f"control.port={broker.port}"]
@@ -146,13 +146,13 @@ def vehicle_cost(words: Sequence[str], seconds: float) -> Cost:
                 reply = operator.ask(f"{next(numbers)}", event="camera_configured", camera=name, scaling=scaling)
                 assert reply["result"] == "applied", reply
 
-            return _measured(setup, side.pid, began, seconds, resize)
+            return _measured(setup, side.pid, began, seconds, resizes, resize)
 
 
 # --- measuring --------------------------------------------------------------------------------------------------------
 
 
-def _measured(setup: Setup, pid: int, began: float, seconds: float, resize: Any) -> Cost:
+def _measured(setup: Setup, pid: int, began: float, seconds: float, resizes: int, resize: Any) -> Cost:
     names = list(setup.vehicle.cameras)
     urls = [f"rtsp://127.0.0.1:{setup.media.port}/{name}" for name in names]
     frames: list[Frame] = []
@@ -167,16 +167,16 @@ def _measured(setup: Setup, pid: int, began: float, seconds: float, resize: Any)
         took_s, cores = time.time() - start, (processor_s(pid) - used_s) / (time.time() - start)
         received = [frame for frame in list(frames) if start <= frame.t < start + took_s]
         memory = memory_mb(pid)
-        reaction = _reaction(names, frames, resize)
+        reaction = _reaction(names, frames, resizes, resize)
     due = sum(float(camera.fps) for camera in setup.vehicle.cameras.values()) * took_s
     ages = [frame.age_ms for frame in received if frame.age_ms is not None]
     return Cost(cores, memory, median(ages), max(first.values()) - began, reaction, len(received) / due)
 
 
-def _reaction(names: Sequence[str], frames: list[Frame], resize: Any) -> float:
+def _reaction(names: Sequence[str], frames: list[Frame], resizes: int, resize: Any) -> float:
     """Median ms from the request for a new size of the first camera until a picture of another width arrives."""
     waits = []
-    for number in range(20):
+    for number in range(resizes):
         before = next(frame.width for frame in reversed(list(frames)) if frame.stream == 0)
         began = time.time()
         resize(names[0], SIZES[number % 2])

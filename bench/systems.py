@@ -1,6 +1,6 @@
 """What the vehicle's side costs on other systems, compared with the first one, in turns on one machine; as root.
 
-  python bench/systems.py "Debian 12=/" "Debian 13=ROOT" "testing=ROOT"     five rounds of 15 s: three minutes a system
+  python bench/systems.py "Debian 12=/" "Debian 13=ROOT" "testing=ROOT"     five rounds of 15 s: four minutes a system
 
 A system is a name and a root directory that `scripts/everywhere --steps "setup for tests" --keep` leaves, or / for this
 one. A bare GStreamer RTSP server with the same launch lines (bench/cost.py) runs there too: what it takes more is
@@ -59,8 +59,8 @@ def main() -> None:
 def measured(seconds: float) -> dict[str, dict[str, float]]:
     """The vehicle's side and a bare server, on this system."""
     return {
-        "own": cost.vehicle_cost(cost.WORDS, seconds)._asdict(),
-        "bare": cost.bare_cost(cost.WORDS, seconds)._asdict(),
+        "own": cost.vehicle_cost(cost.WORDS, seconds, resizes=1)._asdict(),
+        "bare": cost.bare_cost(cost.WORDS, seconds, resizes=1)._asdict(),
     }
 
 
