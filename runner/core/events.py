@@ -7,7 +7,7 @@ from the classes below: from their docstrings, and the limits and notes in their
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from enum import StrEnum
 from fractions import Fraction
@@ -15,6 +15,7 @@ from typing import Annotated, Any, NamedTuple, get_args
 
 from runner.core.limits import Count, Limits, NonNegative, Share
 from runner.core.model import Kbps, Mode, Roi, exact, plain
+from runner.core.roles import Role
 
 LEAST_ERROR = 0.01  # of a prediction's deviation
 Rate = Annotated[Kbps, Limits(0)]
@@ -22,6 +23,11 @@ Latitude = Annotated[float, Limits(-90, 90)]
 Longitude = Annotated[float, Limits(-180, 180)]
 Steering = Annotated[float, Limits(-1.5, 1.5)]
 CameraName = Annotated[str, Limits(1), "name of a camera of the vehicle"]
+Asker = Annotated[str, Limits(1), "its id; the vehicle takes it from the topic of the request"]
+
+
+class Refused(Exception):
+    """A well-formed event cannot be accepted now; the text gives the reason and the valid values."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -200,7 +206,51 @@ class SourceReported(_Event):
 class ControlPassed(_Event):
     """Another operator is in control; measurements of the previous one are no longer valid."""
 
-    operator: Annotated[str, 'its id; "": none is present']
+    operator: Annotated[str, 'its id; "": none']
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ControlRequested(_Event):
+    """An operator asks for control: it gets that of a free vehicle at once, else the holder sees that it asks."""
+
+    operator: Asker
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ControlOffered(_Event):
+    """The operator in control offers it to another one, which then receives the pictures, too."""
+
+    operator: Asker
+    to: Annotated[str, 'id of the other; "": the offer is withdrawn']
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ControlAccepted(_Event):
+    """An operator accepts the offer made to it: it is in control once it sees every camera that is sent."""
+
+    operator: Asker
+    live: Annotated[tuple[str, ...], "the cameras whose pictures have been live at its station for 1 s or longer"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ControlReleased(_Event):
+    """An operator gives up what it has: control of a vehicle that stands, an offer made to it, or its request."""
+
+    operator: Asker
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ControlTaken(_Event):
+    """A supervisor takes control, whoever has it, also while the vehicle moves."""
+
+    operator: Asker
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ControlRestored(_Event):
+    """The vehicle has restarted; the operator that was in control before counts as lost until it returns."""
+
+    operator: Annotated[str, Limits(1), "its id"]
 
 
 class Attention(StrEnum):
@@ -222,17 +272,36 @@ class AttentionChanged(_Event):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OperatorConnected(_Event):
-    """The operator's side is connected.
+    """An operator's side is connected.
 
+    operator   its id; the vehicle takes it from the topic of the request. Absent: not stated, as in earlier logs
+    role       by its keys, stated by the vehicle; without keys everybody is a supervisor
     attention  stated by the operator's page with its heartbeat; the vehicle derives `AttentionChanged` from it
     """
 
+    operator: str | None = None
+    role: Role | None = None
     attention: Attention | None = None
+
+
+class Departure(StrEnum):
+    """How an operator has left."""
+
+    SIGNED_OFF = "signed off"
+    SILENT = "has been silent for 1 s"
+    DISCONNECTED = "its connection broke"
+    WITHDRAWN = "its keys were withdrawn"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OperatorDisconnected(_Event):
-    """The operator's side has disconnected, or the control link to it is lost."""
+    """An operator's side has disconnected, or the control link to it is lost.
+
+    operator, departure  stated by the vehicle, as `operator` of `OperatorConnected`
+    """
+
+    operator: str | None = None
+    departure: Departure | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -255,6 +324,12 @@ Event = (
     | CopiesCounted
     | SourceReported
     | ControlPassed
+    | ControlRequested
+    | ControlOffered
+    | ControlAccepted
+    | ControlReleased
+    | ControlTaken
+    | ControlRestored
     | AttentionChanged
     | OperatorConnected
     | OperatorDisconnected
@@ -268,10 +343,19 @@ OWN = (
     CopiesCounted,
     SourceReported,
     ControlPassed,
+    ControlRestored,
     AttentionChanged,
 )  # made by the vehicle itself; no operator may request them
 NAMES = {kind: name for name, kind in EVENTS.items()}
 
+_WORDS: Mapping[str, Callable[[Any], Any]] = {
+    "mode": Mode,
+    "state": LinkState,
+    "attention": Attention,
+    "role": Role,
+    "departure": Departure,
+    "live": tuple,
+}
 _EXACT = ("kbps", "lower_kbps", "scaling")
 _ROI = ("x", "y", "width", "height")
 
@@ -283,12 +367,10 @@ def parse(document: Mapping[str, Any]) -> Event:
     for key in _EXACT:
         if key in values:
             values[key] = exact(values[key])
-    if "attention" in values:
-        values["attention"] = Attention(values["attention"])
-    if kind is ModeSelected:
-        values["mode"] = Mode(values["mode"])
-    elif kind is LinkMeasured:
-        values["state"] = LinkState(values["state"])
+    for key, kind_of in _WORDS.items():
+        if key in values:
+            values[key] = kind_of(values[key])
+    if kind is LinkMeasured:
         values["evidence"] = Evidence(**values["evidence"])
     elif kind is RoiSet:
         values["roi"] = Roi(*(int(values.pop(key)) for key in _ROI))
@@ -308,6 +390,8 @@ def to_json(event: Event) -> dict[str, Any]:
             document |= {key: getattr(value, key) for key in _ROI}
         elif isinstance(value, Evidence):
             document[name] = value._asdict()
+        elif isinstance(value, tuple):
+            document[name] = list(value)
         elif isinstance(value, Mapping):
             document[name] = {camera: plain(Fraction(of)) for camera, of in value.items()}
         else:

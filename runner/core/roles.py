@@ -11,6 +11,7 @@ class Role(StrEnum):
     VEHICLE = "vehicle"
     BROKER = "broker"
     CONTROLLER = "controller"  # an operator who may drive
+    SUPERVISOR = "supervisor"  # one who may also take control from another
     WATCHER = "watcher"  # sees what the operator sees
     PREDICTOR = "predictor"  # pQoS
     POSITIONER = "positioner"  # localisation and odometry, where they are not on the vehicle
@@ -20,16 +21,19 @@ PRESENCE = frozenset({"operator_connected", "operator_disconnected"})
 DRIVER_EVENTS = frozenset(
     {"mode_selected", "total_set", "camera_switched", "roi_set", "camera_configured", "weights_set"}
 )
+CONTROL_EVENTS = frozenset({"control_requested", "control_offered", "control_accepted", "control_released"})
 MAY_REQUEST: dict[Role, frozenset[str]] = {
-    Role.CONTROLLER: PRESENCE | DRIVER_EVENTS,
+    Role.CONTROLLER: PRESENCE | DRIVER_EVENTS | CONTROL_EVENTS,
+    Role.SUPERVISOR: PRESENCE | DRIVER_EVENTS | CONTROL_EVENTS | {"control_taken"},
     Role.WATCHER: PRESENCE,
     Role.PREDICTOR: frozenset({"bitrate_predicted"}),
     Role.POSITIONER: frozenset({"position_reported", "steering_reported"}),
     Role.VEHICLE: frozenset(),
     Role.BROKER: frozenset(),
 }
-VIEWERS = (Role.CONTROLLER, Role.WATCHER)  # those that see pictures
-PEOPLE = (Role.CONTROLLER, Role.WATCHER, Role.PREDICTOR, Role.POSITIONER)  # those that may request anything
+DRIVERS = (Role.CONTROLLER, Role.SUPERVISOR)  # those that may be in control
+VIEWERS = (*DRIVERS, Role.WATCHER)  # those that see pictures
+PEOPLE = (*VIEWERS, Role.PREDICTOR, Role.POSITIONER)  # those that may request anything
 
 
 def denial(role: Role | None, event: str) -> str | None:

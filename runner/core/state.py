@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from dataclasses import dataclass, field, fields, replace
 from fractions import Fraction
 from operator import attrgetter
 from typing import Any, assert_never
 
+from runner.core import driving as dr
 from runner.core import events as ev
 from runner.core.decision import NOTHING, Decision
+from runner.core.events import Refused
 from runner.core.model import SMALLEST_SIDE_PX, Camera, Kbps, Mode, Roi, Vehicle, plain
 from runner.errors import suggest
-
-
-class Refused(Exception):
-    """A well-formed event cannot be accepted now; the text gives the reason and the valid values."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +47,8 @@ class State:
     steering: ev.SteeringReported | None = None
     copies: Mapping[str, int] = field(default_factory=lambda: NOTHING)  # that leave the vehicle; 1 for others
     lost: Mapping[str, str] = field(default_factory=lambda: NOTHING)  # why its source cannot be opened
+    driving: dr.Driving = field(default_factory=dr.Driving)
+    motion: dr.Motion = field(default_factory=dr.Motion)
 
     @staticmethod
     def initial(vehicle: Vehicle, mode: Mode) -> State:
@@ -142,18 +142,35 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
             return {"copies": copies}
         case ev.OperatorConnected():
             since = event.t if state.operator_since is None else state.operator_since
-            return {"operator_since": since, "operator_lost": None}
+            return {"operator_since": since, "operator_lost": None, **_driving(state, event)}
         case ev.OperatorDisconnected():
-            changes = {"operator_since": None, "operator_lost": event.t, "attention": None}
-            return {**changes, "link": None, "links": NOTHING} if state.operator_lost is None else {}
+            changes = _driving(state, event)
+            if changes["driving"].present or state.operator_lost is not None:
+                return changes
+            gone = {"operator_since": None, "operator_lost": event.t, "attention": None}
+            return {**changes, **gone, "link": None, "links": NOTHING}
         case ev.PositionReported():
-            return {"position": event}
+            motion = state.motion.after(event)
+            return {"position": event, "motion": motion, **_driving(replace(state, motion=motion), event)}
         case ev.SteeringReported():
             return {"steering": event}
-        case ev.ClockAdvanced():
-            return {}
+        case (
+            ev.ControlRequested()
+            | ev.ControlOffered()
+            | ev.ControlReleased()
+            | ev.ControlTaken()
+            | ev.ControlRestored()
+            | ev.ClockAdvanced()
+        ):
+            return _driving(state, event)
+        case ev.ControlAccepted():
+            return _driving(state, event, {name for name, setting in in_force.settings.items() if setting.sending})
         case _:
             assert_never(event)
+
+
+def _driving(state: State, event: ev.Event, sent: Set[str] = frozenset()) -> dict[str, Any]:
+    return {"driving": dr.advance(state.driving, state.motion, event, sent)}
 
 
 def _manual(state: State, in_force: Decision, name: str, is_sent: bool) -> Mapping[str, Manual]:

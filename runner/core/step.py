@@ -10,10 +10,10 @@ from types import MappingProxyType
 from runner.core import rules
 from runner.core.commands import Command, KnobValues, after, difference
 from runner.core.decision import Decision
-from runner.core.events import CameraSwitched, Event, ModeSelected, SourceReported
+from runner.core.events import CameraSwitched, Event, ModeSelected, Refused, SourceReported
 from runner.core.model import Mode, Vehicle
 from runner.core.rules import Memories
-from runner.core.state import Refused, State, advance, keep
+from runner.core.state import State, advance, keep
 
 NOTHING: Mapping[str, KnobValues] = MappingProxyType({})
 

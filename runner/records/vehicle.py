@@ -10,6 +10,7 @@ from msgspec import UNSET, UnsetType
 
 from runner.core.commands import KnobValues
 from runner.core.decision import NOTHING, Believed, Setting
+from runner.core.driving import Driving
 from runner.core.events import (
     Attention,
     Latitude,
@@ -83,6 +84,7 @@ class VehicleState:
     online: Annotated[bool, "false: the vehicle is offline, and its state unknown"] = True
     attention: Annotated[Attention | UnsetType, "of the driver; absent: the operator in control states none"] = UNSET
     operator: Annotated[str | UnsetType, "id of the operator in control; absent: none"] = UNSET
+    driving: Annotated[Driving | UnsetType, "absent: by an earlier version"] = UNSET
     certificate_ends: Annotated[
         float | UnsetType, "when the certificate of the vehicle expires, s since 1970; absent: it has none"
     ] = UNSET

@@ -162,6 +162,7 @@ def vehicle_state(
         run.fault,
         attention=run.state.attention or UNSET,
         operator=operator or UNSET,
+        driving=run.state.driving,
         believed=decision.believed or UNSET,
         uplinks=uplinks_decided(decision),
     )

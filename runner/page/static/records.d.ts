@@ -45,6 +45,30 @@ export interface CameraState {
   slow_fps?: number;
 }
 
+/** Who drives the vehicle, by its own account */
+export interface Driving {
+  /** lost: the holder has gone, so nobody is in control until it returns */
+  state: "free" | "held" | "lost";
+  /** id of the operator that is in control, or was until it was lost; null: free */
+  holder: string | null;
+  /** t from which this holder has been in this state, s */
+  since: number;
+  /** id of the operator to whom the holder offers control; null: no offer */
+  offered: string | null;
+  /** t at which the offer ends unless it is accepted; null: no offer */
+  offer_ends: number | null;
+  /** ids of the operators that ask for control, in this order */
+  requested: (string)[];
+  /** roles of the operators that are connected, by id */
+  present: Record<string, "vehicle" | "broker" | "controller" | "supervisor" | "watcher" | "predictor" | "positioner">;
+  /** who has released control, and does not get it again without asking */
+  released: string | null;
+  /** whether the vehicle is known to stand, so that control may be released */
+  standing: boolean;
+  /** the last change, in words */
+  why: string;
+}
+
 /** What is believed of the uplink, and what predictions of it have proved to be worth; see `runner.core.belief` */
 export interface Believed {
   /** capacity, kbit/s of video, as predictions are */
@@ -96,6 +120,8 @@ export interface VehicleState {
   attention?: "watching" | "unfocused" | "slow" | "hidden" | "absent";
   /** id of the operator in control; absent: none */
   operator?: string;
+  /** absent: by an earlier version */
+  driving?: Driving;
   /** when the certificate of the vehicle expires, s since 1970; absent: it has none */
   certificate_ends?: number;
   /** of the uplink; absent: nothing */
