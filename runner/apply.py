@@ -226,10 +226,10 @@ class VehicleSide:
         """By camera and uplink, what was sent, see `runner.gst.uplinks`."""
         return self._uplinks.counts() if self._uplinks else {}
 
-    def give_control(self, operator: str) -> None:
-        """Set which operator is in control, "" for none: its viewers are always admitted, see `runner.gst.viewers`."""
+    def give_control(self, drivers: Sequence[str]) -> None:
+        """Set who drives, or is about to: their viewers are always admitted, see `runner.gst.viewers`."""
         if self._server:
-            self._server.admission.controller = operator
+            self._server.admission.give_control(drivers)
 
     def push(self, camera: str, frame: Any, form: str | None = None, captured: float | None = None) -> bool:
         """Push a frame of a camera whose frames come from Python; see `runner.live.LiveVehicle`."""

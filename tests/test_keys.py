@@ -460,10 +460,12 @@ def test_a_name_has_one_role(tmp_path, capsys):
 
 # --- roles x events ---------------------------------------------------------------------------------------------------
 
-OWN = ("link_measured", "copies_counted", "source_reported", "control_passed", "attention_changed", "clock_advanced")
+OWN = ("link_measured", "copies_counted", "source_reported", "control_passed", "control_restored", "attention_changed")
 PRESENCE = ("operator_connected", "operator_disconnected")
+DRIVEN = {*EVENTS} - {*OWN, "clock_advanced", "bitrate_predicted", "position_reported", "steering_reported"}
 ALLOWED = {
-    Role.CONTROLLER: {*EVENTS} - {*OWN, "bitrate_predicted", "position_reported", "steering_reported"},
+    Role.CONTROLLER: DRIVEN - {"control_taken"},
+    Role.SUPERVISOR: DRIVEN,
     Role.WATCHER: {*PRESENCE},
     Role.PREDICTOR: {"bitrate_predicted"},
     Role.POSITIONER: {"position_reported", "steering_reported"},
@@ -481,7 +483,7 @@ def test_requests_that_roles_may_make(role, event):
 
 def test_a_denial_names_the_permitted_roles():
     assert set(MAY_REQUEST) == set(Role)
-    assert denial(Role.WATCHER, "total_set") == "a watcher may not request total_set; only controller may"
+    assert denial(Role.WATCHER, "total_set") == "a watcher may not request total_set; only controller or supervisor may"
     assert denial(Role.WATCHER, "clock_advanced").endswith("; only the vehicle generates it")
     assert denial(None, "total_set") == "unknown operator: not listed in the vehicle's keys"
 

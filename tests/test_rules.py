@@ -363,9 +363,7 @@ EVENTS: dict[str, dict[str, st.SearchStrategy[Any]]] = {
     "copies_counted": {"copies": st.dictionaries(st.sampled_from(list(TUM.cameras)), st.sampled_from([1, 2, 3]))},
     "source_reported": {**FRONT_LEFT, "works": st.booleans(), "reason": st.just("no such device")},
     "control_passed": {"operator": st.sampled_from(["a", "b", ""])},
-    **dict.fromkeys(
-        ("control_requested", "control_released", "control_taken", "control_restored"), {"operator": st.just("a")}
-    ),
+    **{f"control_{kind}": {"operator": st.just("a")} for kind in ("requested", "released", "taken", "restored")},
     "control_offered": {"operator": st.just("a"), "to": st.sampled_from(["b", ""])},
     "control_accepted": {"operator": st.just("b"), "live": st.just([])},
     "attention_changed": {"attention": st.sampled_from(list(map(str, Attention)))},

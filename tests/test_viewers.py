@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from runner.gst.viewers import StreamViewer, admit, operator_of, over_uplink, user_agent
+from runner.gst.viewers import StreamViewer, admit, operator_of, over_uplink, too_many, user_agent
 
 LOCAL, ANNA, BERT, ANYONE = (
     StreamViewer("127.0.0.1"),
@@ -31,33 +31,53 @@ def test_only_loopback_costs_no_uplink(address, leaves):
 
 
 @pytest.mark.parametrize(
-    ("viewers", "newcomer", "limit", "controller", "leaving"),
+    ("viewers", "newcomer", "limit", "drivers", "leaving"),
     [
-        ([], ANYONE, 1, "", []),
-        ([ANYONE], LOCAL, 1, "", []),
-        ([LOCAL, LOCAL], ANYONE, 1, "", []),
-        ([ANYONE], BERT, 1, "", None),
-        ([ANYONE], ANYONE, 2, "", []),
-        ([ANYONE, BERT], ANYONE, 2, "", None),
-        ([ANYONE], BERT, 1, "anna", None),
-        ([BERT], ANNA, 1, "anna", [BERT]),
-        ([ANYONE, BERT], ANNA, 2, "anna", [BERT]),  # the newest
-        ([ANNA], BERT, 1, "anna", None),
-        ([ANNA, BERT], ANNA, 2, "anna", [BERT]),
-        ([ANNA], ANNA, 1, "anna", [ANNA]),  # whose address changed
+        ([], ANYONE, 1, (), []),
+        ([ANYONE], LOCAL, 1, (), []),
+        ([LOCAL, LOCAL], ANYONE, 1, (), []),
+        ([ANYONE], BERT, 1, (), None),
+        ([ANYONE], ANYONE, 2, (), []),
+        ([ANYONE, BERT], ANYONE, 2, (), None),
+        ([ANYONE], BERT, 1, ("anna",), None),
+        ([BERT], ANNA, 1, ("anna",), [BERT]),
+        ([ANYONE, BERT], ANNA, 2, ("anna",), [BERT]),  # the newest
+        ([ANNA], BERT, 1, ("anna",), None),
+        ([ANNA, BERT], ANNA, 2, ("anna",), [BERT]),
+        ([ANNA], ANNA, 1, ("anna",), [ANNA]),  # whose address changed
         (
             [ANYONE],
             StreamViewer("192.0.2.9"),
             1,
-            "",
+            (),
             None,
         ),  # without a controller, an anonymous viewer is not taken for it
-        ([LOCAL, ANYONE], ANNA, 1, "anna", [ANYONE]),
-        ([ANYONE, ANYONE._replace(since=1)], ANNA, 2, "anna", [ANYONE._replace(since=1)]),
+        ([LOCAL, ANYONE], ANNA, 1, ("anna",), [ANYONE]),
+        ([ANNA], BERT, 1, ("anna", "bert"), []),  # control is offered to him
+        ([ANNA, ANYONE], BERT, 2, ("anna", "bert"), [ANYONE]),
+        ([ANNA, ANYONE], BERT, 3, ("anna", "bert"), []),
+        ([ANNA, BERT], BERT, 1, ("anna", "bert"), [BERT]),  # whose address changed
+        ([ANNA], ANYONE, 1, ("anna", "bert"), None),
+        ([ANYONE, ANYONE._replace(since=1)], ANNA, 2, ("anna",), [ANYONE._replace(since=1)]),
     ],
 )
-def test_which_viewers_are_admitted_and_which_are_disconnected(viewers, newcomer, limit, controller, leaving):
-    assert admit(viewers, newcomer, limit, controller) == leaving
+def test_which_viewers_are_admitted_and_which_are_disconnected(viewers, newcomer, limit, drivers, leaving):
+    assert admit(viewers, newcomer, limit, drivers) == leaving
+
+
+@pytest.mark.parametrize(
+    ("viewers", "limit", "drivers", "leaving"),
+    [
+        ([ANNA, BERT], 1, ("anna", "bert"), []),
+        ([ANNA, BERT], 1, ("bert",), [ANNA]),  # he has accepted control
+        ([ANNA, BERT], 1, ("anna",), [BERT]),  # he has declined it
+        ([ANNA, BERT], 2, ("anna",), []),
+        ([ANNA, LOCAL], 1, ("bert",), []),
+        ([ANYONE, ANNA, BERT], 2, ("bert",), [ANNA]),
+    ],
+)
+def test_who_leaves_once_control_has_passed(viewers, limit, drivers, leaving):
+    assert too_many(viewers, limit, drivers) == leaving
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,6 @@ from enum import StrEnum
 from math import inf
 from typing import Annotated
 
-from runner.core.decision import NOTHING
 from runner.core.events import (
     NAMES,
     ClockAdvanced,
@@ -60,7 +59,7 @@ class Driving:
     offer_ends: Annotated[float | None, "t at which the offer ends unless it is accepted; None: no offer"] = None
     requested: Annotated[tuple[str, ...], "ids of the operators that ask for control, in this order"] = ()
     present: Annotated[Mapping[str, Role], "roles of the operators that are connected, by id"] = field(
-        default_factory=lambda: NOTHING
+        default_factory=dict
     )
     released: Annotated[str | None, "who has released control, and does not get it again without asking"] = None
     standing: Annotated[bool, "whether the vehicle is known to stand, so that control may be released"] = False
@@ -70,6 +69,11 @@ class Driving:
     def in_control(self) -> str:
         """The operator that is in control, "" for none."""
         return self.holder if self.state is Control.HELD and self.holder else ""
+
+    @property
+    def drivers(self) -> tuple[str, ...]:
+        """The operators that need pictures most: the holder, also while it is lost, and whom control is offered to."""
+        return tuple(name for name in (self.holder, self.offered) if name)
 
 
 @dataclass(frozen=True, slots=True)

@@ -289,7 +289,6 @@ class Departure(StrEnum):
 
     SIGNED_OFF = "signed off"
     SILENT = "has been silent for 1 s"
-    DISCONNECTED = "its connection broke"
     WITHDRAWN = "its keys were withdrawn"
 
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from gi.repository import GstRtsp, GstRtspServer
 
 from runner.gst.clients import Clients
+from runner.gst.connections import RtspConnection
 from runner.gst.opening import ServedCameras
 from runner.gst.rtsp_requests import user_agent, wants_udp
 from runner.gst.sessions import end, set_up, transports
-from runner.gst.viewers import admit, operator_of
+from runner.gst.viewers import admit, operator_of, too_many
 
 if TYPE_CHECKING:
     from runner.gst.secure import ViewerCheck
@@ -22,6 +24,7 @@ OK, FORBIDDEN, REFUSED, UNAVAILABLE, NOT_NOW = (
     GstRtsp.RTSPStatusCode.SERVICE_UNAVAILABLE,
     GstRtsp.RTSPStatusCode.METHOD_NOT_VALID_IN_THIS_STATE,
 )
+ONE_MORE = "it was admitted until control was handed over"
 
 
 class Admission:
@@ -30,7 +33,7 @@ class Admission:
     keys         None: anyone may watch
     max_viewers  of a camera over the uplink
 
-    `controller` is the operator in control, "" for none: see `runner.gst.viewers`.
+    `drivers` are those that are always admitted: see `runner.gst.viewers`.
     """
 
     def __init__(
@@ -42,7 +45,19 @@ class Admission:
     ) -> None:
         self._cameras, self._clients, self._keys = cameras, clients, keys
         self._max_viewers, self._changed = max_viewers, clients.changed
-        self.controller = ""
+        self.drivers: tuple[str, ...] = ()
+
+    def give_control(self, drivers: Sequence[str]) -> None:
+        """Admit others from now on, and disconnect those that were admitted as a second one. From any thread."""
+        with self._changed:
+            self.drivers = tuple(drivers)
+            watching = {name: self._clients.watching(name) for name in self._cameras.named}
+        surplus = set[RtspConnection]()
+        for connections in watching.values():
+            leaving = too_many([c.viewer for c in connections], self._max_viewers, self.drivers)
+            surplus |= {connection for connection in connections if connection.viewer in leaving}
+        for connection in surplus:
+            self._clients.disconnect(connection, f"{ONE_MORE}: media.max_viewers={self._max_viewers}")
 
     def on_setup(self, client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext) -> GstRtsp.RTSPStatusCode:
         """Admit a viewer, or refuse it for its keys, or because its copy of the stream would overload the uplink."""
@@ -66,7 +81,7 @@ class Admission:
             current = self._clients.watching(camera.name)
             viewers = [c.viewer for c in current]
             is_admitted = new_viewer in current
-            leaving = [] if is_admitted else admit(viewers, new_viewer.viewer, self._max_viewers, self.controller)
+            leaving = [] if is_admitted else admit(viewers, new_viewer.viewer, self._max_viewers, self.drivers)
             if leaving is None:
                 return REFUSED
             new_viewer.cameras.setdefault(camera.name, None)
@@ -74,7 +89,7 @@ class Admission:
                 new_viewer.refused_udp.add(camera.name)  # until it is set up
         for connection in current:
             if connection.viewer in leaving:
-                why = f"the operator in control watches from {new_viewer.viewer.address}"
+                why = f"the operator that drives watches from {new_viewer.viewer.address}"
                 self._clients.disconnect(connection, why)
         return OK
 

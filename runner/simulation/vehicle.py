@@ -8,13 +8,15 @@ from dataclasses import dataclass, field
 
 from msgspec import UNSET
 
-from runner.core.events import ClockAdvanced, ControlPassed, Event, OperatorConnected, OperatorDisconnected
+from runner.core.events import ClockAdvanced, ControlPassed, Departure, Event
+from runner.core.roles import Role
 from runner.core.step import Run, start, step
 from runner.errors import RunError
 from runner.pqos import Predictions
 from runner.records.reception import ReceptionReport, ReceptionReported, SentFrame
 from runner.settings import Setup
 from runner.simulation.encoder import Encoder
+from runner.vehicle.noticed import presence_events
 from runner.vehicle.operators import Operators
 from runner.vehicle.repair import KeyFrames
 from runner.vehicle.sending import SendingTimes
@@ -36,7 +38,6 @@ class SimulatedVehicle:
     on_report: Callable[[ReceptionReported], None]
     _sent: deque[tuple[str, SentFrame]] = field(default_factory=deque)  # that were not looked at yet
     _key_frames: KeyFrames = field(default_factory=KeyFrames)
-    _in_control: str = ""
 
     def __post_init__(self) -> None:
         vehicle = self.setup.vehicle
@@ -94,9 +95,9 @@ class SimulatedVehicle:
         self.on_step(before, event, after)
 
     def _note_presence(self, t: float) -> None:
-        in_control = self._operators.in_control
-        if in_control != self._in_control:
-            self._in_control = in_control
+        before, present = self.run.state, self._operators.present
+        for event in presence_events(before, present, lambda _: Role.CONTROLLER, t, Departure.SILENT):
+            self.take(event)
+        in_control = self.run.state.driving.in_control
+        if in_control != before.driving.in_control:
             self.take(ControlPassed(t=t, operator=in_control))
-        if bool(self._operators.present) != (self.run.state.operator_since is not None):
-            self.take(OperatorConnected(t=t) if self._operators.present else OperatorDisconnected(t=t))

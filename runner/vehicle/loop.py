@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 from msgspec import UNSET
 
 from runner.core.commands import Command
+from runner.core.driving import Driving
 from runner.core.events import (
     NAMES,
     OWN,
-    Attention,
     AttentionChanged,
     ClockAdvanced,
+    ControlAccepted,
     ControlPassed,
-    CopiesCounted,
+    ControlRestored,
+    Departure,
     Event,
     OperatorConnected,
     OperatorDisconnected,
@@ -27,22 +29,26 @@ from runner.core.events import (
     describe,
     parse,
 )
+from runner.core.roles import CONTROL_EVENTS
 from runner.core.step import Run, start, step
 from runner.pqos import Predictions
 from runner.records.reception import ReceptionReport, ReceptionReported, SentFrame, UplinkSent
 from runner.records.vehicle import CameraReading, CameraTelemetry, Outcome, SenderStages, Telemetry
-from runner.schema import event_problem, shortened
+from runner.schema import event_problem
 from runner.settings import Setup
 from runner.system.held_up import LateCheck
 from runner.system.interfaces import addresses_by
-from runner.system.reports import LimitedReports, RepeatedReports
+from runner.system.reports import RepeatedReports
 from runner.vehicle.access import Access
+from runner.vehicle.attention import StatedAttention
 from runner.vehicle.inbox import MAX_QUEUED, Answer, Inbox, Item, QueuedReport, Request
+from runner.vehicle.noticed import copies_events, presence_events, source_events
 from runner.vehicle.operators import SILENT_S, Operators
 from runner.vehicle.publishing import Publish, Publisher
 from runner.vehicle.refusals import Refusals
 from runner.vehicle.repair import KeyFrames, cut_off
 from runner.vehicle.replies import Replies
+from runner.vehicle.seen import SeenPictures
 from runner.vehicle.sending import SendingTimes
 from runner.vehicle.uplink import MeasuredUplinks
 
@@ -50,6 +56,7 @@ if TYPE_CHECKING:
     from runner.pqos.track import Track
 
 TICK_S = 0.1  # time between clock_advanced events
+ASKED_BY = CONTROL_EVENTS | {"control_taken"}  # events that say which operator asks
 TELEMETRY_TICKS = 2  # also the vehicle's heartbeat
 
 
@@ -61,7 +68,7 @@ class Applier(Protocol):
     def stages(self) -> Mapping[str, SenderStages]: ...
     def sent_frames(self) -> Mapping[str, Iterable[SentFrame]]: ...
     def sent(self) -> Mapping[str, Mapping[str, UplinkSent]]: ...
-    def give_control(self, operator: str) -> None: ...
+    def give_control(self, drivers: Sequence[str]) -> None: ...
     def send_key_frames(self, cameras: Iterable[str], *, begin_anew: bool = False) -> None: ...
 
 
@@ -81,6 +88,8 @@ class ControlLoop:
                  second; returns False for a record that has to wait because the control link is behind
     on_report    called with one line per event and its result
     access       who may request what
+    former       the operator that was in control when this vehicle's last process ended, "" for none
+    keep_holder  called with the operator whose the control is, "" for none, to be the former one of the next process
 
     An exception in the loop is reported and counted in `errors`; the loop continues. `beat` is when the loop last
     finished a piece of work (time.monotonic), `busy_with` what it is doing.
@@ -94,22 +103,23 @@ class ControlLoop:
     publish: Publish
     on_report: Callable[[str], None]
     access: Access
+    former: str = ""
+    keep_holder: Callable[[str], None] = lambda operator: None
     errors: int = 0
     beat: float = 0.0
     busy_with: str = ""
     _stopped: bool = False
     _ticks: int = 0
-    _attention_stated: tuple[str, float] = ("", 0.0)  # by whom and when
 
     def __post_init__(self) -> None:
         self.vehicle = self.setup.vehicle
         self._cameras: Mapping[str, CameraReading] = dict.fromkeys(self.vehicle.cameras, CameraReading())
         self._inbox = Inbox()
-        self.refusals = Refusals(self._now, self._inbox.is_full)
-        self._operators = Operators(self.setup.expires_s, self.access.may_control)
+        self.refusals = Refusals(self._now, self._inbox.is_full, self.on_report)
+        self._operators, self._attention = Operators(self.setup.expires_s), StatedAttention()
+        self._pictures = SeenPictures()
         self._uplinks, self._sending, self._key_frames = MeasuredUplinks(self.vehicle), SendingTimes(), KeyFrames()
         self._publisher, self._replies = Publisher(self.setup.latency, self.publish), Replies()
-        self._report_denial = LimitedReports(self.on_report)
         self._report_once = RepeatedReports(self.on_report)
         self._operators_checked = 0.0  # when operators were last checked for silence
         self._began = time.monotonic()
@@ -155,8 +165,10 @@ class ControlLoop:
         self._warned = set[str]()
         self._run = start(self.vehicle)
         self._guarded("cameras", self._read)
-        self._guarded("sources", lambda: self._check_sources(0.0))
+        self._guarded("sources", lambda: self._notice(source_events(self._run.state, self._cameras, 0.0)))
         self._guarded("start", lambda: self._take(ClockAdvanced(t=0.0)))
+        if self.former:
+            self._guarded("control", lambda: self._take(ControlRestored(t=0.0, operator=self.former)))
         next_tick, late = TICK_S, LateCheck(2 * TICK_S)
         late.is_excused(0)
         while not self._stopped and (duration_s is None or self._now() < duration_s):
@@ -195,8 +207,8 @@ class ControlLoop:
             self._guarded("position_reported", lambda: self._take(replace(position_at(t), t=t)))
         self._guarded("clock_advanced", lambda: self._take(ClockAdvanced(t=t)))
         self._guarded("cameras", self._read)
-        self._guarded("sources", lambda: self._check_sources(t))
-        self._guarded("copies_counted", lambda: self._count_copies(t))
+        self._guarded("sources", lambda: self._notice(source_events(self._run.state, self._cameras, t)))
+        self._guarded("copies_counted", lambda: self._notice(copies_events(self._run.state, self._cameras, t)))
         if self._ticks % TELEMETRY_TICKS == 0:
             self._guarded("telemetry", lambda: self._publish_measured(t))
         self._guarded("operators", lambda: self._watch_operators(t))
@@ -205,18 +217,15 @@ class ControlLoop:
     def _read(self) -> None:
         self._cameras = self.applier.read()
 
-    def _count_copies(self, t: float) -> None:
-        copies = {name: camera.copies for name, camera in self._cameras.items() if camera.copies > 1}
-        if copies != self._run.state.copies:
-            self._take(CopiesCounted(t=t, copies=copies))
-
-    def _check_sources(self, t: float) -> None:
-        """Let the rules know which cameras cannot be opened."""
-        known = self._run.state.lost
-        for name, why in ((name, camera.lost) for name, camera in self._cameras.items()):
-            if why != known.get(name):
-                self._take(SourceReported(t=t, camera=name, works=why is None, reason=why))
-                self.on_report(f"{name}: lost: {why}; trying again" if why else f"{name}: found again")
+    def _notice(self, events: Iterable[Event]) -> None:
+        for event in events:
+            self._take(event)
+            if isinstance(event, SourceReported):
+                found = "found again" if event.works else f"lost: {event.reason}; trying again"
+                self.on_report(f"{event.camera}: {found}")
+            elif isinstance(event, AttentionChanged):
+                what = event.attention or "no longer reporting its attention"
+                self.on_report(f"operator {self._run.state.driving.in_control} is {what}")
 
     def _take_request(self, request: Request) -> None:
         try:
@@ -228,20 +237,24 @@ class ControlLoop:
     def _answer_request(self, request: Request) -> None:
         t = self._now()
         name = str(request.document.get("event"))
-        if request.sender and (denied := self.access.denial(request.sender, name, self._operators.in_control)):
-            self._report_denial(f"refused {shortened(name)} of {request.sender}: {denied}", request.sender)
-            self.refusals.refuse(request, denied)
+        if request.sender and (denied := self.access.denial(request.sender, name)):
+            self.refusals.deny(request, name, denied)
             return
         stamped = {**request.document, "t": t}
+        if request.sender and name in ASKED_BY:
+            stamped["operator"] = request.sender
         problem = event_problem(stamped)
         event = None if problem else parse(stamped)
-        if isinstance(event, OperatorDisconnected) and self._operators.goes_on(request.sender, t, request.run):
-            request.reply(Outcome(t, "applied", "another process of this operator goes on"))
+        is_goodbye = isinstance(event, OperatorDisconnected)
+        if is_goodbye and (why := self._operators.stays(request.sender, t, request.run, request.will)):
+            request.reply(Outcome(t, "applied", why))
             return
-        self._update_presence(request.sender, t, event, signed_off=not request.will)
+        self._update_presence(request.sender, t, event)
         if event is None:
             assert problem
             self.refusals.refuse(request, problem)
+        elif request.sender and (denied := self.access.unheld(request.sender, name, self._run.state.driving)):
+            self.refusals.deny(request, name, denied)
         elif request.sender and isinstance(event, OWN):
             self.refusals.refuse(request, f"{NAMES[type(event)]}: only the vehicle itself makes this event")
         elif request.as_of is not None and (expired := self._operators.expired(request.sender, t, request.as_of)):
@@ -249,12 +262,15 @@ class ControlLoop:
             request.reply(Outcome(t, "expired", expired))
         elif isinstance(event, OperatorConnected | OperatorDisconnected):
             request.reply(Outcome(t, "applied", ""))  # presence is already updated
+        elif isinstance(event, ControlAccepted):
+            seen = self._pictures.of(event.operator, t)
+            self._take(replace(event, live=tuple(name for name in event.live if name in seen)), request.answer)
         else:
             self._take(event, request.answer)
 
     def _take_report(self, item: QueuedReport) -> None:
         t = self._now()
-        if self.access.denial(item.sender, NAMES[OperatorConnected], ""):
+        if self.access.denial(item.sender, NAMES[OperatorConnected]):
             self.refusals.reject(item.sender)  # for example revoked since it connected
             return
         self._update_presence(item.sender, t, None)
@@ -264,7 +280,8 @@ class ControlLoop:
             item.state_clock()
         if item.report.run is not UNSET:
             self._operators.reported(item.sender, t, item.report.run)
-        reported = ReceptionReported(t, item.sender, item.sender == self._operators.in_control, item.report)
+        self._pictures.add(item.sender, t, item.report)
+        reported = ReceptionReported(t, item.sender, item.sender == self._run.state.driving.in_control, item.report)
         uplink = self._uplinks.of(item.report)
         if uplink is None:
             self._report_once(f"{item.sender}: its reports name an uplink that this vehicle does not have; ignored")
@@ -286,40 +303,20 @@ class ControlLoop:
         if link:
             self._take(link)
         if reported.in_control and item.report.damaged is not UNSET:
-            self._repair(item.report.damaged, t)
+            self.applier.send_key_frames(self._key_frames.to_repair(item.report.damaged, self._run.decision, t))
 
-    def _repair(self, damaged: Iterable[str], t: float) -> None:
-        """Send key frames of cameras with unrecovered packet loss; a camera that is not sent needs none."""
-        sending = {name for name, setting in self._run.decision.settings.items() if setting.sending}
-        if due := self._key_frames.due(sending.intersection(damaged), t):
-            self.applier.send_key_frames(due)
-
-    def _update_presence(self, sender: str, t: float, event: Event | None, *, signed_off: bool = True) -> None:
-        """Any message of an operator shows its presence. The core sees the first to arrive and the last to leave."""
+    def _update_presence(self, sender: str, t: float, event: Event | None) -> None:
+        """Any message of an operator shows its presence."""
         before = self._operators.present
         if isinstance(event, OperatorConnected):
             self._operators.connected(sender, t)
         elif isinstance(event, OperatorDisconnected):
-            self._operators.disconnected(sender, t, signed_off=signed_off)
+            self._operators.signed_off(sender)
         else:
             self._operators.message_received(sender, t)
-        self._presence_changed(before, t, "disconnected")
-        if isinstance(event, OperatorConnected) and sender and sender == self._operators.in_control:
-            self._update_attention(sender, event.attention, t)
-
-    def _update_attention(self, operator: str, attention: Attention | None, t: float) -> None:
-        """Pass on the driver's attention as stated by the operator in control.
-
-        A heartbeat without it, such as of a ROS interface with the same keys, leaves what a page stated just before.
-        """
-        stated_by, at = self._attention_stated
-        if attention is None and stated_by == operator and t - at < SILENT_S:
-            return
-        if attention is not None:
-            self._attention_stated = (operator, t)
-        if attention is not self._run.state.attention:
-            self._take(AttentionChanged(t=t, attention=attention))
-            self.on_report(f"operator {operator} is {attention or 'no longer reporting its attention'}")
+        self._presence_changed(before, t, Departure.SIGNED_OFF)
+        if isinstance(event, OperatorConnected) and sender and sender == self._run.state.driving.in_control:
+            self._notice(self._attention.events(self._run.state, sender, event.attention, t))
 
     def _watch_operators(self, t: float) -> None:
         """Detect operators that have fallen silent, unless this loop itself has stalled."""
@@ -327,27 +324,18 @@ class ControlLoop:
         before = self._operators.present
         if not stalled:
             self._operators.expire_silent(t, self._inbox.senders())
-        self._presence_changed(before, t, f"has been silent for {SILENT_S:g} s")
+        self._presence_changed(before, t, Departure.SILENT)
 
-    def _presence_changed(self, before: frozenset[str], t: float, why: str) -> None:
-        now, in_control = self._operators.present, self._operators.in_control
+    def _presence_changed(self, before: frozenset[str], t: float, departure: Departure) -> None:
+        now = self._operators.present
         for name in sorted(now - before):
             self.on_report(f"operator {name} is present")
         for name in sorted(before - now):
-            self.on_report(f"operator {name} {why}")
-        if in_control != self._publisher.operator:
-            self._publisher.operator = in_control
-
-            def pass_control() -> None:
-                self.applier.give_control(in_control)
-                self._take(ControlPassed(t=t, operator=in_control))
-
-            self._guarded("control", pass_control)
-        # Compared with the core: an event may have failed.
-        if bool(now) != (self._run.state.operator_since is not None):
-            self._take(OperatorConnected(t=t) if now else OperatorDisconnected(t=t))
+            self.on_report(f"operator {name} {departure}")
+        self._notice(presence_events(self._run.state, now, self.access.role, t, departure))
 
     def _take(self, event: Event, answer: Answer | None = None) -> None:
+        driving = self._run.state.driving
         self._take_run(step(self.vehicle, self._run, event), event, answer)
         predictions = list(self.pqos.observe(event))
         for warning in self.pqos.warnings:
@@ -356,6 +344,23 @@ class ControlLoop:
                 self.on_report(warning)
         for prediction in predictions:
             self._take_run(step(self.vehicle, self._run, prediction), prediction)
+        if self._run.state.driving is not driving:
+            self._follow(driving, event.t)
+
+    def _follow(self, before: Driving, t: float) -> None:
+        """Let everybody know who drives now."""
+        now = self._run.state.driving
+        if now == before:
+            return
+        self._publisher.again = True
+        if now.why != before.why:
+            self.on_report(now.why)
+        if now.holder != before.holder:
+            self.keep_holder(now.holder or "")
+        if now.drivers != before.drivers:
+            self._guarded("control", lambda: self.applier.give_control(now.drivers))
+        if now.in_control != before.in_control:
+            self._take(ControlPassed(t=t, operator=now.in_control))
 
     def _take_run(self, after: Run, event: Event, answer: Answer | None = None) -> None:
         before, self._run = self._run, after

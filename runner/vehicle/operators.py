@@ -1,14 +1,14 @@
 """Tracks which operators are present and whether a request is too old to execute. Pure: time is passed in.
 
 An operator is a client that sends requests under its own id, which is part of the topic. It is present from its
-`operator_connected` until it falls silent or sends `operator_disconnected`; any later message brings it back. One of
-the operators present is in control.
+`operator_connected` until it falls silent or signs off; any later message brings it back. Which of those present is in
+control: `runner.core.driving`.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from math import inf
 
@@ -25,10 +25,8 @@ MAX_OPERATORS = 64  # remembered; a new one replaces the one that has been silen
 @dataclass(slots=True)
 class _Operator:
     last_message: float
-    since: float = 0.0
     present: bool = False
     announced: bool = False
-    signed_off: bool = False
     clock_asked: float = -inf
     runs: dict[int, float] = field(default_factory=dict)  # by process, when it last sent a reception report
     delays: deque[float] = field(default_factory=lambda: deque(maxlen=DELAYS))
@@ -37,40 +35,16 @@ class _Operator:
 class Operators:
     """All operators known to the vehicle.
 
-    expires_s    age from which a request is dropped, beyond the measured round trip
-    may_control  whether an operator currently may be in control
+    expires_s  age from which a request is dropped, beyond the measured round trip
     """
 
-    def __init__(self, expires_s: float, may_control: Callable[[str], bool] = lambda name: True) -> None:
-        self._expires_s, self._may_control = expires_s, may_control
+    def __init__(self, expires_s: float) -> None:
+        self._expires_s = expires_s
         self._known: dict[str, _Operator] = {}
-        self._control = ""  # the operator that was last in control
 
     @property
     def present(self) -> frozenset[str]:
         return frozenset(name for name, operator in self._known.items() if operator.present)
-
-    @property
-    def in_control(self) -> str:
-        """The operator in control, "" for none."""
-        return self._control if self._control in self.present and self._may_control(self._control) else ""
-
-    def _pass_control(self, t: float) -> None:
-        """Control stays with an operator while it is present, then passes to the one that has been present longest.
-
-        An operator that falls silent, or whose connection breaks, keeps control until another one has been present for
-        SILENT_S since; one that signs off loses it at once. If all fell silent, the link was down, and the first one to
-        return must not take control from the one that drives. One that may no longer be in control, as its keys were
-        revoked, loses it immediately.
-        """
-        present = {name: o.since for name, o in self._known.items() if o.present and self._may_control(name)}
-        if not present or self._control in present:
-            return
-        longest = min(present, key=lambda name: present[name])
-        last = self._known.get(self._control) if self._control else None
-        revoked = not self._may_control(self._control)
-        if last is None or last.signed_off or revoked or t - max(last.last_message, present[longest]) >= SILENT_S:
-            self._control = longest
 
     def connected(self, name: str, t: float) -> bool:
         """An operator announces itself, initially or as its heartbeat; returns whether it was absent."""
@@ -83,19 +57,15 @@ class Operators:
         operator = self._operator(name, t)
         operator.last_message = t
         returns = operator.announced and not operator.present
-        if returns:
-            operator.present, operator.since, operator.signed_off = True, t, False
-        self._pass_control(t)
+        operator.present = operator.present or returns
         return returns
 
-    def disconnected(self, name: str, t: float, *, signed_off: bool = True) -> bool:
-        """An operator signed off, or its connection broke (its last will); returns whether it was present."""
+    def signed_off(self, name: str) -> bool:
+        """An operator has signed off; returns whether it was present."""
         operator = self._known.get(name)
         was_present = operator is not None and operator.present
         if operator:
-            operator.present, operator.signed_off = False, signed_off
-            operator.announced = operator.announced and not signed_off  # a report may be queued behind it
-        self._pass_control(t)
+            operator.present = operator.announced = False  # a report may be queued behind it
         return was_present
 
     def expire_silent(self, t: float, queued: Collection[str] = ()) -> list[str]:
@@ -107,7 +77,6 @@ class Operators:
         offline = [name for name in silent if name not in queued]
         for name in offline:
             self._known[name].present = False
-        self._pass_control(t)
         return offline
 
     def expired(self, name: str, t: float, as_of: float) -> str | None:
@@ -134,12 +103,17 @@ class Operators:
         operator = self._operator(name, t)
         operator.runs = {each: at for each, at in operator.runs.items() if t - at < PRESENT_S} | {run: t}
 
-    def goes_on(self, name: str, t: float, ended: int | None) -> bool:
-        """Whether another process of an operator than the one that ends still sends reports; None: not stated which."""
+    def stays(self, name: str, t: float, ended: int | None, will: bool) -> str | None:
+        """Why an operator stays although a goodbye of it has arrived; None: it goes.
+
+        ended  the process that the goodbye is of; None: not stated. Another one may still send reports
+        will   whether the broker sent it, of a connection that broke or that a new one of this operator has replaced
+        """
         operator = self._known.get(name)
-        if ended is None or operator is None:
-            return False
-        return any(t - at < PRESENT_S for run, at in operator.runs.items() if run != ended)
+        runs = operator.runs if operator and ended is not None else {}
+        if any(t - at < PRESENT_S for run, at in runs.items() if run != ended):
+            return "another process of this operator goes on"
+        return "a connection broke: silence shows whether the operator has gone" if will else None
 
     def may_ask_clock(self, name: str, t: float) -> bool:
         """Whether to answer an operator that compares clocks: answers to a flood would fill the uplink."""

@@ -46,7 +46,6 @@ class Publisher:
 
     publish   as in `runner.vehicle.loop.ControlLoop`
     cause     the event that the decision in force came from
-    operator  the one in control, "" for none
     latency   when a latency was last reported, s, and its value, ms
     position  as last reported
     """
@@ -54,7 +53,6 @@ class Publisher:
     limit: LatencyLimit
     publish: Publish
     cause: str = ""
-    operator: str = ""
     latency: tuple[float, float | None] = (-ADVICE_S, None)
     again: bool = False
     position: PositionReported | None = None
@@ -70,7 +68,7 @@ class Publisher:
 
         has_viewer  whether an operator is present
         """
-        state = vehicle_state(run, cameras, now, self.cause, self.operator)
+        state = vehicle_state(run, cameras, now, self.cause)
         if self._is_news(state, REASONS_S if has_viewer else UNSEEN_REASONS_S) and self.publish(state):
             self.again, self._published = False, state
 
@@ -138,15 +136,14 @@ class Publisher:
 
     def _speed_factor(self, run: Run, t: float) -> float | None:
         at, measured_ms = self.latency
-        is_seen = t - at <= ADVICE_S and run.state.attention not in UNSEEN
+        is_driven = bool(run.state.driving.in_control) and run.state.attention not in UNSEEN
+        is_seen = is_driven and t - at <= ADVICE_S
         factor = self.limit.speed_factor(measured_ms if is_seen else None)
         return None if factor is None else round(factor, 3)
 
 
-def vehicle_state(
-    run: Run, cameras: Mapping[str, CameraReading], t: float, cause: str, operator: str = ""
-) -> VehicleState:
-    """The state as the vehicle publishes it. operator: in control, "" for none."""
+def vehicle_state(run: Run, cameras: Mapping[str, CameraReading], t: float, cause: str) -> VehicleState:
+    """The state as the vehicle publishes it."""
     decision = run.decision
     states = {
         name: CameraState.at(decision.settings[name], plain(run.state.weights[name]), name, camera)
@@ -161,7 +158,7 @@ def vehicle_state(
         states,
         run.fault,
         attention=run.state.attention or UNSET,
-        operator=operator or UNSET,
+        operator=run.state.driving.in_control or UNSET,
         driving=run.state.driving,
         believed=decision.believed or UNSET,
         uplinks=uplinks_decided(decision),

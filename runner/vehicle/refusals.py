@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from runner.records.vehicle import Outcome
+from runner.schema import shortened
+from runner.system.reports import LimitedReports
 from runner.vehicle.inbox import Request
 
 REFUSALS = 10  # answered per sender between two ticks; further ones are only counted
@@ -13,11 +15,15 @@ REFUSALS = 10  # answered per sender between two ticks; further ones are only co
 class Refusals:
     """May be used from any thread.
 
-    now      returns the vehicle's time, s
-    is_full  whether another request of a sender would probably be refused
+    now        returns the vehicle's time, s
+    is_full    whether another request of a sender would probably be refused
+    on_report  called with requests that their sender may not make, a limited number of each
     """
 
-    def __init__(self, now: Callable[[], float], is_full: Callable[[str], bool]) -> None:
+    def __init__(
+        self, now: Callable[[], float], is_full: Callable[[str], bool], on_report: Callable[[str], None]
+    ) -> None:
+        self._report_denial = LimitedReports(on_report)
         self._now, self._is_full = now, is_full
         self.count = 0
         self._recent: dict[str, int] = {}  # by sender, since the last tick
@@ -46,3 +52,8 @@ class Refusals:
         recent = self.reject(request.sender)
         if request.answer and (not request.sender or recent <= REFUSALS):
             request.answer(Outcome(self._now(), "refused", problem))
+
+    def deny(self, request: Request, event: str, why: str) -> None:
+        """Refuse a request that its sender may not make, and report it."""
+        self._report_denial(f"refused {shortened(event)} of {request.sender}: {why}", request.sender)
+        self.refuse(request, why)

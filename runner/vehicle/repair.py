@@ -20,6 +20,11 @@ class KeyFrames:
         self._sent |= dict.fromkeys(due, t)
         return due
 
+    def to_repair(self, damaged: Iterable[str], decision: Decision, t: float) -> list[str]:
+        """Those of the cameras that an operator reports as damaged; one that is not sent needs none."""
+        sending = {name for name, setting in decision.settings.items() if setting.sending}
+        return self.due(sending.intersection(damaged), t)
+
 
 def cut_off(before: Decision, after: Decision) -> list[str]:
     """The cameras whose uplinks have all just stalled, and whose new one gives them less than they had.

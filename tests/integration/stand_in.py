@@ -38,7 +38,7 @@ class RecordingVehicle:
         self._sent = dict.fromkeys(self._names, 0)
         self.watched: set[str] = set()
         self.commands: list[Command] = []
-        self.controller = ""
+        self.drivers: tuple[str, ...] = ()
         self.key_frames: list[str] = []
         self.lost: dict[str, str] = {}
         self.on_turned: Callable[[], None] = lambda: None
@@ -80,8 +80,8 @@ class RecordingVehicle:
     def send_key_frames(self, cameras: Iterable[str], *, begin_anew: bool = False) -> None:
         self.key_frames += cameras
 
-    def give_control(self, operator: str) -> None:
-        self.controller = operator
+    def give_control(self, drivers: Sequence[str]) -> None:
+        self.drivers = tuple(drivers)
 
     def push(self, camera: str, frame: Any) -> bool:
         return camera in self.watched

@@ -370,7 +370,7 @@ def test_more_viewers_are_admitted_if_the_configuration_allows_them(outside):
 
 def test_the_controller_is_admitted_and_the_other_viewer_disconnected(outside):
     with serving() as vehicle, RtspClient(vehicle.url(), source=outside) as stranger:
-        vehicle.side.give_control("anna")
+        vehicle.side.give_control(["anna"])
         assert stranger.open() == [200, 200, 200]
         with RtspClient(vehicle.url(), source=outside, agent=user_agent("bert")) as bert:
             assert bert.open() == [200, 453]

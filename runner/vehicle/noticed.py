@@ -1,0 +1,57 @@
+"""The events by which the core learns what the vehicle notices: who is present, which cameras are lost, copies. Pure.
+
+Each is a comparison with the core's state, not with what was noticed before, since an event may have failed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Mapping
+
+from runner.core.events import (
+    CopiesCounted,
+    Departure,
+    Event,
+    OperatorConnected,
+    OperatorDisconnected,
+    SourceReported,
+)
+from runner.core.roles import Role
+from runner.core.state import State
+from runner.records.vehicle import CameraReading
+
+
+def presence_events(
+    known: State,
+    present: Collection[str],
+    role_of: Callable[[str], Role | None],
+    t: float,
+    departure: Departure,
+) -> Iterator[Event]:
+    """Which operators have come, in which role, and which have gone.
+
+    present    names of those that are; "" is the vehicle's own program, which drives nothing
+    role_of    None: its keys were withdrawn
+    departure  how those that are no longer present have left
+    """
+    roles = {name: role for name in sorted(present) if name and (role := role_of(name))}
+    for name in known.driving.present.keys() - roles.keys():
+        yield OperatorDisconnected(t=t, operator=name, departure=Departure.WITHDRAWN if name in present else departure)
+    for name, role in roles.items():
+        if known.driving.present.get(name) is not role:
+            yield OperatorConnected(t=t, operator=name, role=role)
+    if not roles and bool(present) != (known.operator_since is not None) and not known.driving.present:
+        yield OperatorConnected(t=t) if present else OperatorDisconnected(t=t)
+
+
+def source_events(known: State, cameras: Mapping[str, CameraReading], t: float) -> Iterator[Event]:
+    """Which cameras cannot be opened, or can be again."""
+    for name, why in ((name, camera.lost) for name, camera in cameras.items()):
+        if why != known.lost.get(name):
+            yield SourceReported(t=t, camera=name, works=why is None, reason=why)
+
+
+def copies_events(known: State, cameras: Mapping[str, CameraReading], t: float) -> Iterator[Event]:
+    """How many copies of each camera's stream leave the vehicle."""
+    copies = {name: camera.copies for name, camera in cameras.items() if camera.copies > 1}
+    if copies != known.copies:
+        yield CopiesCounted(t=t, copies=copies)
