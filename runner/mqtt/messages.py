@@ -49,6 +49,7 @@ _SURROGATE = re.compile(rb"\\u[dD]")  # perhaps half of a pair
 OPERATOR_RULE = "topic: an operator's id must be 1 to 64 letters, digits, _ and -"
 LARGEST = {"kbps": 1e9, "lower_kbps": 1e9, "valid_s": 3600.0}  # a larger number could not be read back by operators ...
 LARGEST_WEIGHT = 1e6  # ... or would outlast its sender
+STATED_BY_VEHICLE = ("operator", "role", "departure")  # keys of events, which follow from the sender
 MAX_ID = 128  # characters of a request's id, which its reply repeats
 MAX_REQUEST_BYTES = 65_536  # the longest event is a hundredth of it
 MAX_OFFLINE_BYTES = 256  # a longer state is of a vehicle that is online
@@ -214,6 +215,8 @@ def read_request(message: MqttMessage) -> ParsedRequest:
         problem = "must not be retained: a request is for now"
     elif "t" in document:
         problem = "t: must not be given, the vehicle stamps events on receipt"
+    elif stated := [key for key in STATED_BY_VEHICLE if key in document]:
+        problem = f"{stated[0]}: must not be given, the vehicle takes it from the topic"
     elif document == {"event": OPERATOR_GONE["event"]}:
         return ParsedRequest(document, identity)  # a last will cannot know when it is published
     elif isinstance(as_of, bool) or not isinstance(as_of, int | float) or not math.isfinite(as_of):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import secrets
 import time
-import uuid
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -52,6 +51,7 @@ from runner.records.vehicle import (
 from runner.security.keyring import Keyring
 from runner.settings import Setup
 from runner.system.held_up import LateCheck
+from runner.system.kept import KeptIdentity
 
 if TYPE_CHECKING:
     from runner.apply import Reception
@@ -125,7 +125,7 @@ class Station:
     """One operator's end of the control link, and the measurements of reception.
 
     settings   those that must agree with the vehicle's configuration, see `runner.configuration.agreement`
-    keyring    of this operator; None: no authentication, under a random id
+    keyring    of this operator; None: no authentication, under an id that this machine keeps
     listeners  must be added before `connect`
 
     Requests go out through `ask`; samples of the cameras' counters come in through `take`.
@@ -136,7 +136,8 @@ class Station:
         self._vehicle, self._settings = vehicle, settings
         control, login = setup.control, login_of(setup.control, keyring, self.note)
         self.user = login.identity or None if login else None  # this operator's name in its keys; None: it has none
-        self.identity = self.user or uuid.uuid4().hex[:12]  # of this operator
+        self._kept = None if self.user else KeptIdentity()
+        self.identity = self._kept.value if self._kept else str(self.user)  # of this operator
         self.answer_s = answer_s(setup.expires_s)
         self.listeners: list[Listener] = []
         self.state: VehicleState | None = None  # None: the vehicle is offline
@@ -184,6 +185,8 @@ class Station:
     def close(self) -> None:
         self.state = None  # so that signing off is not reported as a loss
         self.link.close((self._to_request, of_run(SIGNED_OFF, self._run)))
+        if self._kept:
+            self._kept.close()
 
     def ask(self, event: JsonObject, on_reply: OnReply | None = None) -> None:
         """Send a request to the vehicle.

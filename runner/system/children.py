@@ -6,7 +6,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import IO
@@ -64,10 +64,17 @@ class VerbProcess:
     name    for messages
     before  prefix of its command line
     stderr  file for its standard error; None: the same as this process's
+    env     variables that its environment has besides this process's
     """
 
     def __init__(
-        self, name: str, verb: str, words: Sequence[str], before: Sequence[str] = (), stderr: IO[str] | None = None
+        self,
+        name: str,
+        verb: str,
+        words: Sequence[str],
+        before: Sequence[str] = (),
+        stderr: IO[str] | None = None,
+        env: Mapping[str, str] | None = None,
     ) -> None:
         self.name, self._stderr = name, stderr
         read, self._lifeline = os.pipe()
@@ -75,7 +82,7 @@ class VerbProcess:
             self.process = subprocess.Popen(
                 [*before, sys.executable, "-m", "runner", verb, *words],
                 stderr=stderr,
-                env={**environment(), LIFELINE: str(read)},
+                env={**environment(), **(env or {}), LIFELINE: str(read)},
                 pass_fds=[read],
                 start_new_session=True,
             )

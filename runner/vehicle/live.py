@@ -53,6 +53,7 @@ from runner.system.interfaces import number_of
 from runner.system.kernel_clock import clock_error_s, wall_ahead_s
 from runner.system.service import notify
 from runner.vehicle.access import Access
+from runner.vehicle.holder import KeptHolder
 from runner.vehicle.inbox import QueuedReport, Request
 from runner.vehicle.loop import ControlLoop
 
@@ -374,6 +375,7 @@ def live_vehicle(
     conf: Path | str | None = None,
     *,
     log: Path | str | None = None,
+    state: Path | str | None = None,
     say: Callable[[str], None] = print,
     progress: Progress = lambda what, done: None,
 ) -> Iterator[LiveVehicle]:
@@ -381,6 +383,7 @@ def live_vehicle(
 
     overrides, conf  as in `live_operator`
     log       directory that the drive is recorded to
+    state     directory that keeps who is in control over a restart; None: the next process does not know
     say       called, from a separate thread, with one line per event
     progress  called with the progress of rendering a synthetic drive
     raises    ConfigError, RunError
@@ -434,7 +437,10 @@ def live_vehicle(
             metrics.take(record)
             return control.publish(record)
 
-        loop = ControlLoop(setup, side, pqos, track, drive, publish, report, Access(keyring, report))
+        holder = KeptHolder(Path(state) / f"{setup.vehicle.name}.json" if state else None, report)
+        ending.callback(holder.close)
+        access = Access(keyring, report)
+        loop = ControlLoop(setup, side, pqos, track, drive, publish, report, access, holder.former, holder.keep)
         side.on_turned = loop.wake
         live = LiveVehicle(side, loop)
         if ros := ros_cameras(setup, side.push_shared, report):

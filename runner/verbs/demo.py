@@ -277,11 +277,12 @@ def _sides(words: Sequence[str], link: LimitedLink | None, run: _Run) -> Iterato
     if run.keys:
         to_vehicle = (*to_vehicle, f"keys={run.keys.vehicle}")
         to_operator = (*to_operator, f"keys={run.keys.controller}")
-    with tempfile.TemporaryFile("w+") as stderr, ExitStack() as stack:
-        before = link.vehicle_command if link else ()
+    to_operator = (*to_operator, f"duration_s={run.duration_s}")
+    with tempfile.TemporaryFile("w+") as stderr, tempfile.TemporaryDirectory() as state, ExitStack() as stack:
+        before, env = link.vehicle_command if link else (), {"XDG_STATE_HOME": state}  # each drive is a new one
         sides = (
-            VerbProcess("the vehicle's side", "vehicle", [*words, *to_vehicle], before, stderr),
-            VerbProcess("the operator's side", "operator", [*words, *to_operator, f"duration_s={run.duration_s}"]),
+            VerbProcess("the vehicle's side", "vehicle", [*words, *to_vehicle], before, stderr, env),
+            VerbProcess("the operator's side", "operator", [*words, *to_operator], env=env),
         )
         for side in sides:
             stack.enter_context(signals.urgent(side.kill))

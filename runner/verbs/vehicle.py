@@ -3,7 +3,8 @@
 The vehicle's side: an RTSP server with one stream per camera at rtsp://HOST:8554/CAMERA, the rules that set bitrate and
 size of each, the prediction source, and the control link. Needs an MQTT broker at control.host. Ends with Ctrl-C or
 after duration_s. With log=DIR events, decisions and telemetry are written to DIR/drive.jsonl, which must not exist;
-with drives=DIR to DIR/TIME/drive.jsonl, where TIME is the start in UTC.
+with drives=DIR to DIR/TIME/drive.jsonl, where TIME is the start in UTC. Who is in control outlasts a restart, in
+~/.local/state/tod-runner/vehicles (or below XDG_STATE_HOME).
 
   tod-runner vehicle                                        the paper's vehicle with a synthetic drive
   tod-runner vehicle source=v4l2 pqos=live                  real cameras; predictions come over the control link
@@ -15,6 +16,7 @@ from __future__ import annotations
 
 import sys
 
+from runner.system.kept import state_directory
 from runner.system.memory import freeze_loaded
 from runner.system.signals import stopping
 from runner.vehicle.live import live_vehicle
@@ -28,7 +30,14 @@ def run(arguments: Arguments) -> int:
     sys.setswitchinterval(SWITCH_S)
     with (
         progress_bar() as progress,
-        live_vehicle(arguments.overrides, arguments.conf, log=arguments.drive(), say=say, progress=progress) as vehicle,
+        live_vehicle(
+            arguments.overrides,
+            arguments.conf,
+            log=arguments.drive(),
+            state=state_directory() / "vehicles",
+            say=say,
+            progress=progress,
+        ) as vehicle,
         stopping(action=vehicle.loop.stop) as stop,
     ):
         if vehicle.loop.track is not None:

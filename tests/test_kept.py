@@ -1,0 +1,80 @@
+"""What a side keeps from one process to the next: a vehicle its holder, an operator without keys its id."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from runner.system.kept import IDENTITY, KeptIdentity, state_directory
+from runner.vehicle.holder import SOMEBODY, KeptHolder
+
+
+def kept_after(path: Path, *holders: str) -> list[str]:
+    """What a vehicle reports that starts, has these holders in turn, and ends."""
+    reports: list[str] = []
+    kept = KeptHolder(path, reports.append)
+    for holder in holders:
+        kept.keep(holder)
+    kept.close()
+    return reports
+
+
+def former(path: Path) -> str:
+    reports: list[str] = []
+    kept = KeptHolder(path, reports.append)
+    kept.close()
+    return kept.former
+
+
+def test_the_next_process_of_a_vehicle_knows_who_was_in_control(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "robot.json"
+    assert former(path) == ""
+    assert kept_after(path, "alice") == []
+    assert former(path) == "alice"
+    assert kept_after(path, "", "bob", "carol") == []
+    assert former(path) == "carol"
+    assert kept_after(path, "") == []
+    assert former(path) == ""
+    assert [each.name for each in path.parent.iterdir()] == ["robot.json"]
+
+
+def test_a_file_that_cannot_be_read_means_that_somebody_was_in_control(tmp_path: Path) -> None:
+    path = tmp_path / "robot.json"
+    for content in ("", "{", "[]", "{}", '{"holder": 5}', '{"holder": "a b"}'):
+        path.write_text(content)
+        (report,) = kept_after(path)
+        assert report.startswith(f"{path}: who was in control cannot be read (")
+        assert report.endswith("somebody counts as in control and lost; remove the file if the vehicle stands")
+        assert former(path) == SOMEBODY
+
+
+def test_a_directory_that_cannot_be_written_is_reported(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    (report,) = kept_after(tmp_path / "file" / "robot.json", "alice")
+    assert report.endswith("file exists: after a restart of the vehicle anybody may get control")
+
+
+def test_nothing_is_kept_without_a_directory() -> None:
+    kept = KeptHolder(None, print)
+    kept.keep("alice")
+    kept.close()
+    assert kept.former == ""
+
+
+def test_an_operator_without_keys_has_its_id_again_and_no_other_has_it_meanwhile() -> None:
+    first, second = KeptIdentity(), KeptIdentity()
+    assert first.value != second.value
+    first.close()
+    again, third = KeptIdentity(), KeptIdentity()
+    assert again.value == first.value
+    assert len({each.value for each in (second, again, third)}) == 3
+    assert all(IDENTITY.fullmatch(each.value) for each in (second, again, third))
+    for each in (second, again, third):
+        each.close()
+    assert KeptIdentity().value == first.value
+
+
+def test_an_operator_has_an_id_where_nothing_can_be_kept() -> None:
+    state_directory().parent.mkdir(parents=True)
+    state_directory().touch()
+    first, second = KeptIdentity(), KeptIdentity()
+    assert first.value != second.value
