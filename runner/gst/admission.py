@@ -89,7 +89,7 @@ class Admission:
                 new_viewer.refused_udp.add(camera.name)  # until it is set up
         for connection in current:
             if connection.viewer in leaving:
-                why = f"the operator that drives watches from {new_viewer.viewer.address}"
+                why = f"operator {operator}, who has or is offered control, watches from {new_viewer.viewer.address}"
                 self._clients.disconnect(connection, why)
         return OK
 

@@ -11,6 +11,8 @@ import uuid
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from msgspec import UNSET
+
 from runner.graph import rtsp_url
 from runner.mqtt.copies import Newest
 from runner.mqtt.link import ControlLink, login_of
@@ -26,6 +28,7 @@ from runner.mqtt.messages import (
     read_telemetry,
     topic,
 )
+from runner.records import to_json
 from runner.records.vehicle import UplinkLost, VehicleState
 from runner.ros.inputs import PRESENCE, OperatorInput, check_names, input_services, input_topics, ros_name
 from runner.ros.process import Message, NodeProcess
@@ -34,6 +37,7 @@ from runner.settings import Setup
 from runner.system.reports import LimitedReports
 
 REQUEST, REPLY, STATE, TELEMETRY, URL = "~/request", "~/reply", "~/state", "~/telemetry", "~/url"
+DRIVING = "~/driving"
 EVERY_S = 0.1  # between two positions, and between two predictions
 OFFLINE = '{"online": false}'
 
@@ -65,9 +69,11 @@ class Bridge:
         self._topics, self._services = input_topics(vehicle), input_services(vehicle)
         self._reports = bool(ros.position or ros.prediction)
         self._due: dict[str, float] = {}  # by event, when the next may be sent
-        self._lock = threading.Lock()  # of the next three
+        self._lock = threading.Lock()  # of the next four
         self._state = OFFLINE  # the newest from the vehicle
-        self._is_shown = True  # whether it was published last; OFFLINE is, once the vehicle has been silent
+        self._driving = OFFLINE  # who drives, by that state
+        self._is_shown = True  # whether they were published last; OFFLINE is, once the vehicle has been silent
+        self._shown_driving = ""  # as published last
         self._state_time = -math.inf  # when it arrived by time.monotonic
         self._newest = Newest()
         self._requests = topic(vehicle.name, "request", self.identity)
@@ -96,7 +102,7 @@ class Bridge:
             self._on_message,
             self._on_node_report,
             inputs=inputs,
-            outputs={REPLY: False, TELEMETRY: False, STATE: True, **dict.fromkeys(self._urls, True)},
+            outputs={REPLY: False, TELEMETRY: False, STATE: True, DRIVING: True, **dict.fromkeys(self._urls, True)},
             services={name: operator_input.kind for name, operator_input in self._services.items()},
             insecure=setup.insecure,
         )
@@ -106,7 +112,7 @@ class Bridge:
         self._node.start()
         for name, url in self._urls.items():
             self._node.publish(name, url)
-        self._node.publish(STATE, OFFLINE)
+        self._show(OFFLINE, OFFLINE)
         self._link.connect()
 
     def close(self) -> None:
@@ -123,7 +129,7 @@ class Bridge:
         now = time.monotonic()
         with self._lock:
             if self._is_shown and self._is_silent() and self._state != OFFLINE:
-                self._node.publish(STATE, OFFLINE)
+                self._show(OFFLINE, OFFLINE)
                 self._is_shown = False
         for identity in [identity for identity, until in tuple(self._pending.items()) if now > until]:
             if self._pending.pop(identity, None) is not None:
@@ -141,10 +147,21 @@ class Bridge:
             return  # it has others
         if isinstance(said, VehicleState) and not self._newest.takes("state", said.t, time.monotonic()):
             return
-        state = message.payload.decode() if isinstance(said, VehicleState) else OFFLINE
+        state = driving = OFFLINE
+        if isinstance(said, VehicleState):
+            state, driving = (
+                message.payload.decode(),
+                json.dumps(to_json(said.driving)) if said.driving is not UNSET else OFFLINE,
+            )
         with self._lock:
-            self._node.publish(STATE, state)
-            self._state, self._is_shown, self._state_time = state, True, time.monotonic()
+            self._show(state, driving)
+            self._state, self._driving, self._is_shown, self._state_time = state, driving, True, time.monotonic()
+
+    def _show(self, state: str, driving: str) -> None:
+        self._node.publish(STATE, state)
+        if driving != self._shown_driving:
+            self._node.publish(DRIVING, driving)
+            self._shown_driving = driving
 
     def _on_telemetry(self, message: MqttMessage) -> None:
         telemetry = read_telemetry(message.payload)
@@ -153,7 +170,7 @@ class Bridge:
             with self._lock:
                 self._vehicle_time = (telemetry.t, arrived)
                 if not self._is_shown:
-                    self._node.publish(STATE, self._state)
+                    self._show(self._state, self._driving)
                     self._is_shown = True
             self._node.publish(TELEMETRY, message.payload.decode())
 

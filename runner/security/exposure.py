@@ -121,7 +121,7 @@ def viewer_keyring(setup: Setup) -> Keyring | None:
     """The keys of a role that may see a vehicle's pictures; raises UserError as `keyring_of`, and for other roles."""
     keyring = keyring_of(setup, MEDIA_SECRET)
     if keyring and keyring.holder.role not in VIEWERS:
-        raise _wrong_holder(keyring, "a controller or a watcher")
+        raise _wrong_holder(keyring, "a controller, a supervisor or a watcher")
     return keyring
 
 

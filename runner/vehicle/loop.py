@@ -358,6 +358,7 @@ class ControlLoop:
         if now.holder != before.holder:
             self.keep_holder(now.holder or "")
         if now.drivers != before.drivers:
+            self._notice(copies_events(self._run.state, self._cameras, t))
             self._guarded("control", lambda: self.applier.give_control(now.drivers))
         if now.in_control != before.in_control:
             self._take(ControlPassed(t=t, operator=now.in_control))

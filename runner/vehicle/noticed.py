@@ -39,8 +39,9 @@ def presence_events(
     for name, role in roles.items():
         if known.driving.present.get(name) is not role:
             yield OperatorConnected(t=t, operator=name, role=role)
-    if not roles and bool(present) != (known.operator_since is not None) and not known.driving.present:
-        yield OperatorConnected(t=t) if present else OperatorDisconnected(t=t)
+    own = "" in present
+    if not roles and not known.driving.present and own != (known.operator_since is not None):
+        yield OperatorConnected(t=t) if own else OperatorDisconnected(t=t)
 
 
 def source_events(known: State, cameras: Mapping[str, CameraReading], t: float) -> Iterator[Event]:
@@ -51,7 +52,12 @@ def source_events(known: State, cameras: Mapping[str, CameraReading], t: float) 
 
 
 def copies_events(known: State, cameras: Mapping[str, CameraReading], t: float) -> Iterator[Event]:
-    """How many copies of each camera's stream leave the vehicle."""
-    copies = {name: camera.copies for name, camera in cameras.items() if camera.copies > 1}
+    """How many copies of each camera's stream leave the vehicle.
+
+    One for the operator to whom control is offered counts from the offer on: the uplink has room before it begins.
+    """
+    least = len(known.driving.drivers)
+    numbers = {name: max(camera.copies, least) if camera.copies else 0 for name, camera in cameras.items()}
+    copies = {name: number for name, number in numbers.items() if number > 1}
     if copies != known.copies:
         yield CopiesCounted(t=t, copies=copies)

@@ -41,7 +41,7 @@ SIMULATED = (
     *("peak", "grant_ms"),
 )
 OF_SIMULATED = {"bursts": ("true", "false"), "control": ("true", "false")}
-HOLDERS = ("vehicle", "controller", "watcher", "predictor", "positioner", "broker")
+HOLDERS = ("vehicle", "controller", "supervisor", "watcher", "predictor", "positioner", "broker")
 KEYS = ("output", *HOLDERS, "host", "rotate", "revoke", "ca", "signed", "crl", "rules", "prefix")
 VERBS = {
     "print": Verb(

@@ -1,5 +1,6 @@
-"""usage: tod-runner keys output=DIR [vehicle=NAME] [controller=NAME] [watcher=NAME] [predictor=NAME] [positioner=NAME]
-                              [broker=HOST] [host=HOST[,HOST...]] [rotate=NAME] [revoke=NAME]
+"""usage: tod-runner keys output=DIR [vehicle=NAME] [controller=NAME] [supervisor=NAME] [watcher=NAME]
+                              [predictor=NAME] [positioner=NAME] [broker=HOST] [host=HOST[,HOST...]]
+                              [rotate=NAME] [revoke=NAME]
                               [ca=FILE] [signed=FILE[,FILE...]] [crl=FILE] [rules=true] [prefix=TOPIC]
 
 Creates the keys that vehicles, operators and the broker need to communicate over a network: a certificate authority in
@@ -8,7 +9,8 @@ machine; DIR/authority stays where it is. Existing keys are kept, so names can b
 
   vehicle     its `name` in the configuration     host  addresses or DNS names of that vehicle, or of an operator whose
   controller  an operator who may drive                 page is served to other machines
-  watcher     an operator who may only watch      broker  address or DNS name of the machine with the MQTT broker
+  supervisor  one who may also take control       broker  address or DNS name of the machine with the MQTT broker
+  watcher     an operator who may only watch
   predictor   sends predicted bitrates
   positioner  sends positions and steering angles
 

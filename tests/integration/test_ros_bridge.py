@@ -18,7 +18,7 @@ from runner.plans import compile_plans
 from runner.settings import Endpoint
 
 pytestmark = MARKS
-HEARD = [f"{NODE}/{name}" for name in ("state", "telemetry", "reply", "url/front", "url/rear")]
+HEARD = [f"{NODE}/{name}" for name in ("state", "driving", "telemetry", "reply", "url/front", "url/rear")]
 
 
 @pytest.fixture
@@ -55,6 +55,7 @@ def matching(lines, part):
 def test_requests_are_answered_and_a_late_subscriber_knows_all(ros, lines):
     with bridged(ros, lines) as (words, _, (vehicle, _)), ros.client("interface", *HEARD) as operator:
         assert operator.newest("state")["mode"] == "automatic"
+        assert operator.newest("driving")["state"] == "free"
         until(lambda: len(operator.texts("telemetry")) > 5)
         reply = operator.ask(id="one", event="mode_selected", mode="collective")
         assert (reply["id"], reply["result"]) == ("one", "applied")
@@ -75,6 +76,7 @@ def test_requests_are_answered_and_a_late_subscriber_knows_all(ros, lines):
 
         vehicle.terminate()
         until(lambda: operator.texts("state")[-1] == '{"online": false}')
+        until(lambda: operator.texts("driving")[-1] == '{"online": false}')
         reply = until(lambda: offline(operator))
         assert reply["result"] == "refused"
     assert matching(lines, "Traceback") == []
@@ -182,7 +184,7 @@ def test_requests_have_the_role_of_their_keys(ros, lines, tmp_path):
         reply = operator.ask(id="one", event="mode_selected", mode="collective")
         assert (reply["result"], reply["reason"]) == (
             "refused",
-            "a watcher may not request mode_selected; only controller may",
+            "a watcher may not request mode_selected; only controller or supervisor may",
         )
         assert operator.ask(id="two", event="operator_connected")["result"] == "applied"
         assert operator.texts("url/front")[0].startswith("rtsps://")

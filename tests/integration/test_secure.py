@@ -156,7 +156,7 @@ def test_video_and_control_pass_and_each_role_may_do_what_it_is_for(keys):
             refused = answer_to(bob, {"event": "total_set", "kbps": 10})
             assert (refused.result, refused.reason) == (
                 "refused",
-                "a watcher may not request total_set; only controller may",
+                "a watcher may not request total_set; only controller or supervisor may",
             )
             assert answer_to(bob, {"event": "operator_connected"}).result == "applied"
         with operating(keys, common, "carol") as carol:
@@ -878,5 +878,5 @@ def test_keys_of_another_role_are_refused(keys, refusal):
     status, output = refusal("operator", *WORDS, f"keys={keys / 'copy'}")
     assert (status, output) == (
         2,
-        f"keys: {keys / 'copy'}: must be those of a controller or a watcher, not of predictor bob",
+        f"keys: {keys / 'copy'}: must be those of a controller, a supervisor or a watcher, not of predictor bob",
     )

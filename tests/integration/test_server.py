@@ -379,8 +379,8 @@ def test_the_controller_is_admitted_and_the_other_viewer_disconnected(outside):
             assert stranger.ended()
             anna.read()
             until(lambda: anna.frames > 5)
-        closed = f"{CAMERA}: disconnected the viewer at {outside}: the operator in control watches from {outside}"
-        assert closed in vehicle.reported
+        why = f"operator anna, who has or is offered control, watches from {outside}"
+        assert f"{CAMERA}: disconnected the viewer at {outside}: {why}" in vehicle.reported
 
 
 def longest_allowed(untouched):
