@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+import time
+from dataclasses import replace
 from typing import Any
 
 import pytest
 from msgspec import UNSET
 
+from runner.core.driving import Control, Driving
 from runner.core.events import EVENTS, LinkState
 from runner.mqtt.messages import read_state
-from runner.operator.notes import CAUSES, change_notes, decision_note
+from runner.operator.notes import CAUSES, change_notes, decision_note, driver_words
 from runner.operator.uplinks import uplink_rows
 from runner.records.vehicle import UplinkMeasured, VehicleState
 
@@ -125,3 +128,28 @@ def test_an_uplink_in_words() -> None:
         (True, "uplink b: STALLED, nothing arrives; carries front, mast"),
     ]
     assert uplink_rows(state(), UNSET) == []
+
+
+@pytest.mark.parametrize(
+    "driving, words",
+    [
+        (Driving(), "nobody is in control"),
+        (Driving(Control.HELD, "anna"), "you are in control since {}"),
+        (Driving(Control.HELD, "bob", requested=("anna",)), "bob is in control since {}; you ask for control"),
+        (
+            Driving(Control.HELD, "anna", offered="bob", requested=("bob", "eve")),
+            "you are in control since {}; offered to bob; eve asks for control",
+        ),
+        (Driving(Control.LOST, "bob", offered="anna"), "bob is lost since {}; offered to you"),
+    ],
+)
+def test_who_drives_in_words(driving: Driving, words: str) -> None:
+    at = 1_700_000_000.0
+    assert driver_words(driving, "anna", at) == words.format(time.strftime("%H:%M:%S", time.localtime(at)))
+
+
+def test_a_note_says_why_another_operator_drives() -> None:
+    before = replace(state(), driving=Driving(Control.HELD, "anna", why="anna has asked for control, which was free"))
+    after = replace(before, driving=Driving(Control.HELD, "bob", why="bob has accepted control from anna"))
+    assert list(change_notes(before, after)) == ["bob has accepted control from anna"]
+    assert list(change_notes(after, replace(after, t=9.0))) == []

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Sequence
 
 from msgspec import UNSET
 
+from runner.core.driving import Control, Driving
 from runner.core.events import EVENTS
 from runner.records.vehicle import CameraState, VehicleState
 
@@ -27,12 +29,42 @@ CAUSES = {
 
 
 def change_notes(before: VehicleState, state: VehicleState) -> Iterator[str]:
-    """That the rules fail or decide again, that uplinks stall or cameras move to another, and a decision."""
+    """Who drives, that the rules fail or decide again, that uplinks stall or cameras move to another; a decision."""
+    if state.driving is not UNSET and (before.driving is UNSET or state.driving.why != before.driving.why):
+        yield state.driving.why
     if state.fault != before.fault:
         yield f"{state.fault}; the previous decision stays in force" if state.fault else "the rules decide again"
     yield from _uplink_notes(before, state)
     if text := decision_note(before, state):
         yield text
+
+
+def driver_words(driving: Driving, own: str, since: float) -> str:
+    """Who drives, and what operators have asked or offered.
+
+        you are in control since 14:03:12; bob asks for control
+        alice is in control since 14:03:12; offered to you
+        nobody is in control
+
+    own    the operator of this side, who is called you
+    since  the time of `Driving.since`, s since 1970
+    """
+
+    def named(name: str) -> str:
+        return "you" if name == own else name
+
+    parts = ["nobody is in control"]
+    if driving.holder:
+        be = "are" if driving.holder == own else "is"
+        state = "lost" if driving.state is Control.LOST else "in control"
+        at = time.strftime("%H:%M:%S", time.localtime(since))
+        parts = [f"{named(driving.holder)} {be} {state} since {at}"]
+    if driving.offered is not None:
+        parts.append(f"offered to {named(driving.offered)}")
+    asking = [named(name) for name in driving.requested if name != driving.offered]
+    if asking:
+        parts.append(f"{', '.join(asking)} {'ask' if asking[1:] or asking == ['you'] else 'asks'} for control")
+    return "; ".join(parts)
 
 
 def decision_note(before: VehicleState, state: VehicleState) -> str | None:

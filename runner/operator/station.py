@@ -31,7 +31,7 @@ from runner.mqtt.messages import (
 )
 from runner.operator.latency import Latency, stages
 from runner.operator.meter import MeasuredRates, ReceptionMeter
-from runner.operator.notes import change_notes
+from runner.operator.notes import change_notes, driver_words
 from runner.operator.reception import ReceptionReports
 from runner.operator.requests import OnReply, Requests
 from runner.operator.uplinks import UplinkRow, uplink_rows
@@ -271,13 +271,20 @@ class Station:
             CameraRow(name, self._rates[name], received, cameras.get(name)) for name, received in self.samples.items()
         ]
 
+    def own_time(self, t: float) -> float:
+        """A time of the vehicle by this machine's clock, s since 1970."""
+        return time.time() - (self._requests.vehicle_now(time.monotonic()) - t)
+
     def headline(self) -> str:
         state = self.state  # another thread may replace it
         if state is None:
             return f"{self._vehicle.name}: {self.link.fault or 'offline'}"
         clock = self.latency.clock
         latencies = f"latencies ± {1000 * clock.bound_s:.1f} ms" if clock else "latencies still unknown"
-        return f"{self._vehicle.name}, mode {state.mode}, total {state.total_words} kbit/s, {latencies}"
+        totals = f"{self._vehicle.name}, mode {state.mode}, total {state.total_words} kbit/s, {latencies}"
+        if (driving := state.driving) is UNSET:
+            return totals
+        return f"{totals}\n{driver_words(driving, self.identity, self.own_time(driving.since))}"
 
     def _sample(self, over: Mapping[str, Mapping[str, UplinkReceived]]) -> Sample:
         telemetry, clock = self._telemetry if self.state else None, self.latency.clock
