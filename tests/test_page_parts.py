@@ -73,7 +73,8 @@ def served(*overrides, layouts=None, login=None, keyring=None, note=print):
     No window is dropped for its silence: most clients here answer pings only while they receive.
     """
     port = free_port()
-    station = SimpleNamespace(state=None, note=note, user="anna", answer_s=1.0, attention=None, link_state=LinkState())
+    told = {"identity": "anna", "answer_s": 1.0, "attention": None, "link_state": LinkState()}
+    station = SimpleNamespace(state=None, note=note, **told)
     with pytest.MonkeyPatch.context() as patch:
         if login:
             patch.setattr("runner.page.server.Access", lambda _none, *rest: Access(login, *rest))
@@ -157,7 +158,7 @@ def test_messages_are_ignored_once_the_token_is_replaced(monkeypatch):
                 pass
             assert station.attention is Attention.HIDDEN
             changed.token = b"another"
-            await ws.send_json({"release_control": True})
+            await ws.send_json({"attention": "watching"})
             await ws.send_json({"clock": 1})
             with pytest.raises(TimeoutError):
                 while "page_ms" not in await ws.receive_json(timeout=1):
@@ -401,7 +402,7 @@ async def attention_becomes(station, attention):
 
 
 def test_the_drivers_attention_is_reported_to_the_station():
-    """Only the page in control counts: a closed page is absent, and one that releases control reports nothing."""
+    """Only the page in control counts: a closed page is absent."""
 
     async def drive(own, station):
         async with aiohttp.ClientSession() as session:
@@ -428,8 +429,6 @@ def test_the_drivers_attention_is_reported_to_the_station():
             driver = await session.ws_connect(f"{own}/live?viewer=driver", origin=own)
             await driver.send_json({"attention": "unfocused"})
             await attention_becomes(station, "unfocused")
-            await driver.send_json({"release_control": True})
-            await attention_becomes(station, None)
 
     with served() as (port, station):
         asyncio.run(drive(f"http://localhost:{port}", station))
@@ -497,21 +496,15 @@ def test_a_monitor_shares_selection_and_control_with_the_page_in_its_browser():
         await stranger.send_json(request)
         await received(stranger, "reply", id="1", reason="this page does not hold control; take it first")
         assert requests == [{"event": "mode_selected", "mode": "single"}]
-        for order in ("take_control", "release_control"):
-            await monitor.send_json({order: True})
-            await received(monitor, "reply", result="refused")
-            await stranger.send_json({order: True})
-            await received(stranger, "reply", result="refused")
+        for window in (monitor, stranger):
+            await window.send_json({"take_control": True})
+            await received(window, "reply", result="refused")
 
         other = await windows.open("other", "there")
         await received(stranger, "control", holder="another")
         await other.send_json({"take_control": True})
         await received(stranger, "control", holder="you")
         await received(monitor, "control", holder="another")
-        await page.send_json({"take_control": True})
-        await received(monitor, "control", holder="you")
-        await page.send_json({"release_control": True})
-        await received(monitor, "control", holder="nobody", abandoned=False)
         await page.send_json({"take_control": True})
         await received(monitor, "control", holder="you")
         await page.close()
@@ -661,7 +654,7 @@ def test_which_page_a_window_belongs_to():
     assert page_of(nameless, [window("4"), nameless], control) == "n", (
         "it shares nothing with pages that state no browser"
     )
-    control.release("3")
+    control.on_closed("3", 0)
     assert control.holder_for(page_of(nameless, [nameless], control)) == "nobody"
 
 
@@ -746,10 +739,6 @@ def test_control_belongs_to_one_page():
     assert [control.holder_for(page) for page in "ab"] == ["you", "another"]
     control.take("b")
     assert [control.holder_for(page) for page in "ab"] == ["another", "you"]
-    control.release("a")  # not the holder
-    assert control.holder_for("b") == "you"
-    control.release("b")
-    assert [control.holder_for(page) for page in "ab"] == ["nobody", "nobody"]
 
 
 def test_a_reload_keeps_control_and_a_page_that_left_loses_it():
@@ -781,14 +770,9 @@ def test_a_watching_page_that_connects_again_gets_no_control():
 
 def test_after_a_restart_of_the_station_its_driver_gets_control_again():
     control = Control()
-    for page, before in (("watcher", "another"), ("released", "nobody"), ("driver", "you"), ("opened", None)):
+    for page, before in (("watcher", "another"), ("opened before", "nobody"), ("driver", "you"), ("opened", None)):
         control.on_opened(page, 1, before)
     assert control.holder_for("driver") == "you"
-    control.release("driver")
-    control.on_opened("watcher", 2, "nobody")  # nobody asked for it
-    assert control.holder_for("watcher") == "nobody"
-    control.on_opened("newcomer", 3)
-    assert control.holder_for("newcomer") == "you"
 
 
 def sample(time, position=None):

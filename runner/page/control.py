@@ -13,7 +13,9 @@ PRECEDENCE = (Attention.HIDDEN, Attention.SLOW, Attention.WATCHING, Attention.UN
 
 
 class Control:
-    """At most one page holds control; a page is known by its token, which survives a reload.
+    """At most one page holds control: it acts for the station, whose operator need not be the vehicle's driver.
+
+    A page is known by its token, which survives a reload.
 
     A page that opens takes control if it is free; one that only connects again, if it held control before, since nobody
     asked for another one to drive. Any page may take control on request; the previous holder then watches.
@@ -38,10 +40,6 @@ class Control:
 
     def take(self, token: str) -> None:
         self._holder, self._closed_at = token, None
-
-    def release(self, token: str) -> None:
-        if token == self._holder:
-            self._holder, self._closed_at = "", None
 
     @property
     def is_held(self) -> bool:

@@ -15,11 +15,12 @@ from pathlib import Path
 from typing import Any
 
 from aiohttp import WSMsgType, web
+from msgspec import UNSET
 
 from runner.configuration.layout import Layouts
 from runner.core.events import Attention
 from runner.core.model import Camera, plain
-from runner.core.roles import DRIVER_EVENTS
+from runner.core.roles import MAY_REQUEST, PRESENCE, Role
 from runner.graph import video_codec
 from runner.h264.access_unit import AccessUnit, RecentUnits
 from runner.mqtt.messages import read_message
@@ -55,6 +56,9 @@ PING_S = 0.5
 UNRESPONSIVE_S = 2.0  # a viewer that has not answered a ping for this long is dropped, and reconnects if it is alive
 CLOSE_TYPES = (WSMsgType.CLOSE, WSMsgType.CLOSING, WSMsgType.CLOSED, WSMsgType.ERROR)
 MAX_MESSAGE_BYTES = 1_048_576  # a longer message closes the connection
+MAY_ASK = (
+    MAY_REQUEST[Role.SUPERVISOR] - PRESENCE
+)  # what a page may request; its operator's role is checked by the vehicle
 
 
 class PageServer(Listener):
@@ -124,7 +128,7 @@ class PageServer(Listener):
         self._thread.join(STOP_S)
 
     def on_state(self, state: VehicleState | None) -> None:
-        self._call_soon(self._windows.broadcast, "state", state_to_json(state))
+        self._call_soon(self._windows.broadcast, "state", _stated(state, self._station))
 
     def on_sample(self, sample: Sample) -> None:
         self._call_soon(self._add_sample, sample)
@@ -230,11 +234,11 @@ class PageServer(Listener):
 
     def _send_current_state(self, viewer: PageViewer) -> None:
         introduction = _introduction(self._setup, viewer.cameras)
-        station = {"operator": self._station.user, "answer_s": self._station.answer_s}
+        station = {"operator": self._station.identity, "answer_s": self._station.answer_s}
         current = {"layout": self._page_layouts.stated(), "selected": viewer.selected or None}
         viewer.post("hello", introduction | station | current)
         viewer.post("link", self._station.link_state._asdict())
-        viewer.post("state", state_to_json(self._station.state))
+        viewer.post("state", _stated(self._station.state, self._station))
         viewer.post("history", self._history.columns())
         for note in self._notes:
             viewer.post("note", note)
@@ -258,13 +262,11 @@ class PageServer(Listener):
                 self._windows.state_control()
             case {"select": str(name)} if name in self._index:
                 self._windows.select(viewer, name)
-            case {"take_control": True} | {"release_control": True} if viewer.monitor:
-                reason = "only a page can take or release control, not its monitors"
+            case {"take_control": True} if viewer.monitor:
+                reason = "only a page can take control, not its monitors"
                 viewer.post("reply", {"id": document.get("id"), "result": "refused", "reason": reason})
             case {"take_control": True}:
                 self._windows.take_control(viewer)
-            case {"release_control": True}:
-                self._windows.release_control(viewer)
             case _:
                 self._on_request(viewer, document)
 
@@ -296,10 +298,17 @@ class PageServer(Listener):
             self._call_soon(answer, outcome.result, outcome.reason)
 
         event = document.get("event")
-        if event in DRIVER_EVENTS:
+        if event in MAY_ASK:
             self._station.ask(document, on_reply)
         else:
-            answer("refused", f"event: {event!r}: must be one of {', '.join(sorted(DRIVER_EVENTS))}")
+            answer("refused", f"event: {event!r}: must be one of {', '.join(sorted(MAY_ASK))}")
+
+
+def _stated(state: VehicleState | None, station: Station) -> dict[str, Any]:
+    """The vehicle's state, and since when its holder has been in control, s since 1970."""
+    driving = state.driving if state else UNSET
+    since = station.own_time(driving.since) if driving is not UNSET and driving.holder else None
+    return {**state_to_json(state), "held_since": since}
 
 
 def _recent(camera: Camera) -> RecentUnits:

@@ -1,4 +1,4 @@
-"""The open windows of all browsers: which of them are one page, and which page holds control."""
+"""The open windows of all browsers: which of them are one page, and which page acts for the station."""
 
 from __future__ import annotations
 
@@ -54,10 +54,6 @@ class Windows:
         self._control.take(viewer.token)
         self.state_control()
 
-    def release_control(self, viewer: PageViewer) -> None:
-        self._control.release(viewer.token)
-        self.state_control()
-
     def select(self, viewer: PageViewer, camera: str) -> None:
         """Select a camera in all windows of a page."""
         viewer.selected = camera
@@ -68,7 +64,7 @@ class Windows:
     def state_control(self) -> None:
         """Send each window the holder of control, and whether another window of its page has the focus or is hidden.
 
-        abandoned  nobody is in control because the page that was has closed
+        abandoned  no page acts for the station because the one that did has closed
         """
         for viewer in self._viewers:
             others = self._others(viewer)

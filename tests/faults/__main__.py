@@ -103,8 +103,8 @@ FAULTS = [
     Fault("page/viewer.py", "if len(queue.live) > MAX_UNITS:", "if False:", "test_page_parts"),
     Fault(
         "page/control.py",
-        "if token == self._holder:\n            self._holder, self._closed_at = ",
-        "if True:\n            self._holder, self._closed_at = ",
+        "if token == self._holder:\n            self._closed_at = ",
+        "if True:\n            self._closed_at = ",
         "test_page_parts",
     ),
     Fault("drive/read.py", "if kind not in OF_SEVERAL_THREADS and t < ", "if False and t < ", "test_replay"),

@@ -62,7 +62,7 @@ class Station(SimpleNamespace):
                 roi = dict(zip(("x", "y", "width", "height"), camera.roi, strict=True))
                 self.step(event="roi_set", camera=name, **roi)
         self.units = {name: self.encoded(name, picture) for name, picture in pictures.items()}
-        told = {"note": print, "user": "anna", "answer_s": 1.0, "attention": None, "link_state": LinkState()}
+        told = {"note": print, "identity": "anna", "answer_s": 1.0, "attention": None, "link_state": LinkState()}
         latency = SimpleNamespace(captured=lambda camera, at: at)  # both clocks are one
         super().__init__(state=self.published(), latency=latency, **told)
 

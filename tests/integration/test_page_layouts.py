@@ -60,23 +60,37 @@ BELIEVED = Believed(31999, 0.1, 0.2, -0.44, 0.35, 0.31, None)  # in as many word
 UNCHANGED = SimpleNamespace(captured=lambda camera, at: at)  # both clocks are one
 
 
+OWN = "anna"  # this station's operator
+
+
 class Station(SimpleNamespace):
-    """A stub of the operator's side: a vehicle in mode A that applies every request immediately."""
+    """A stub of the operator's side: a vehicle in mode A that applies every request immediately.
+
+    `happens` is an event of the vehicle about who drives, by its own rules; the page learns of it.
+    """
 
     def __init__(self, vehicle):
         run = step(vehicle, start(vehicle), parse({"t": 0, "event": "bitrate_predicted", "kbps": 3000}))
+        run = step(vehicle, run, parse({"t": 1, "event": "operator_connected", "operator": OWN, "role": "supervisor"}))
         cameras = {
             name: CameraState.at(setting, 1, name, CameraReading(run.commanded[name]))
             for name, setting in run.decision.settings.items()
         }
         totals = (plain(run.decision.total), plain(run.decision.asked))
-        state = VehicleState(1.0, "", run.decision.mode, *totals, cameras, believed=BELIEVED)
-        own = {"user": "anna", "answer_s": 1.0, "link_state": LinkState(), "latency": UNCHANGED}
-        super().__init__(state=state, note=print, attention=None, requests=[], seen=[], **own)
+        state = VehicleState(1.0, "", run.decision.mode, *totals, cameras, driving=run.state.driving, believed=BELIEVED)
+        own = {"identity": OWN, "answer_s": 1.0, "link_state": LinkState(), "latency": UNCHANGED, "own_time": float}
+        super().__init__(state=state, note=print, attention=None, requests=[], seen=[], vehicle=vehicle, run=run, **own)
 
     def ask(self, document, on_reply):
         self.requests.append(document)
-        on_reply(Outcome(0.0, "applied", ""))
+        refused = self.happens(**document, operator=OWN) if "control_" in document["event"] else None
+        on_reply(Outcome(0.0, "refused" if refused else "applied", refused or ""))
+
+    def happens(self, **event):
+        self.run = step(self.vehicle, self.run, parse({"t": self.run.state.driving.since + 1, **event}))
+        self.state = replace(self.state, driving=self.run.state.driving)
+        self.page.on_state(self.state)
+        return self.run.refused
 
 
 def over_two_uplinks(state):
@@ -103,6 +117,7 @@ def served(picture, layouts, *words, vehicle=SMALL_ROBOT, conf=None):
     vehicle = setup.vehicle
     station = Station(vehicle)
     page, ended = PageServer(setup, station, layouts=layouts), threading.Event()
+    station.page = page
     page.silent = set()  # names of cameras that send nothing
     page.behind_s = 0.0  # how long ago pictures were captured
     page.sample = None  # sent with each picture
@@ -415,7 +430,7 @@ def test_a_driver_is_warned_in_either_view(chromium, picture, pressed):
         page.evaluate("delete document.hidden; document.dispatchEvent(new Event('visibilitychange'))")
         until(lambda: "check every picture" in page.text_content("#alarms"))
         page.keyboard.press("t")
-        until(lambda: page.evaluate("tod.control") == "nobody")
+        until(lambda: page.evaluate("tod.control") == "free")
         server.silent.add("rear")
         until(lambda: measure(page)["rear"]["status"] == "lost")
         before = tones(page)
@@ -440,31 +455,35 @@ def test_a_driver_is_warned_if_the_vehicle_has_another_operator_in_control(chrom
     with served(picture, None) as (server, station), opened(chromium, server.url) as page:
         all_live(page)
         controlling(page)
-        viewing(page, "drive")
         page.evaluate(COUNT_TONES)
-        server.on_state(replace(station.state, operator="bob"))
-        until(lambda: page.inner_text("#attention") == "NOT IN CONTROL: operator bob is in control")
-        assert "CONTROL LOST" not in page.inner_text("#toasts"), "this station's operator did not have it"
-        server.on_state(replace(station.state, operator="anna"))
-        until(page.locator("#attention").is_hidden)
+        page.keyboard.press("v")
         server.on_state(None)
         before = tones(page)
-        server.on_state(replace(station.state, operator="bob"))
-        until(lambda: page.inner_text("#attention") == "NOT IN CONTROL: operator bob is in control")
-        assert "CONTROL LOST: operator bob is in control" in page.inner_text("#toasts")
+        server.on_state(station.state)
+        station.happens(event="operator_connected", operator="eve", role="supervisor")
+        station.happens(event="control_taken", operator="eve")
+        until(lambda: page.inner_text("#attention") == "CONTROL LOST: operator eve is in control; request control (t)")
+        assert "CONTROL LOST: operator eve is in control" in page.inner_text("#toasts")
         until(lambda: tones(page) >= before + 4)
+        assert page.inner_text("#drive-holder").startswith("Operator eve is in control since ")
         shot(page, "other-operator-drive")
         page.keyboard.press("v")
-        assert page.inner_text("#holder") == "Operator bob is in control"
+        assert page.inner_text("#holder").startswith("Operator eve is in control since ")
+        assert page.locator("[data-camera=front] .switch").is_disabled()
+        assert page.get_attribute("[data-camera=front] .switch", "title") == (
+            "operator eve is in control; request control (t)"
+        )
         shot(page, "other-operator-configure")
-        server.on_state(replace(station.state, operator="anna"))
+        station.happens(event="control_offered", operator="eve", to=OWN)
+        until(lambda: page.inner_text("#hand-over-words") == "eve offers control to you")
+        page.keyboard.press("t")
         until(page.locator("#attention").is_hidden)
-        assert page.inner_text("#holder") == "You are in control"
+        until(lambda: page.inner_text("#holder").startswith("You are in control"))
         before = tones(page)
-        server.on_state(station.state)  # names no operator: nothing from this station arrives any more
+        station.happens(event="operator_disconnected", operator=OWN, departure="has been silent for 1 s")
         unheard = "the vehicle receives nothing from this station"
-        until(lambda: page.inner_text("#attention") == f"NOT IN CONTROL: {unheard}")
-        assert page.inner_text("#holder") == "Vehicle does not receive you"
+        until(lambda: page.inner_text("#attention") == f"CONTROL LOST: {unheard}")
+        assert page.inner_text("#holder").startswith("Vehicle does not receive you")
         assert page.inner_text("#connection") == "✕ vehicle receives nothing"
         assert f"CONTROL LOST: {unheard}" in page.inner_text("#toasts")
         until(lambda: tones(page) >= before + 4)
@@ -472,7 +491,8 @@ def test_a_driver_is_warned_if_the_vehicle_has_another_operator_in_control(chrom
         until(lambda: page.inner_text("#line").endswith("vehicle receives nothing"))
         before = tones(page)
         paused = {name: replace(camera, sending=False) for name, camera in station.state.cameras.items()}
-        server.on_state(replace(station.state, operator="anna", cameras=paused))
+        station.happens(event="operator_connected", operator=OWN, role="supervisor")
+        server.on_state(replace(station.state, cameras=paused))
         until(lambda: page.inner_text("#alarms") == "❚❚ PAUSED front, rear, mast")
         assert page.inner_text("#worst-of") == "3 of 3 pictures not live"
         until(lambda: tones(page) >= before + 4)
@@ -536,7 +556,7 @@ def test_a_driver_is_alerted_to_a_monitor_that_crashed(chromium, picture):
         until(lambda: "a monitor no longer responds: reload it" in page.inner_text("#toasts"))
         until(lambda: tones(page) >= before + 4)
         until(lambda: "▲ MONITOR NOT RESPONDING front, mast" in page.text_content("#alarms"))
-        for holder in ("nobody", "you"):
+        for holder in ("free", "you"):
             page.keyboard.press("t")
             until(lambda holder=holder: monitor.evaluate("tod.control") == holder)
             assert "CONTROL LOST" not in monitor.inner_text("#attention"), "the driver has released it"
@@ -551,7 +571,7 @@ def test_keys_act_on_the_cameras_after_a_button_was_clicked(chromium, picture):
         controlling(page)
         assert page.inner_text("#offer-drive") == "Drive view (x)"
         titles = [page.get_attribute(f"#{name}", "title") for name in ("to-drive", "theme", "take-control")]
-        assert titles == ["Drive view: pictures first (x)", "Day or night", "take or release control (t)"]
+        assert titles == ["Drive view: pictures first (x)", "Day or night", "Release (t)"]
         for key, camera in (("k", "mast"), ("ArrowDown", "rear"), ("1", "front"), ("3", "front")):
             page.keyboard.press(key)
             assert page.evaluate("tod.selected") == camera, key
@@ -559,7 +579,7 @@ def test_keys_act_on_the_cameras_after_a_button_was_clicked(chromium, picture):
         page.keyboard.press("x")
         usual = edges(page)
         assert usual["front"]["width"] > 2 * usual["mast"]["width"], "the enlarged picture stayed large"
-        for holder in ("nobody", "you"):
+        for holder in ("free", "you"):
             page.click("#drive-control")
             until(lambda holder=holder: page.evaluate("tod.control") == holder)
         page.keyboard.press("ArrowDown")
@@ -573,7 +593,7 @@ def test_keys_act_on_the_cameras_after_a_button_was_clicked(chromium, picture):
         page.keyboard.press("Enter")
         until(lambda: edges(page)["rear"]["width"] == usual["front"]["width"])
         page.click("#drive-control")
-        until(lambda: page.evaluate("tod.control") == "nobody")
+        until(lambda: page.evaluate("tod.control") == "free")
         page.focus("#drive-control")
         page.evaluate("void (globalThis.clicks = 0, addEventListener('click', () => clicks++))")
         for _ in range(3):
@@ -975,7 +995,10 @@ LEVELS = ["fine", "near", "late", "unknown", "none"]
 STATUSES = ["live", "late", "damaged", "frozen", "lost", "off", "unsupported"]
 # Elements that a page shows only at times, by selector and attribute.
 STATES = [
-    *([f"#{name}", "data-test", ["shown"]] for name in ("banner", "warning", "offer", "attention", "no-such-camera")),
+    *(
+        [f"#{name}", "data-test", ["shown"]]
+        for name in ("banner", "warning", "offer", "hand-over", "attention", "no-such-camera")
+    ),
     ["#latency", "data-level", LEVELS],
     ["#speed-now", "data-level", LEVELS],
     ["#alarms", "data-level", ["near", "late"]],

@@ -1,54 +1,52 @@
-/** Control that is lost is noticed once, control that is released is not lost; a vehicle that hears no operator is noticed. */
+/** What a page notices of its control: that it has gained, passed on or lost it. */
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-import { Hearing, Holding } from "../../runner/page/static/holding.js";
+import { Holding } from "../../runner/page/static/holding.js";
 
-const updated = (holding, ...holders) => holders.map((holder) => [holding.update(holder), holding.isLost]);
-
-test("control taken by another page is lost until it is back", () => {
-  const found = updated(new Holding(), "nobody", "you", "you", "another", "another", "nobody", "you", "another");
-  assert.deepEqual(found, [[false, false], [false, false], [false, false], [true, true], [false, true], [false, true], [false, false], [true, true]]);
-});
-
-test("a release that the station has not received is neither forgotten nor taken for a loss", () => {
+/** What is noticed of who drives, each [who, given, ms], and whether control counts as lost then. */
+function noticed(...changes) {
   const holding = new Holding();
-  updated(holding, "you");
-  holding.onRelease();
-  assert.deepEqual([updated(holding, "you"), holding.isReleasing], [[[false, false]], true]);
-  assert.deepEqual([updated(holding, "nobody"), holding.isReleasing], [[[false, false]], false]);
-  holding.onRelease();
-  holding.onTake();
-  assert.deepEqual([updated(holding, "you", "another"), holding.isReleasing], [[[false, false], [true, true]], false]);
+  return changes.map(([who, given = null, now = 9000]) => [holding.update(who, given, now), holding.isLost]);
+}
+
+test("control taken by another page or a supervisor is lost until it is back", () => {
+  for (const other of ["another", "operator"]) {
+    const found = noticed(["you"], [other], [other], ["nobody"], ["you"], [other]);
+    assert.deepEqual(found, [[null, false], ["lost", true], [null, true], [null, true], ["gained", false], ["lost", true]]);
+  }
 });
 
-test("control that a page releases, or never had, is not lost", () => {
+test("control that has been accepted from this page, or released, is not lost", () => {
+  assert.deepEqual(noticed(["you"], ["operator", "offered"]), [[null, false], ["passed", false]]);
+  assert.deepEqual(noticed(["you"], ["free", "released"], ["operator"]), [[null, false], [null, false], [null, false]]);
+});
+
+test("control that goes to whoever asked for it, once this page's person has released it, is not lost", () => {
   const holding = new Holding();
-  updated(holding, "you");
-  holding.onRelease();
-  assert.deepEqual(updated(holding, "nobody", "another"), [[false, false], [false, false]]);
-  assert.deepEqual(updated(new Holding(), "another"), [[false, false]]);
+  holding.update("you", null, 0);
+  holding.onRelease(true);
+  assert.deepEqual([holding.update("you", null, 1), holding.update("operator", null, 2), holding.isLost], [null, null, false]);
 });
 
-const named = { online: true, operator: "anna" };
-const unnamed = { online: true };
-const heard = (...states) => {
-  const hearing = new Hearing();
-  return states.map(([now, state]) => [hearing.update(state, now), hearing.isLost]);
-};
+test("control that is taken after a release was refused is lost", () => {
+  const holding = new Holding();
+  holding.update("you", null, 0);
+  holding.onRelease(true);
+  holding.onRelease(false);
+  assert.equal(holding.update("operator", null, 1), "lost");
+});
 
-test("a vehicle that no longer names an operator receives nothing, until it names one again", () => {
-  const found = heard([0, named], [100, unnamed], [200, unnamed], [300, named], [400, unnamed]);
-  assert.deepEqual(found, [[false, false], [true, true], [false, true], [false, false], [true, true]]);
+test("a page that opens and is in control has not gained it, one that waits for it has", () => {
+  assert.deepEqual(noticed(["unknown"], ["you"]), [[null, false], [null, false]]);
+  assert.deepEqual(noticed(["unknown"], ["free"], ["you"]), [[null, false], [null, false], ["gained", false]]);
 });
 
 test("a vehicle that comes online has two seconds to hear of its operator", () => {
-  const found = heard([0, named], [100, { online: false }], [200, unnamed], [2100, unnamed], [2200, unnamed]);
-  assert.deepEqual(found, [[false, false], [false, false], [false, false], [false, false], [true, true]]);
-});
-
-test("a vehicle that is offline, or has never named an operator, has lost none", () => {
-  assert.deepEqual(heard([0, unnamed], [9000, unnamed], [9100, null]), [[false, false], [false, false], [false, false]]);
-  assert.deepEqual(heard([0, named], [10, null], [9000, { online: false }]), [[false, false], [false, false], [false, false]]);
+  const back = noticed(["you"], ["unknown", null, 0], ["unheard", null, 100], ["you", null, 400], ["unheard", null, 500]);
+  assert.deepEqual(back, [[null, false], [null, false], [null, false], [null, false], ["lost", true]]);
+  const gone = noticed(["you"], ["unknown", null, 0], ["free", null, 100], ["free", null, 2000], ["free", null, 2100]);
+  assert.deepEqual(gone.at(-2), [null, false]);
+  assert.deepEqual(gone.at(-1), ["lost", true]);
 });

@@ -1,7 +1,8 @@
 /** The operator's actions; `inputs` in the configuration assigns them to keys and buttons. */
 
 import { camera, enlarge, inControl, publish, select, store } from "./store.js";
-import { selectMode, toggleControl } from "./header.js";
+import { selectMode } from "./header.js";
+import { toggleControl } from "./control.js";
 import { driveRoles, focusTile, switchCamera } from "./tiles.js";
 import { scaleTotal } from "./total.js";
 import { sendFull } from "./panel.js";
@@ -61,7 +62,7 @@ export const ACTIONS = {
   monitors: { description: "pictures in additional windows, for other monitors", run: listMonitors },
   switch: { description: "switch the selected camera on or off", run: () => store.selected && switchCamera(store.selected) },
   full_image: { description: "full image of the selected camera (mode S)", run: sendFull },
-  control: { description: "take or release control", run: toggleControl },
+  control: { description: "take, request, offer, accept or release control: the first of its buttons", run: toggleControl },
   theme: { description: "night or day theme", run: toggleTheme },
   help: { description: "show this list", run: () => publish("help") },
 };

@@ -5,8 +5,8 @@ import { worstOf } from "./ages.js";
 import { ALARMS } from "./alarm.js";
 import { Attention } from "./attention.js";
 import { isGuided, nextChoice } from "./guides.js";
-import { holding, linkFault, toggleControl, whyNotInControl } from "./header.js";
-import { withKey } from "./hints.js";
+import { controlWarning } from "./control.js";
+import { linkFault } from "./header.js";
 import { reportAttention, showGuides } from "./link.js";
 import { monitored, ownPictures } from "./monitored.js";
 import { showProblem } from "./requests.js";
@@ -44,7 +44,6 @@ function refresh() {
   refreshSpeed();
   setText(byId("line"), [MODES[mode() ?? ""] ?? "no mode", totalWords(), linkWords()].join(" · "));
   showUplinks(byId("drive-uplinks"), isOnline() ? uplinkLines(store.state, store.sample) : []);
-  refreshControl();
   for (const [part, before] of fitted) {
     const text = (part.textContent ?? "").replace(/\d/g, "0"); // all digits are equally wide
     if (text !== before) fit(part);
@@ -128,13 +127,6 @@ function fit(part) {
   }
 }
 
-function refreshControl() {
-  const button = byId("drive-control", HTMLButtonElement);
-  setText(button, store.holder === "you" ? "Release" : "Take control");
-  button.classList.toggle("strong", store.connected && store.holder !== "you");
-  button.disabled = !store.connected;
-}
-
 // --- lines on the ground ----------------------------------------------------------------------------------------------
 
 /** @returns {import("./guides.js").Choice} */
@@ -183,19 +175,9 @@ function onPress() {
   if (performance.now() - returnedAt > RETURNED_MS) remind("return", null);
 }
 
-function warningText() {
-  if (!inControl()) return holding.isLost ? `CONTROL LOST: ${lossWords()}` : null;
-  const why = whyNotInControl();
-  return [why && `NOT IN CONTROL: ${why}`, attention.warning].filter(Boolean).join(" · ") || null;
-}
-
-function lossWords() {
-  if (store.view !== "monitor") return withKey("this page only watches; take control", "control");
-  return store.abandoned ? "the page of this monitor is closed" : "take control on the page of this monitor";
-}
+const warningText = () => (inControl() ? attention.warning : controlWarning());
 
 export function startDrive() {
-  byId("drive-control").addEventListener("click", toggleControl);
   byId("guides").addEventListener("click", toggleGuides);
   byId("drive-help").addEventListener("click", () => publish("help"));
   addEventListener("blur", () => {

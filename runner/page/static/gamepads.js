@@ -12,6 +12,8 @@ const CLOSING = { help: ["help"], confirm: ["back", "control"], monitors: ["back
 const EFFECTS = {
   lost: { duration: 600, strongMagnitude: 1, weakMagnitude: 1 },
   late: { duration: 200, strongMagnitude: 0.3, weakMagnitude: 0.6 },
+  asked: { duration: 200, strongMagnitude: 0.3, weakMagnitude: 0.6 },
+  passed: { duration: 400, strongMagnitude: 0.6, weakMagnitude: 0.6 },
 };
 
 const presses = new Presses();
@@ -53,7 +55,7 @@ function onDisconnected({ gamepad }) {
   presses.reset(); // a button held when a pad connects again does not count
 }
 
-/** Vibrate for a picture that is lost or late. */
+/** Vibrate with each tone. */
 function vibrate(kind) {
   for (const { vibrationActuator } of pads()) {
     Promise.resolve(vibrationActuator?.playEffect("dual-rumble", EFFECTS[kind])).catch(() => {}); // not every device can

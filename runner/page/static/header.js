@@ -1,10 +1,8 @@
-/** The header: vehicle, mode, totals and control; and the banner when vehicle or station is offline. */
+/** The header: vehicle, mode and totals; and the banner when vehicle or station is offline. */
 
-import { inControl, listen, mode, otherOperator, publish, store } from "./store.js";
-import { pending, reportProblem, request, showProblem, whyNoControl } from "./requests.js";
-import { send } from "./link.js";
-import { withKey } from "./hints.js";
-import { Hearing, Holding } from "./holding.js";
+import { inControl, listen, mode, publish, store } from "./store.js";
+import { pending, request } from "./requests.js";
+import { isUnheard } from "./control.js";
 import { MOVING } from "./status.js";
 import { byId, displayName, setAttribute, setText, whole } from "./format.js";
 
@@ -12,17 +10,12 @@ const START_MS = 800; // no alarm while the page is opening
 const GRACE_MS = 2000; // of a warning
 const UNKNOWN = "▲ Latency unknown: no capture times, or no answer from the vehicle's clock; LATE covers only the time since arrival here";
 const UNMEASURED = "▲ No measurements from the station: speed, advised speed and bitrates are unknown";
-const HOLDERS = { you: "You are in control", another: "Another page is in control", nobody: "Nobody is in control" };
-const UNHEARD = "the vehicle receives nothing from this station";
 
 let clockKnownAt = performance.now(); // when the clock offset was last known, or could not be measured
 
 let sampledAt = performance.now(); // when a sample was last known, or none was due
 let wasSampled = false; // whether any has arrived
-let wasOperator = false; // whether the vehicle had this page's operator in control
 
-export const holding = new Holding();
-const hearing = new Hearing();
 const buttons = [...byId("modes").querySelectorAll("button")];
 
 /** Request another mode. The mode that the vehicle reports stays highlighted. */
@@ -31,61 +24,10 @@ export function selectMode(selected) {
   request("mode", { event: "mode_selected", mode: selected }, `mode ${selected}`);
 }
 
-/**
- * This page has lost control without releasing it: the driver must know, and other pages may drive. A monitor shares its
- * page's control.
- */
-function onControl() {
-  if (store.view === "monitor" && store.holder === "nobody" && !store.abandoned) holding.onRelease(); // its page has released it
-  const isLost = holding.update(store.holder);
-  if (holding.isReleasing) send({ release_control: true }); // the first one may have been lost with its connection
-  if (isLost) reportLoss(HOLDERS[store.holder].toLowerCase());
-}
-
-/** While this page is in control of its station, the vehicle may have passed control to another operator. */
-function watchOperator() {
-  if (!inControl() || store.view === "monitor" || !store.state?.online || !store.state.operator) return;
-  const other = otherOperator();
-  if (other && wasOperator) reportLoss(`operator ${other} is in control`);
-  wasOperator = other === null;
-}
-
-function watchHearing() {
-  const isLost = hearing.update(store.connected ? store.state : null, performance.now());
-  if (isLost && inControl() && store.view !== "monitor") reportLoss(UNHEARD);
-  refreshControl();
-  refreshConnection();
-}
-
-/** Why this page does not control the vehicle, although it is in control of its station; null: it does. */
-export function whyNotInControl() {
-  const other = otherOperator();
-  return other ? `operator ${other} is in control` : hearing.isLost ? UNHEARD : null;
-}
-
-function reportLoss(why) {
-  reportProblem(`CONTROL LOST: ${why}`);
-  publish("deposed");
-}
-
-export function toggleControl() {
-  if (!store.connected) return;
-  if (store.view === "monitor") return showProblem("only the page can take or release control, not its monitors");
-  if (store.holder === "you") {
-    holding.onRelease();
-    return send({ release_control: true });
-  }
-  holding.onTake();
-  if (store.holder === "nobody") return send({ take_control: true });
-  setText(byId("confirm-text"), "Another page is in control of this vehicle. Take control from it?");
-  byId("confirm", HTMLDialogElement).showModal();
-}
-
 function refresh() {
   setText(byId("vehicle"), store.hello?.vehicle ?? "…");
   document.title = [...(globalThis.boot.shown ?? []).map(displayName), store.hello?.vehicle, "tod-runner"].filter(Boolean).join(" · ");
   refreshModes();
-  refreshControl();
   refreshBanner();
   refreshConnection();
 }
@@ -100,19 +42,6 @@ function refreshModes() {
     setAttribute(button, "tabindex", own === (now ?? "single") ? 0 : -1);
     setAttribute(button, "aria-disabled", inControl() && now ? null : "true");
   }
-}
-
-function refreshControl() {
-  const button = byId("take-control", HTMLButtonElement);
-  const other = otherOperator();
-  const isUnheard = store.holder === "you" && hearing.isLost;
-  const own = isUnheard ? "Vehicle does not receive you" : HOLDERS[store.holder];
-  setText(byId("holder"), !store.connected ? "" : other ? `Operator ${other} is in control` : own);
-  setAttribute(byId("holder"), "data-holder", other || isUnheard ? "another" : store.holder);
-  setText(button, store.holder === "you" ? "Release" : "Take control");
-  button.classList.toggle("strong", store.connected && store.holder !== "you");
-  button.disabled = !store.connected;
-  button.title = store.connected ? withKey("take or release control", "control") : whyNoControl();
 }
 
 function refreshBanner() {
@@ -131,7 +60,7 @@ export function linkFault() {
   if (!store.connected) return store.hung ? "video stopped" : "station unreachable";
   if (!store.state) return "no state yet";
   if (!store.state.online) return store.link.fault ? "no control link" : "vehicle offline";
-  return hearing.isLost ? "vehicle receives nothing" : null;
+  return isUnheard() ? "vehicle receives nothing" : null;
 }
 
 function refreshConnection() {
@@ -185,20 +114,12 @@ function moveFocus(event) {
 export function startHeader() {
   for (const button of buttons) button.addEventListener("click", () => selectMode(button.dataset.mode));
   byId("modes").addEventListener("keydown", moveFocus);
-  byId("take-control").addEventListener("click", toggleControl);
-  const confirm = byId("confirm", HTMLDialogElement);
-  confirm.addEventListener("close", () => {
-    if (confirm.returnValue === "yes") send({ take_control: true });
-    confirm.returnValue = "";
-  });
   byId("help-open").addEventListener("click", () => publish("help"));
-  listen("control", onControl);
-  listen("control state", watchOperator);
-  listen("state socket ages", watchHearing);
   listen("hello state link control requests socket", refresh);
   listen("link", refreshWarning);
   listen("sample socket state", refreshTotals);
   listen("ages", refreshWarning);
+  listen("ages", refreshConnection);
   listen("ages", refreshSkew);
   setTimeout(refresh, START_MS + 50);
   refresh();

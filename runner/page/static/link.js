@@ -18,7 +18,7 @@ const handlers = {
   socket({ open }) {
     if (hung) return void (hung.connected = open);
     store.connected = open;
-    if (!open) store.holder = "nobody";
+    if (!open) store.holder = "unknown";
     publish("socket", open);
   },
   status({ camera, status, why }) {

@@ -1,12 +1,13 @@
 /** Wires the page: one module for each part, all fed by the messages that the worker passes on from the station. */
 
 import { ask, send, start } from "./link.js";
-import { listen, store } from "./store.js";
+import { listen, store, who } from "./store.js";
 import { requests } from "./requests.js";
 import { startTheme } from "./theme.js";
 import { startViews } from "./views.js";
 import { startHints } from "./hints.js";
 import { startHeader } from "./header.js";
+import { startControl } from "./control.js";
 import { startTiles } from "./tiles.js";
 import { startDrive } from "./drive.js";
 import { startBirdseye } from "./birdseye.js";
@@ -28,6 +29,7 @@ startTheme();
 startViews();
 startHints();
 startHeader();
+startControl();
 startTiles();
 startDrive();
 startBirdseye();
@@ -66,5 +68,6 @@ globalThis.tod = {
     return { pending: [...requests.pending.values()].map(({ timer, ...kept }) => kept), answered: requests.answered };
   },
 };
-const SHOWN = { state: "state", sample: "sample", history: "series", view: "view", control: "holder", selected: "selected" };
+const SHOWN = { state: "state", sample: "sample", history: "series", view: "view", selected: "selected" };
 for (const [name, key] of Object.entries(SHOWN)) Object.defineProperty(globalThis.tod, name, { get: () => store[key] });
+Object.defineProperty(globalThis.tod, "control", { get: who });

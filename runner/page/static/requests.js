@@ -3,7 +3,7 @@
  * of a request; a control is shown as pending until its request is answered.
  */
 
-import { inControl, listen, note, publish, store } from "./store.js";
+import { inControl, listen, note, publish, store, who } from "./store.js";
 import { withKey } from "./hints.js";
 import { send } from "./link.js";
 
@@ -19,14 +19,18 @@ export const requests = { pending: new Map(), answered: [] };
 let count = 0;
 
 /**
- * Send an event.
+ * Send an event that needs control.
  * @param {string} control name of what it sets, "mode", "on:front_left": a newer request for it replaces an older one
  * @param {object} event without id
  * @param {string} description for the list of events if the request fails
  * @returns {string|undefined} its id; undefined: this page is not in control
  */
 export function request(control, event, description) {
-  if (!inControl()) return void showProblem(whyNoControl());
+  return inControl() ? submit(control, event, description) : void showProblem(whyNoControl());
+}
+
+/** Send an event, also without control. @param {string} control  @param {object} event  @param {string} description */
+export function submit(control, event, description) {
   const id = `${PREFIX}-${++count}`;
   const none = { id, result: "timed out", reason: "no answer from the station" };
   const timer = setTimeout(() => onReply(none), 1000 * (store.hello?.answer_s ?? 0) + GIVE_UP_MS);
@@ -41,10 +45,24 @@ export function pending(control) {
   return [...requests.pending.values()].findLast((each) => each.control === control);
 }
 
+/** Why this page's person cannot change what is sent, and what they can do. */
 export function whyNoControl() {
   if (!store.connected) return store.hung ? "the page's worker does not respond" : "no connection to the station";
-  if (store.holder === "another") return "another page holds control";
-  return store.view === "monitor" ? "the page of this monitor does not hold control" : withKey("take control first", "control");
+  const [holder, ask] = [store.driving?.holder, withKey("request control", "control")];
+  switch (who()) {
+    case "another":
+      return "another page holds control";
+    case "operator":
+      return `operator ${holder} is in control; ${ask}`;
+    case "lost":
+      return `operator ${holder} was in control and is lost; ${ask}`;
+    case "unheard":
+      return "the vehicle receives nothing from this station";
+    case "unknown":
+      return "the vehicle is offline";
+    default:
+      return store.view === "monitor" ? "the page of this monitor does not hold control" : withKey("take control first", "control");
+  }
 }
 
 /** Show a problem in a toast. */
@@ -66,6 +84,7 @@ function onReply({ id, result, reason }) {
   const { timer, ...kept } = entry;
   requests.answered = [...requests.answered, { ...kept, result, reason, answered: Date.now() }].slice(-200);
   if (result !== "applied") reportProblem(`${entry.description}: ${result}${reason ? `: ${reason}` : ""}`);
+  publish("answered", { ...kept, result });
   publish("requests");
 }
 

@@ -3,14 +3,14 @@
  * the one that takes control; until then, and while muted, the page shows it.
  */
 
-import { alertStatus, listen, publish, store } from "./store.js";
+import { alertStatus, listen, publish, store, who } from "./store.js";
 import { Alarm, worstKind } from "./alarm.js";
 import { monitored } from "./monitored.js";
 import { withKey } from "./hints.js";
 import { byId, setAttribute, setText } from "./format.js";
 
 const KEY = "tod-muted";
-const TONES = { lost: [880, 587, 880, 587], late: [659] }; // Hz, one after the other
+const TONES = { lost: [880, 587, 880, 587], late: [659], asked: [784, 784], passed: [523, 784, 1047] }; // Hz, one after the other
 const TONE_S = 0.15;
 const VOLUME = 0.3;
 const CHECK_MS = 250;
@@ -26,7 +26,7 @@ const isMuted = () => localStorage.getItem(KEY) === "yes";
 
 /** Create or resume the audio context if needed; it stays blocked until a click or key press. */
 function unlock() {
-  if (!isDriving) return;
+  if (!isDriving && store.holder !== "you") return; // its person may be offered control
   if (!context) {
     context = new AudioContext();
     context.onstatechange = onAudioState;
@@ -58,7 +58,7 @@ function play(kind) {
   }
 }
 
-/** @param {"lost"|"late"|null} kind */
+/** @param {keyof typeof TONES|null} kind */
 function sound(kind) {
   if (!kind) return;
   publish("alarm", kind);
@@ -80,7 +80,7 @@ function onStatus(picture, camera, status) {
 
 function onControl() {
   const before = isDriving;
-  isDriving = store.holder === "you" || (isDriving && !store.connected);
+  isDriving = who() === "you" || (isDriving && who() === "unknown");
   unlock();
   if (isDriving && !before) soundCurrent();
   refresh();
@@ -117,11 +117,13 @@ export function startSound() {
   const onClick = () => (!wasBlocked || isMuted()) && toggleSound(); // resumed since the press began
   for (const button of buttons) button.addEventListener("click", onClick);
   for (const kind of ["pointerup", "keydown"]) addEventListener(kind, onPress, true);
-  listen("control", onControl);
+  listen("control state socket", onControl);
   listen("hello", refresh);
   listen("status", ({ camera, status }) => onStatus(camera, camera, status));
   listen("monitored", ({ picture, camera, status }) => onStatus(picture, camera, status));
   listen("deposed unseen unplugged", () => sound("lost"));
+  listen("passed", () => sound("passed"));
+  listen("asked", () => sound("asked"));
   addEventListener("storage", refresh); // muted in another window
   setInterval(() => {
     const kind = alarm.overdue(performance.now());

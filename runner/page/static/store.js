@@ -1,8 +1,10 @@
 /** The page's state, as received from the station; views listen for the kinds of messages that they show. */
 
 import { BIRDSEYE } from "./arrange.js";
+import { onlyNamed, whoDrives } from "./driving.js";
 
 const SHOWN_S = 300;
+const UNDRIVEN = ["free", "nobody", "unknown"];
 const SAMPLE_MS = 1000; // the station sends four samples a second
 const listeners = new Map();
 let sampledAt = -Infinity; // page time of the last sample
@@ -10,7 +12,8 @@ let sampledAt = -Infinity; // page time of the last sample
 /**
  * The part of the station's messages that the page uses.
  * @typedef {import("./records.js").CameraState & {applied: Applied}} Decision
- * @typedef {import("./records.js").VehicleState & {cameras: Record<string, Decision>}} State
+ * @typedef {import("./records.js").VehicleState & {cameras: Record<string, Decision>, held_since: number|null}} State
+ *   held_since: since when its holder is in control, or was until it was lost, s since 1970
  * @typedef {import("./records.js").Sample & {time: number}} Sample time: s since 1970
  * @typedef {object} Camera of hello
  * @property {string} name
@@ -30,9 +33,9 @@ let sampledAt = -Infinity; // page time of the last sample
  * @property {number[]} scaling factors, rising
  * @property {number} b_full_kbps
  * @typedef {{vehicle: string, cameras: Camera[], layout: Layout, selected: string|null,
- *   dimensions: import("./guides.js").Dimensions|null, inputs: Inputs, operator: string|null, answer_s: number,
+ *   dimensions: import("./guides.js").Dimensions|null, inputs: Inputs, operator: string, answer_s: number,
  *   late_ms: number}} Hello
- * selected: in another window of this page; operator: this station's by its keys; answer_s: the station
+ * selected: in another window of this page; operator: this station's; answer_s: the station
  *   answers a request within this time; late_ms: a picture older than this is late
  * @typedef {{keys: Record<string, string|null>, buttons: Record<string, number|string|null>}} Inputs by action
  * @typedef {{places: Places, own: Places, drive: import("./placing.js").Places|null, problem: string|null}} Layout of the Configure
@@ -55,9 +58,10 @@ let sampledAt = -Infinity; // page time of the last sample
  * @typedef {object} Store
  * @property {Hello|null} hello
  * @property {State|null} state
+ * @property {import("./driving.js").Driving|null} driving as the vehicle last published it; null: not yet
  * @property {Sample|null} sample null: none yet, or none for a second
  * @property {Link} link
- * @property {string} holder
+ * @property {string} holder which of the station's pages acts for it: you, another or nobody; unknown: not told since it connected
  * @property {boolean} abandoned
  * @property {boolean} elsewhere
  * @property {boolean} covered
@@ -80,10 +84,11 @@ let sampledAt = -Infinity; // page time of the last sample
 export const store = {
   hello: null,
   state: null,
+  driving: null,
   sample: null,
   link: { fault: null, expiring: [] },
-  holder: "nobody",
-  abandoned: false, // whether nobody is in control because the page that was has closed
+  holder: "unknown",
+  abandoned: false, // whether no page acts for the station because the one that did has closed
   elsewhere: false, // whether another window of this page has the keyboard focus
   covered: false, // whether another window of this page is hidden
   connected: false,
@@ -134,13 +139,24 @@ export function onStationMessage(message) {
   else if (kind === "history") onHistory(message);
   else if (kind === "note") return note({ ...message, own: false });
   if (kind === "sample") appendSample(message);
+  if (kind === "state") onState(message);
   publish(kind, message);
   if (store.selected !== selected) publish("selected", store.selected); // by a hello: another window has selected it meanwhile
 }
 
 function onControl({ holder, abandoned, elsewhere, covered }) {
   Object.assign(store, { holder, abandoned, elsewhere, covered });
-  if (holder !== "you") store.reminders.clear();
+  forgetReminders();
+}
+
+/** While the vehicle is offline, what it published last counts. @param {State} state */
+function onState({ online, driving, operator }) {
+  if (online) store.driving = driving ?? onlyNamed(operator, store.hello?.operator ?? "");
+  forgetReminders();
+}
+
+function forgetReminders() {
+  if (!["you", "unknown"].includes(who())) store.reminders.clear();
 }
 
 /** Remind whoever drives of something until it is settled: text null. @param {string} key  @param {string|null} text */
@@ -187,17 +203,16 @@ export function whyUndecided(name) {
   return decisionOf(name) ? "" : `The vehicle has no camera ${name}.`;
 }
 export const mode = () => (store.state?.online ? store.state.mode : null);
-export const inControl = () => store.connected && store.holder === "you";
 
-/**
- * The operator in control, if it is not this station's; null: it is, nobody is, or any operator's requests are carried
- * out, as without keys.
- */
-export function otherOperator() {
-  const own = store.hello?.operator;
-  const operator = store.connected && store.state?.online ? store.state.operator : undefined;
-  return own && operator && operator !== own ? operator : null;
+/** What this page knows of who drives. @returns {import("./driving.js").View} */
+export function driverView() {
+  const [own, page] = [store.hello?.operator ?? "", store.connected ? store.holder : "unknown"];
+  return { driving: store.driving, own, page, online: store.state?.online === true };
 }
+
+/** Who drives: the one truth that all of the page reads. */
+export const who = () => whoDrives(driverView());
+export const inControl = () => who() === "you";
 
 /**
  * A camera's status as far as the driver must be alerted to it: pauses while nobody drives, and those by a weight of 0, are intended.
@@ -205,7 +220,7 @@ export function otherOperator() {
  */
 export function alertStatus(name, status = store.status[name]) {
   const isUnshared = mode() !== "single" && decisionOf(name)?.weight === 0;
-  return status === "paused" && (store.holder === "nobody" || isUnshared) ? "off" : status;
+  return status === "paused" && (UNDRIVEN.includes(who()) || isUnshared) ? "off" : status;
 }
 
 /** Select a camera in all windows of this page. */

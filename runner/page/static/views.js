@@ -95,7 +95,7 @@ export function startViews() {
   document.addEventListener("fullscreenchange", showFullScreen);
   byId("offer-drive").addEventListener("click", () => setView("drive"));
   byId("offer-no").addEventListener("click", dismissOffer);
-  listen("control socket", refreshOffer);
+  listen("control state socket", refreshOffer);
   applyView();
   showFullScreen();
 }

@@ -1,0 +1,96 @@
+/** Who drives from a page's point of view, and the buttons that its person gets. */
+
+import assert from "node:assert/strict";
+import { test } from "node:test";
+
+import { choicesOf, driverWords, handOverWords, LivePictures, onlyNamed, speedWords, whoDrives } from "../../runner/page/static/driving.js";
+
+const NONE = { state: "free", holder: null, since: 0, offered: null, offer_ends: null, requested: [], released: null, standing: true, why: "" };
+const PRESENT = { anna: "controller", bob: "controller", eve: "watcher" };
+
+/** @returns {any} what the page of anna's station sees */
+const seen = (driving = {}, more = {}) => ({ driving: { ...NONE, present: PRESENT, ...driving }, own: "anna", page: "you", online: true, ...more });
+const held = (holder, more = {}) => ({ state: "held", holder, ...more });
+const texts = (view) => choicesOf(view).map(({ text, why }) => (why ? `${text}: ${why}` : text));
+
+test("who drives follows from the vehicle's record and the page that acts for the station", () => {
+  const table = [
+    [seen(), "free"],
+    [seen({ present: { bob: "controller" } }), "unheard"],
+    [seen(held("anna")), "you"],
+    [seen(held("anna"), { page: "another" }), "another"],
+    [seen(held("anna"), { page: "nobody" }), "nobody"],
+    [seen(held("anna"), { page: "unknown" }), "unknown"],
+    [seen(held("bob")), "operator"],
+    [seen(held("bob"), { page: "another" }), "operator"],
+    [seen({ state: "lost", holder: "bob" }), "lost"],
+    [seen({ state: "lost", holder: "anna" }), "unheard"],
+    [seen({}, { driving: null }), "unknown"],
+  ];
+  for (const [view, who] of table) assert.equal(whoDrives(view), who);
+  assert.deepEqual(["operator", "lost"].map((who) => driverWords(/** @type {any} */ (who), /** @type {any} */ (held("bob")))), ["Operator bob is in control", "Operator bob is lost"]);
+});
+
+test("a vehicle of an earlier version names who is in control, or obeys everybody", () => {
+  const who = (operator) => whoDrives({ driving: onlyNamed(operator, "anna"), own: "anna", page: "you" });
+  assert.deepEqual([who(undefined), who("anna"), who("bob")], ["you", "you", "operator"]);
+});
+
+test("the driver offers control to those who ask before others", () => {
+  assert.deepEqual(texts(seen(held("anna", { present: { anna: "controller" } }))), ["Release"]);
+  assert.deepEqual(texts(seen(held("anna"))), ["Release", "Offer …"]);
+  assert.deepEqual(choicesOf(seen(held("anna")))[1].takers, ["bob"], "not to a watcher");
+  assert.deepEqual(texts(seen(held("anna", { requested: ["bob"] }))), ["Offer control to bob", "Release"]);
+  assert.deepEqual(texts(seen(held("anna", { offered: "bob", requested: ["bob"] }))), ["Withdraw offer", "Release"]);
+});
+
+test("an operator who does not drive asks, waits for the pictures, and accepts", () => {
+  assert.deepEqual(texts(seen()), ["Take control"]);
+  assert.deepEqual(texts(seen(held("bob"))), ["Request control"]);
+  assert.deepEqual(texts(seen(held("bob", { requested: ["anna"] }))), ["Withdraw request"]);
+  const offered = held("bob", { offered: "anna" });
+  assert.deepEqual(texts(seen(offered, { unseen: ["front left", "rear"] })), ["Accept control: waiting for pictures: front left, rear", "Decline"]);
+  assert.deepEqual(texts(seen(offered, { page: "another" })), ["Accept control", "Decline"], "any page of the station may act");
+});
+
+test("a supervisor may take control, after confirming", () => {
+  const present = { ...PRESENT, anna: "supervisor" };
+  const choices = choicesOf(seen(held("bob", { present })));
+  assert.deepEqual(choices.map(({ text, from }) => [text, from]), [["Request control", undefined], ["Take control", "operator"]]);
+  assert.deepEqual([8.1, 0, undefined].map(speedWords), ["at 29 km/h", "at 0 km/h", "at a speed that is not known, which counts as moving"]);
+});
+
+test("buttons that do nothing say why", () => {
+  assert.deepEqual(texts(seen(held("bob"), { own: "eve" })), ["Request control: a watcher may not drive"]);
+  assert.deepEqual(texts(seen(held("anna"), { online: false })), ["Release: the vehicle is offline"]);
+  assert.deepEqual(texts(seen({ state: "lost", holder: "anna" })), ["Take control: the vehicle receives nothing from this station"]);
+  assert.deepEqual(texts(seen(held("anna"), { page: "unknown" })), ["Take control: no connection to the station"]);
+});
+
+test("another page of the station is asked for a confirmation, one that has closed is not", () => {
+  assert.deepEqual(choicesOf(seen(held("anna"), { page: "another" })), [{ text: "Take control", from: "page" }]);
+  assert.deepEqual(choicesOf(seen(held("anna"), { page: "nobody", online: false })), [{ text: "Take control" }]);
+});
+
+test("everybody is told who asks and to whom control is offered", () => {
+  const table = [
+    [held("bob"), ""],
+    [held("bob", { requested: ["anna"] }), "You ask for control"],
+    [held("anna", { requested: ["bob", "carol"] }), "bob, carol ask for control"],
+    [held("anna", { offered: "bob", requested: ["bob", "carol"] }), "You offer control to bob; you drive until bob accepts. carol asks for control"],
+    [held("bob", { offered: "carol" }), "bob offers control to carol"],
+  ];
+  for (const [driving, words] of table) assert.equal(handOverWords(seen(driving)), words);
+  const view = seen(held("bob", { offered: "anna", requested: ["anna"] }), { unseen: ["rear"] });
+  assert.equal(handOverWords(view), "bob offers control to you; waiting for pictures: rear");
+});
+
+test("a picture counts once it has been live for a second without a break", () => {
+  const pictures = new LivePictures();
+  pictures.update({ front: "live", rear: "lost" }, 0);
+  assert.deepEqual(pictures.seen(999), []);
+  assert.deepEqual(pictures.seen(1000), ["front"]);
+  pictures.update({ front: "late", rear: "live" }, 1100);
+  pictures.update({ front: "live", rear: "live" }, 1200);
+  assert.deepEqual([pictures.seen(2100), pictures.seen(2200)], [["rear"], ["rear", "front"]]);
+});
