@@ -247,8 +247,9 @@ class VehicleSide:
 
     def read(self) -> dict[str, CameraReading]:
         """By camera, what its elements say now. From any thread."""
-        lost, copies = self._lost.reasons(), self._server.copies() if self._server else {}
-        return {name: self._read(name, lost.get(name), copies.get(name, 0)) for name in self._wanted}
+        lost, server = self._lost.reasons(), self._server
+        copies, refused = (server.copies(), server.admission.refused()) if server else (NOTHING, NOTHING)
+        return {n: self._read(n, lost.get(n), copies.get(n, 0), refused.get(n, NOTHING)) for n in self._wanted}
 
     def stages(self) -> dict[str, SenderStages]:
         """By camera, latency from capture to the encoder, and through it, ms; unknown ones are omitted.
@@ -287,12 +288,13 @@ class VehicleSide:
 
         self._glib.end(stop)
 
-    def _read(self, name: str, lost: str | None, copies: int) -> CameraReading:
+    def _read(self, name: str, lost: str | None, copies: int, refused: Mapping[str, str]) -> CameraReading:
         pipeline, refusal = self._pipeline(name), self._refusal(name)
         if pipeline is None:
-            return CameraReading(fault=refusal, lost=lost, copies=copies)
+            return CameraReading(fault=refusal, lost=lost, copies=copies, refused=refused)
         fault, untimed, slow_fps = pipeline.source_fault or refusal, pipeline.untimed, pipeline.slow_fps
-        return CameraReading(dict(pipeline.knobs.applied), pipeline.counters(), fault, lost, untimed, slow_fps, copies)
+        rest = fault, lost, untimed, slow_fps, copies, refused
+        return CameraReading(dict(pipeline.knobs.applied), pipeline.counters(), *rest)
 
     def _on_found(self, name: str) -> None:
         """From the thread that tries again. A viewer makes the server open its camera."""
@@ -416,15 +418,16 @@ class OperatorSide:
 
         self._glib.call("starting the receivers", start)
 
-    def sample(self, sending: Mapping[str, bool]) -> dict[str, Reception]:
+    def sample(self, sending: Mapping[str, bool], anew: bool = False) -> dict[str, Reception]:
         """Reception of each camera; to be called a few times a second.
 
         sending  which cameras should send; a silent one that should is rebuilt. Unknown ones are omitted
+        anew     ask at once for those that the vehicle has refused: it may decide otherwise now
         raises   RunError if GStreamer hangs
         """
         receivers = self._receivers
         return self._glib.call(
-            "reading the receivers' counters", lambda: {n: r.sample(sending.get(n)) for n, r in receivers.items()}
+            "reading the receivers' counters", lambda: {n: r.sample(sending.get(n), anew) for n, r in receivers.items()}
         )
 
     def admit(self, uplinks: Addresses) -> None:

@@ -86,18 +86,23 @@ class Media(Endpoint):
     rtp_ports          first and last UDP port for RTP and RTCP; a camera takes two
     session_timeout_s  a viewer that sends neither requests nor RTCP for this long is dropped
     max_viewers        simultaneous viewers of one camera outside the vehicle
+    watcher_copies     whether they may be watchers, a role of keys
     secure             whether it serves RTSP over TLS, with SRTP
     """
 
     rtp_ports: tuple[int, int]
     session_timeout_s: int
     max_viewers: int
+    watcher_copies: bool = False
     secure: bool = False
 
     def __post_init__(self) -> None:
         first, last = self.rtp_ports
         if first >= last:
             raise ModelError("rtp_ports", f"[{first}, {last}]", "must be [first, last], first below last")
+        if self.watcher_copies and self.max_viewers < 2:
+            rule = "must be false while max_viewers is 1: the operator in control would take the watcher's place"
+            raise ModelError("watcher_copies", "true", rule)
 
 
 @dataclass(frozen=True, slots=True)

@@ -563,6 +563,11 @@ def test_a_base_that_does_not_exist(conf: UserConf, tod: Command) -> None:
             "graph.mtu_bytes: 1317: must be at most 1316 with srtsink, which cuts longer packets",
         ),
         (["media.max_viewers=0"], "media.max_viewers: 0: must be at least 1"),
+        (
+            ["media.watcher_copies=true"],
+            "media.watcher_copies: true: must be false while max_viewers is 1: "
+            "the operator in control would take the watcher's place",
+        ),
         (["media.session_timeout_s=1.5"], "media.session_timeout_s: 1.5: must be a whole number"),
         (["media.host=on", "media.port=true"], "media.port: true: must be a whole number"),
         (["name=${oc.env:HOME}"], "name: Unsupported interpolation type oc.env"),

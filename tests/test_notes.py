@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 from msgspec import UNSET
@@ -13,7 +13,15 @@ from msgspec import UNSET
 from runner.core.driving import Control, Driving
 from runner.core.events import EVENTS, LinkState
 from runner.mqtt.messages import read_state
-from runner.operator.notes import CAUSES, change_notes, decision_note, driver_words
+from runner.operator.notes import (
+    CAUSES,
+    EXPLAINED_S,
+    UNEXPLAINED,
+    Refusals,
+    change_notes,
+    decision_note,
+    driver_words,
+)
 from runner.operator.uplinks import uplink_rows
 from runner.records.vehicle import UplinkMeasured, VehicleState
 
@@ -153,3 +161,44 @@ def test_a_note_says_why_another_operator_drives() -> None:
     after = replace(before, driving=Driving(Control.HELD, "bob", why="bob has accepted control from anna"))
     assert list(change_notes(before, after)) == ["bob has accepted control from anna"]
     assert list(change_notes(after, replace(after, t=9.0))) == []
+
+
+# --- refused pictures -------------------------------------------------------------------------------------------------
+
+NO_PLACE = "one viewer per camera: media.max_viewers; anna watches"
+
+
+class Received(NamedTuple):
+    """The part of a reception that counts here."""
+
+    refused: bool = True
+
+
+class Camera(NamedTuple):
+    """The part of a camera's state that counts here."""
+
+    refused: object = UNSET
+
+
+def test_the_reason_comes_from_the_vehicle_and_is_noted_once():
+    refusals = Refusals("bert")
+    both, told = (
+        {"front": Received(), "rear": Received()},
+        {"front": Camera({"bert": NO_PLACE}), "rear": Camera({"bert": NO_PLACE})},
+    )
+    assert refusals.update(both, {"front": Camera(), "rear": Camera()}, 0) == []  # its state is about to say why
+    assert refusals.words == {"front": UNEXPLAINED, "rear": UNEXPLAINED}
+    assert refusals.update(both, told, 0.2) == [f"front, rear: refused by the vehicle: {NO_PLACE}"]
+    assert refusals.update(both, told, 5) == []
+    assert refusals.words == {"front": NO_PLACE, "rear": NO_PLACE}
+    assert refusals.update({"front": Received(refused=False), "rear": Received()}, told, 6) == []
+    assert refusals.words == {"rear": NO_PLACE}
+    assert refusals.update(both, told, 7) == [f"front: refused by the vehicle: {NO_PLACE}"]  # once more
+
+
+def test_a_vehicle_that_does_not_say_why_is_explained_by_the_status_alone():
+    refusals = Refusals("bert")
+    front = {"front": Received()}
+    assert refusals.update(front, {"front": Camera({"carl": NO_PLACE})}, 0) == []
+    assert refusals.update(front, {}, EXPLAINED_S) == [f"front: refused by the vehicle: {UNEXPLAINED}"]
+    assert refusals.update(front, {}, 9) == []

@@ -4,7 +4,17 @@ from __future__ import annotations
 
 import pytest
 
-from runner.gst.viewers import StreamViewer, admit, operator_of, over_uplink, too_many, user_agent
+from runner.gst.viewers import (
+    STATED_S,
+    RefusedViewers,
+    StreamViewer,
+    admit,
+    limit_words,
+    operator_of,
+    over_uplink,
+    too_many,
+    user_agent,
+)
 
 LOCAL, ANNA, BERT, ANYONE = (
     StreamViewer("127.0.0.1"),
@@ -86,3 +96,30 @@ def test_who_leaves_once_control_has_passed(viewers, limit, drivers, leaving):
 )
 def test_an_operator_is_known_by_its_user_agent(agent, operator):
     assert operator_of(agent) == operator
+
+
+def test_a_refusal_names_the_key_and_who_watches():
+    assert limit_words(1, [LOCAL, ANNA]) == "one viewer per camera: media.max_viewers; anna watches"
+    assert limit_words(2, [BERT, ANNA]) == "2 viewers per camera: media.max_viewers; anna and bert watch"
+    assert limit_words(1, [ANYONE]) == "one viewer per camera: media.max_viewers"
+
+
+def test_a_refusal_is_stated_until_the_viewer_is_admitted_or_asks_no_more():
+    refused = RefusedViewers()
+    assert refused.add("front", BERT, "full", 0)
+    assert not refused.add("front", BERT, "full", 30)  # is known
+    assert refused.add("front", ANYONE, "full", 30)  # states no operator: it is reported, but asks for nothing
+    assert refused.stated(30 + STATED_S - 1) == {"front": {"bert": "full"}}
+    assert refused.stated(30 + STATED_S) == {}
+    refused.add("front", BERT, "full", 100)
+    refused.remove("front", BERT)
+    assert refused.stated(100) == {}
+
+
+def test_refused_viewers_with_ever_new_names_use_bounded_memory():
+    refused = RefusedViewers()
+    for number in range(1000):
+        refused.add("front", StreamViewer("192.0.2.7", f"name{number}"), "full", 0)
+    stated = refused.stated(0)["front"]
+    assert len(stated) == 50
+    assert "name999" in stated

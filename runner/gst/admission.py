@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from gi.repository import GstRtsp, GstRtspServer
 
+from runner.core.roles import Role
 from runner.gst.clients import Clients
 from runner.gst.connections import RtspConnection
 from runner.gst.opening import ServedCameras
 from runner.gst.rtsp_requests import user_agent, wants_udp
 from runner.gst.sessions import end, set_up, transports
-from runner.gst.viewers import admit, operator_of, too_many
+from runner.gst.viewers import (
+    RefusedViewers,
+    StreamViewer,
+    admit,
+    limit_words,
+    operator_of,
+    over_uplink,
+    too_many,
+)
+from runner.settings import Media
 
 if TYPE_CHECKING:
     from runner.gst.secure import ViewerCheck
@@ -30,8 +41,9 @@ ONE_MORE = "it was admitted until control was handed over"
 class Admission:
     """Decides in the thread of each client.
 
-    keys         None: anyone may watch
-    max_viewers  of a camera over the uplink
+    keys       None: anyone may watch
+    media      states who may have a copy over the uplink
+    on_report  called with a camera and who is refused it, and why
 
     `drivers` are those that are always admitted: see `runner.gst.viewers`.
     """
@@ -41,23 +53,26 @@ class Admission:
         cameras: ServedCameras,
         clients: Clients,
         keys: ViewerCheck | None,
-        max_viewers: int,
+        media: Media,
+        on_report: Callable[[str, str], None],
     ) -> None:
         self._cameras, self._clients, self._keys = cameras, clients, keys
-        self._max_viewers, self._changed = max_viewers, clients.changed
+        self._media, self._changed, self._on_report = media, clients.changed, on_report
+        self._refused = RefusedViewers()
         self.drivers: tuple[str, ...] = ()
 
     def give_control(self, drivers: Sequence[str]) -> None:
         """Admit others from now on, and disconnect those that were admitted as a second one. From any thread."""
+        limit = self._media.max_viewers
         with self._changed:
             self.drivers = tuple(drivers)
             watching = {name: self._clients.watching(name) for name in self._cameras.named}
         surplus = set[RtspConnection]()
         for connections in watching.values():
-            leaving = too_many([c.viewer for c in connections], self._max_viewers, self.drivers)
+            leaving = too_many([c.viewer for c in connections], limit, self.drivers)
             surplus |= {connection for connection in connections if connection.viewer in leaving}
         for connection in surplus:
-            self._clients.disconnect(connection, f"{ONE_MORE}: media.max_viewers={self._max_viewers}")
+            self._clients.disconnect(connection, f"{ONE_MORE}: media.max_viewers={limit}")
 
     def on_setup(self, client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext) -> GstRtsp.RTSPStatusCode:
         """Admit a viewer, or refuse it for its keys, or because its copy of the stream would overload the uplink."""
@@ -81,7 +96,7 @@ class Admission:
             current = self._clients.watching(camera.name)
             viewers = [c.viewer for c in current]
             is_admitted = new_viewer in current
-            leaving = [] if is_admitted else admit(viewers, new_viewer.viewer, self._max_viewers, self.drivers)
+            leaving = [] if is_admitted else self._admit(camera.name, viewers, new_viewer.viewer)
             if leaving is None:
                 return REFUSED
             new_viewer.cameras.setdefault(camera.name, None)
@@ -92,6 +107,32 @@ class Admission:
                 why = f"operator {operator}, who has or is offered control, watches from {new_viewer.viewer.address}"
                 self._clients.disconnect(connection, why)
         return OK
+
+    def _admit(
+        self, camera: str, viewers: Sequence[StreamViewer], new_viewer: StreamViewer
+    ) -> Sequence[StreamViewer] | None:
+        """As `admit`; a refusal is reported once."""
+        limit, leaving = self._media.max_viewers, None
+        if self._must_not_load(new_viewer):
+            why = "a watcher gets no copy over the uplink: media.watcher_copies"
+        else:
+            leaving = admit(viewers, new_viewer, limit, self.drivers)
+            why = limit_words(limit, viewers)
+        if leaving is not None:
+            self._refused.remove(camera, new_viewer)
+        elif self._refused.add(camera, new_viewer, why, time.monotonic()):
+            self._on_report(camera, f"refused the viewer at {new_viewer}: {why}")
+        return leaving
+
+    def _must_not_load(self, viewer: StreamViewer) -> bool:
+        """Whether a viewer is one that may only watch, and would load the uplink."""
+        is_watcher = self._keys is not None and self._keys.role(viewer.operator) == Role.WATCHER
+        return is_watcher and not self._media.watcher_copies and over_uplink(viewer.address)
+
+    def refused(self) -> dict[str, dict[str, str]]:
+        """By camera and operator, why this one is refused it. From any thread."""
+        with self._changed:
+            return self._refused.stated(time.monotonic())
 
 
 def _end_other(client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext) -> bool:

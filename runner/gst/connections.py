@@ -61,7 +61,7 @@ class RtspConnection:
         self._written: deque[tuple[float, int]] = deque()  # when, total bytes written by then
 
     def __str__(self) -> str:
-        return f"{self.viewer.address} ({self.viewer.operator})" if self.viewer.operator else self.viewer.address
+        return str(self.viewer)
 
     def _probe_after(self, silent_s: int) -> None:
         for option, value in (("KEEPIDLE", silent_s), ("KEEPINTVL", KEEPALIVE_S), ("KEEPCNT", KEEPALIVES)):

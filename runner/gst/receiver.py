@@ -17,7 +17,15 @@ from runner.gst.arriving import NTP_EPOCH_S
 from runner.gst.caps import structure
 from runner.gst.probes import BufferProbe, PassingBuffer
 from runner.gst.repair import RtpSession
-from runner.gst.rtspsrc import STREAM_ENDED, Opening, handle_stream_end, is_rtsp_client, limit_teardown
+from runner.gst.rtspsrc import (
+    NO_PLACE,
+    STREAM_ENDED,
+    Opening,
+    handle_stream_end,
+    is_rtsp_client,
+    limit_teardown,
+    status_of,
+)
 from runner.gst.sender_filter import SenderFilter
 from runner.gst.supervised import SupervisedPipeline
 from runner.gst.timers import later
@@ -26,6 +34,7 @@ from runner.gst.viewers import user_agent
 from runner.h264.access_unit import AccessUnit, read_unit
 from runner.h264.damage import HEAD_BYTES, Damage
 from runner.records.reception import Arrival
+from runner.system.backoff import pause_s
 from runner.system.held_up import LateCheck
 from runner.system.recent import RecentValue
 
@@ -35,6 +44,7 @@ if TYPE_CHECKING:
 
 STALL_S = 2.0  # a camera that should send but neither sends nor answers for longer is rebuilt
 DIALLED_STALL_S = 1.0  # likewise where the vehicle dials: it calls again, but a listener keeps its first caller
+REFUSED_S = (1.0, 30.0)  # from a refusal to the next request: doubled from the first value up to the second
 GRACE_S = 0.75  # time for the first frame once a camera is expected to send
 
 
@@ -56,6 +66,7 @@ class Reception:
     waited_ms   how long a sampled frame was in the jitter buffer; None: unknown, as without RTP
     decode_ms   from a sampled access unit to its picture; None: unknown
     rebuilt     how often a pipeline that had received frames was rebuilt
+    refused     whether the vehicle refuses this viewer for want of room on its uplink
     arrivals    of each access unit since the previous sample, if requested: arrival and capture time, s since 1970
                 by this machine's and by the vehicle's clock
     """
@@ -74,6 +85,7 @@ class Reception:
     waited_ms: float | None = None
     decode_ms: float | None = None
     rebuilt: int = 0
+    refused: bool = False
     arrivals: tuple[tuple[float, float | None], ...] = ()
 
 
@@ -128,6 +140,9 @@ class Receiver:
         self._is_dialled = not plan.serves
         self._stall_s = DIALLED_STALL_S if self._is_dialled else STALL_S
         self._supervised = SupervisedPipeline(launch, self._on_built, lambda what: on_report(name, what))
+        self._supervised.is_excused = self._is_refusal
+        self._supervised.must_wait = lambda: time.monotonic() < self._refused_until
+        self._refused, self._refused_until = 0, 0.0  # refusals in a row; until when the vehicle is not asked again
         self._before = Reception()  # counters of earlier pipelines
         self._latency, self._decode = RecentValue[float](), RecentValue[float]()  # ms, of a sampled frame
         self._entered: tuple[int | None, float] = (None, 0.0)  # PTS of the newest access unit, and when it arrived
@@ -146,12 +161,16 @@ class Receiver:
         self._supervised.stop()
         self._close_filter()
 
-    def sample(self, should_send: bool | None) -> Reception:
+    def sample(self, should_send: bool | None, anew: bool = False) -> Reception:
         """Reception so far; requests the latency of the next frame.
 
         should_send  whether the camera should; None: unknown while the vehicle is offline
+        anew         ask the vehicle again now if it has refused this viewer
         """
         self._should_send = should_send
+        if anew and self._refused:
+            self._refused, self._refused_until = 1, 0.0
+            self._supervised.hurry()
         buffer_ms = self.rtp.adapt()
         if self._begun:
             self.rtp.report_transport()
@@ -191,6 +210,15 @@ class Receiver:
         if self._should_send is None and self._is_dialled:
             return self._was_expected and self._begun
         return bool(self._should_send)
+
+    def _is_refusal(self, error: Gst.Message) -> bool:
+        """Whether a receiver fails since the vehicle has no room for it, which its state explains. Begins a pause."""
+        if status_of(error) != NO_PLACE:
+            self._refused = 0
+            return False
+        self._refused_until = time.monotonic() + pause_s(self._refused, *REFUSED_S)
+        self._refused += 1
+        return True
 
     @property
     def is_damaged(self) -> bool:
@@ -296,6 +324,7 @@ class Receiver:
             latency_at=latency_at,
             decode_ms=self._decode.get(),
             rebuilt=self._supervised.rebuilt,
+            refused=self._refused > 0,
         )
 
     def _on_frame(self, _pad: Gst.Pad, picture: PassingBuffer) -> bool:
@@ -321,6 +350,7 @@ class Receiver:
         if self._arrivals is not None:
             self._arrivals.append((arrived, captured))
         self._bytes += size
+        self._refused = 0
         self._frames += 1  # after its arrival is recorded: no sample counts a frame without one
         self._damaged += damaged
         if self._on_unit:

@@ -15,12 +15,22 @@ STREAM_ENDED = "the stream ended"
 # longer to free it, and whoever waits no longer has abandoned it (`runner.gst.aside`).
 TEARDOWN_S = 20.0
 FAILING_S = 20.0  # likewise after an error, while it fails to open a stream
+NO_PLACE = 453  # Not Enough Bandwidth (RFC 2326, section 11.3.7)
 BYE = "on-bye-ssrc"  # signals of an RTP session (RFC 3550, section 6.6)
 SILENT = ("on-bye-timeout", "on-timeout")
 
 
 def is_rtsp_client(element: Gst.Element) -> bool:
     return bool(GObject.signal_lookup("select-stream", element))
+
+
+def status_of(error: Gst.Message) -> int | None:
+    """The status of the answer by which an RTSP client's request has failed; None: it failed in another way.
+
+    The client states it only in what it says for developers: "Error (453): Not Enough Bandwidth" (1.22 to 1.28).
+    """
+    found = re.search(r"Error \((\d{3})\):", error.parse_error()[1] or "") if is_rtsp_client(error.src) else None
+    return int(found[1]) if found else None
 
 
 def limit_teardown(pipeline: Gst.Bin) -> None:

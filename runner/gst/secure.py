@@ -189,6 +189,11 @@ class ViewerCheck:
         holder = self._check.holder(certificate) if certificate else None
         return holder.name if isinstance(holder, Holder) and holder.name in self._known else None
 
+    def role(self, name: str) -> Role | None:
+        """The role of a viewer; None: it may no longer watch."""
+        person = self._people.get().get(name)
+        return person.role if person else None
+
     def withdrawn(self, certificate: Gio.TlsCertificate | None) -> str | None:
         """Why a client's connection must end, to be asked once its handshake is over; None: it need not."""
         return None if self.viewer(certificate) else "its keys are no longer accepted"

@@ -80,7 +80,7 @@ class CameraServer:
         permissions = self._keys and self._keys.permissions
         self._cameras = ServedCameras(plans, media, openings, permissions, self._clients, self._stopped)
         self.pipelines = self._cameras.pipelines
-        self.admission = Admission(self._cameras, self._clients, self._keys, media.max_viewers)
+        self.admission = Admission(self._cameras, self._clients, self._keys, media, on_report)
         self._left = LeftCameras(self._clients, self.pipelines)
         self._sessions, self._mounts = SessionPool(), GstRtspServer.RTSPMountPoints()
         self._sessions.connect("session-removed", on_session_removed)

@@ -37,6 +37,7 @@ class SupervisedPipeline:
     on_report  called once with each reason, until the pipeline works again
     rebuilt    how often a pipeline that had worked was rebuilt
     must_wait   whether it must not be built again yet
+    is_excused  whether an error, as a message, is reported elsewhere
     before_stop  called before this pipeline is stopped, in the thread that stops it
     """
 
@@ -55,6 +56,7 @@ class SupervisedPipeline:
         self._outage = Outage(on_report)
         self.rebuilt = 0
         self.must_wait: Callable[[], bool] = lambda: False
+        self.is_excused: Callable[[Gst.Message], bool] = lambda _error: False
         self.before_stop: Callable[[], object] = lambda: None
 
     def start(self) -> None:
@@ -88,15 +90,24 @@ class SupervisedPipeline:
             )
             self._pipeline = None
 
-    def restart(self, why: str) -> None:
-        """Tear down now, rebuild soon; nothing happens if it is stopped."""
+    def hurry(self) -> None:
+        """If it waits to be built again, do so now."""
+        if self._retry:
+            self._retry.cancel()
+            self._retry_start()
+
+    def restart(self, why: str | None) -> None:
+        """Tear down now, rebuild soon; nothing happens if it is stopped.
+
+        why  is reported; None: it is not
+        """
         if self._retry or self._stopped:
             return
         now = time.monotonic()
         if self._works:
             self.rebuilt += 1
             self._lost = now
-        if self._worked or now - self._lost > PATIENCE_S:
+        if why and (self._worked or now - self._lost > PATIENCE_S):
             self._outage.report_failure(why, self._lost)
         self._ended = now
         self._tear_down()
@@ -115,8 +126,10 @@ class SupervisedPipeline:
     def _on_failed(self, _bus: Gst.Bus, message: Gst.Message) -> None:
         if concerns_file(message) or self._retry or self._stopped:
             return
-        error = message.parse_error()[0] if message.type == Gst.MessageType.ERROR else None
-        self.restart(error.message if error else STREAM_ENDED)
+        if message.type != Gst.MessageType.ERROR:
+            self.restart(STREAM_ENDED)
+        else:
+            self.restart(None if self.is_excused(message) else message.parse_error()[0].message)
 
     def _on_first_buffer(self, pad: Gst.Pad, _buffer: PassingBuffer) -> bool:
         """From a streaming thread."""

@@ -14,6 +14,8 @@ from ipaddress import IPv6Address, ip_address
 from typing import NamedTuple
 
 _PRODUCT = "tod-runner/"
+STATED_S = 45.0  # how long a refusal is stated after the last one: receivers ask again earlier, see `gst/receiver.py`
+MOST_REFUSED = 50  # names are not proven without keys
 
 
 class StreamViewer(NamedTuple):
@@ -27,6 +29,9 @@ class StreamViewer(NamedTuple):
     address: str
     operator: str = ""
     since: float = 0.0
+
+    def __str__(self) -> str:
+        return f"{self.address} ({self.operator})" if self.operator else self.address
 
 
 def user_agent(operator: str) -> str:
@@ -76,3 +81,46 @@ def too_many(viewers: Sequence[StreamViewer], limit: int, drivers: Sequence[str]
 def _others(viewers: Sequence[StreamViewer], drivers: Sequence[str]) -> list[StreamViewer]:
     """Those that do not drive, the newest first."""
     return [viewer for viewer in reversed(viewers) if viewer.operator not in drivers]
+
+
+def limit_words(limit: int, viewers: Sequence[StreamViewer]) -> str:
+    """Why there is no room for another viewer of a camera.
+
+    viewers  those of this camera
+    """
+    names = sorted({each.operator for each in viewers if each.operator and over_uplink(each.address)})
+    watching = f"; {' and '.join(names)} {'watches' if len(names) == 1 else 'watch'}" if names else ""
+    return f"{'one viewer' if limit == 1 else f'{limit} viewers'} per camera: media.max_viewers{watching}"
+
+
+class RefusedViewers:
+    """Who is refused which camera, and why. Not thread-safe; times are s by the monotonic clock."""
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[str, str, str], tuple[float, str]] = {}  # camera, operator, address: until when, why
+
+    def add(self, camera: str, viewer: StreamViewer, why: str, now: float) -> bool:
+        """Returns whether it was not known to be refused for this reason."""
+        self._forget(now)
+        key = (camera, viewer.operator, viewer.address)
+        before = self._known.pop(key, None)
+        if len(self._known) >= MOST_REFUSED:
+            del self._known[next(iter(self._known))]
+        self._known[key] = now + STATED_S, why
+        return before is None or before[1] != why
+
+    def remove(self, camera: str, viewer: StreamViewer) -> None:
+        """It is admitted."""
+        self._known.pop((camera, viewer.operator, viewer.address), None)
+
+    def stated(self, now: float) -> dict[str, dict[str, str]]:
+        """By camera and operator, why it is refused; viewers that state no operator are omitted."""
+        self._forget(now)
+        stated: dict[str, dict[str, str]] = {}
+        for (camera, operator, _), (_, why) in self._known.items():
+            if operator:
+                stated.setdefault(camera, {})[operator] = why
+        return stated
+
+    def _forget(self, now: float) -> None:
+        self._known = {key: (until, why) for key, (until, why) in self._known.items() if until > now}

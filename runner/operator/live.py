@@ -73,6 +73,7 @@ class LiveOperator:
         self._requests = deque(requests)
         self._failure: RunError | None = None
         self._sampled = time.monotonic()
+        self._in_control: object = None  # the operator, as of the last sample
         self._late = LateCheck(2.5 * REPORT_S)
         self._thread = threading.Thread(target=self._run, name="sampling", daemon=True)
         self._reporting = threading.Thread(target=self._report, name="reporting", daemon=True)
@@ -173,7 +174,10 @@ class LiveOperator:
     def _sample(self, side: OperatorSide) -> None:
         if addresses := self.station.addresses:
             side.admit(addresses)
-        self.station.take(side.sample(self.station.sending()), side.received())
+        state = self.station.state
+        before, self._in_control = self._in_control, state.operator if state else None
+        samples = side.sample(self.station.sending(), anew=self._in_control != before)
+        self.station.take(samples, side.received())
         self._sampled = time.monotonic()
         notify("WATCHDOG=1")
         while self._requests and self._elapsed_s() >= self._requests[0].at_s:

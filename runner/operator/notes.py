@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 from msgspec import UNSET
 
 from runner.core.driving import Control, Driving
 from runner.core.events import EVENTS
 from runner.records.vehicle import CameraState, VehicleState
+
+if TYPE_CHECKING:
+    from runner.apply import Reception
+
+EXPLAINED_S = 1.0  # after a refusal, until the vehicle's state has said why
+UNEXPLAINED = "no room on the vehicle's uplink: media.max_viewers"
 
 # First words of a note, by the event that caused the decision, where its name is not enough; fields as in
 # `runner.core.events.describe`.
@@ -154,3 +161,38 @@ def _factor(camera: CameraState) -> str:
     if camera.scaling is None:
         return "lost"
     return f"{camera.scaling:g}" if camera.sending else "paused"
+
+
+class Refusals:
+    """Why the vehicle refuses this operator's receivers their pictures. Times are s by any steady clock.
+
+    operator  id of this operator
+    words     by refused camera, why
+    """
+
+    def __init__(self, operator: str) -> None:
+        self._operator = operator
+        self._since: dict[str, float] = {}  # when each camera was first refused
+        self._noted: Mapping[str, str] = {}
+        self.words: Mapping[str, str] = {}
+
+    def update(self, received: Mapping[str, Reception], cameras: Mapping[str, CameraState], now: float) -> list[str]:
+        """Take what the receivers met, and the vehicle's state; returns what there is to tell the operator.
+
+        cameras  by the vehicle's state; none while it is offline
+        """
+        refused = [name for name, each in received.items() if each.refused]
+        self._since = {name: self._since.get(name, now) for name in refused}
+        told = {name: self._told(cameras.get(name)) for name in refused}
+        self.words = {name: why or UNEXPLAINED for name, why in told.items()}
+        if any(not why and now - self._since[name] < EXPLAINED_S for name, why in told.items()):
+            return []  # it is about to be explained
+        before, self._noted = self._noted, self.words
+        names: dict[str, list[str]] = {}
+        for name, why in self.words.items():
+            if before.get(name) != why:
+                names.setdefault(why, []).append(name)
+        return [f"{', '.join(cameras)}: refused by the vehicle: {why}" for why, cameras in names.items()]
+
+    def _told(self, camera: CameraState | None) -> str:
+        return "" if camera is None or camera.refused is UNSET else camera.refused.get(self._operator, "")

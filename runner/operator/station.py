@@ -31,7 +31,7 @@ from runner.mqtt.messages import (
 )
 from runner.operator.latency import Latency, stages
 from runner.operator.meter import MeasuredRates, ReceptionMeter
-from runner.operator.notes import change_notes, driver_words
+from runner.operator.notes import Refusals, change_notes, driver_words
 from runner.operator.reception import ReceptionReports
 from runner.operator.requests import OnReply, Requests
 from runner.operator.uplinks import UplinkRow, uplink_rows
@@ -92,12 +92,13 @@ class LinkState(NamedTuple):
 
 
 class CameraRow(NamedTuple):
-    """One camera: its rates and counters, and its state on the vehicle, if known."""
+    """One camera: its rates and counters, its state on the vehicle, if known, and why the vehicle refuses it, or ""."""
 
     name: str
     rates: MeasuredRates
     received: Reception
     state: CameraState | None
+    refused: str = ""
 
 
 class _KnownVehicles:
@@ -157,6 +158,7 @@ class Station:
         self.meters = {name: ReceptionMeter(each) for name, each in fps.items()}
         self.samples: Mapping[str, Reception] = {}
         self._rates: dict[str, MeasuredRates] = {}
+        self._refusals = Refusals(self.identity)
         self.uplinks: Sequence[UplinkRow] = ()  # none while the vehicle is offline
         self._late = LateCheck()
         self.latency = Latency(fps, self._cameras)
@@ -249,6 +251,8 @@ class Station:
         for name, received in samples.items():
             self._rates[name] = self.meters[name].add(now, received, cameras.get(name))
         self.samples = samples
+        for text in self._refusals.update(samples, cameras, now):
+            self.note(text)
         sample, state = self._sample(over), self.state
         self.uplinks = uplink_rows(state, sample.uplinks) if state else []
         for listener in self.listeners:
@@ -266,9 +270,10 @@ class Station:
                 self.link.publish(self._to_report, to_json(report), behind=True)  # its arrivals are in no other report
 
     def rows(self) -> list[CameraRow]:
-        cameras = self._cameras()
+        cameras, refused = self._cameras(), self._refusals.words
         return [
-            CameraRow(name, self._rates[name], received, cameras.get(name)) for name, received in self.samples.items()
+            CameraRow(name, self._rates[name], received, cameras.get(name), refused.get(name, ""))
+            for name, received in self.samples.items()
         ]
 
     def own_time(self, t: float) -> float:
@@ -438,4 +443,5 @@ def _camera_sample(
         arrivals=(),
         stages_ms=stages(received, measured),
         received=over,
+        refused=row.refused or UNSET,
     )

@@ -59,6 +59,9 @@ class CameraSample(EncoderCounts):
     received: Annotated[
         Mapping[str, UplinkReceived] | UnsetType, "by uplink, since the pipeline was built; absent: there is one"
     ] = UNSET
+    refused: Annotated[
+        str | UnsetType, "why the vehicle refuses this operator its pictures, in words; absent: it does not"
+    ] = UNSET
 
 
 @dataclass(frozen=True, slots=True)

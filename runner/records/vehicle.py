@@ -57,6 +57,9 @@ class CameraState(CameraDecision):
     slow_fps: Annotated[
         int | UnsetType, Limits(1), "rate of its pictures, Hz, while the camera is slow; absent otherwise"
     ] = UNSET
+    refused: Annotated[
+        Mapping[str, str] | UnsetType, "by operator that is refused its pictures, why, in words; absent: none is"
+    ] = UNSET
 
     @classmethod
     def at(cls, setting: Setting, weight: Number, camera: str, reading: CameraReading) -> CameraState:
@@ -67,6 +70,7 @@ class CameraState(CameraDecision):
             fault=reading.fault or reading.lost,
             untimed=reading.untimed or UNSET,
             slow_fps=reading.slow_fps or UNSET,
+            refused=reading.refused or UNSET,
         )
 
 
@@ -257,6 +261,7 @@ class CameraReading(NamedTuple):
     untimed        whether its source does not know the capture time of its last picture
     slow_fps       the rate of its pictures, Hz, if that has been well below its own for a while; else None
     copies         viewers outside the vehicle: each is sent a copy of the stream
+    refused        by operator whose receiver is refused, why
     """
 
     applied: KnobValues = NOTHING
@@ -266,6 +271,7 @@ class CameraReading(NamedTuple):
     untimed: bool = False
     slow_fps: int | None = None
     copies: int = 0
+    refused: Mapping[str, str] = NOTHING
 
 
 def state_to_json(state: VehicleState | None) -> Json:

@@ -106,6 +106,8 @@ def _table(rows: Sequence[CameraRow], title: Text, width: int) -> RichTable:
 def _cells(row: CameraRow) -> dict[str, str | Text]:
     received, state = row.received, row.state
     size = f"{received.width}x{received.height}" if received.width and row.rates.fps else "-"
+    if row.refused:
+        size = "refused"
     return {
         "fps": f"{row.rates.fps:.1f}",
         "kbit/s": f"{row.rates.kbps:.0f}",
@@ -115,7 +117,7 @@ def _cells(row: CameraRow) -> dict[str, str | Text]:
         "factor": str(state.scaling or ("LOST" if state.on else "off")) if state else "-",
         "latency ms": f"{received.latency_ms:.1f}" if received.latency_ms is not None else "-",
         "lost": str(received.lost),
-        WHY: state.reason if state else "",
+        WHY: row.refused or (state.reason if state else ""),
     }
 
 

@@ -709,7 +709,7 @@ def test_both_views_fit_every_screen(chromium, picture, tmp_path, owner):
                 page.keyboard.press("Escape")
 
 
-OTHERS = ("synchronising", "late", "damaged", "frozen", "lost", "unsupported", "off", "paused")
+OTHERS = ("synchronising", "late", "damaged", "frozen", "lost", "refused", "unsupported", "off", "paused")
 
 # Show all pictures with a status, until that changes.
 ALL_AS = """async (status) => {
@@ -992,7 +992,7 @@ CONTRAST = """([root, theme, states]) => {
   return [measured, bad, bordered];
 }"""
 LEVELS = ["fine", "near", "late", "unknown", "none"]
-STATUSES = ["live", "late", "damaged", "frozen", "lost", "off", "unsupported"]
+STATUSES = ["live", "late", "damaged", "frozen", "lost", "off", "refused", "unsupported"]
 # Elements that a page shows only at times, by selector and attribute.
 STATES = [
     *(

@@ -25,6 +25,9 @@ const CASES = [
   ["lost", { connected: false, on: false }], // the state of an unreachable camera is unknown
   ["lost", { arrived: NOW - 1001 }],
   ["frozen", { arrived: NOW - 1000 }],
+  ["refused", { declined: true, arrived: NOW - 5000 }], // by the vehicle, which says why: not lost
+  ["lost", { declined: true, online: false }],
+  ["off", { declined: true, on: false }],
   ["unsupported", { refused: "no decoder" }],
   ["lost", { refused: "no decoder", arrived: NOW - 1001 }],
   ["synchronising", { drawn: false }],

@@ -4,7 +4,7 @@ const TOGETHER_MS = 1000; // a link that fails takes eight pictures with it: one
 const REPEAT_MS = 2000; // a picture that flickers does not sound each time
 const PAUSED_MS = 1000; // a shorter pause, as until a vehicle hears of its operator, does not sound
 /** The statuses that trigger a tone, the worst first, and its kind: "lost" where nothing moves. */
-export const ALARMS = { lost: "lost", frozen: "lost", unsupported: "lost", paused: "lost", damaged: "late", late: "late" };
+export const ALARMS = { lost: "lost", frozen: "lost", refused: "lost", unsupported: "lost", paused: "lost", damaged: "late", late: "late" };
 const never = () => ({ lost: -Infinity, late: -Infinity });
 /**
  * @typedef {object} Sounded what was sounded of a camera

@@ -24,6 +24,7 @@ export class Liveness {
   /** @type {boolean|null} */
   sending = null;
   unopened = false; // whether the vehicle cannot open the source
+  declined = ""; // why the vehicle refuses the station its pictures; "": it does not
   /** @type {number|null} */
   slow_fps = null; // what the camera delivers, if well below its rate
   /** @type {number|null} */
@@ -89,7 +90,7 @@ export class Liveness {
     const known = { connected, online, on, sending, unopened, refused, stood_since, waits_since, wave_s, damaged };
     const faulty = this.failed_at !== null;
     const least = Math.min(this.slow_fps ?? this.camera.fps, fps);
-    return { ...known, faulty, arrived, decoded, late_until, drawn: this.drawn && drawn, fps: least };
+    return { ...known, faulty, arrived, decoded, late_until, drawn: this.drawn && drawn, fps: least, declined: this.declined !== "" };
   }
 
   judge(more, time) {

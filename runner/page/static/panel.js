@@ -6,7 +6,7 @@ import { fullRegion, isLocked, sendRegion, toggleLocked } from "./roi.js";
 import { RegionFrame } from "./region_frame.js";
 import { SMALLEST } from "./region.js";
 import { makeSlider } from "./slider.js";
-import { SHAPES, STALE, switchCamera, unapplied } from "./tiles.js";
+import { EXPLAINED, SHAPES, STALE, switchCamera, unapplied } from "./tiles.js";
 import { canStraighten } from "./straight.js";
 import { isStraight, toggleStraight } from "./straighten.js";
 import { withKey } from "./hints.js";
@@ -174,7 +174,7 @@ function refreshHead(now) {
   on.disabled = Boolean(whyNot());
   on.title = whyNot() ?? withKey("switch this camera on or off", "switch");
   setText(on, requested ? (requested.event.on ? "on…" : "off…") : now?.on ? "on" : now ? "off" : "–");
-  setText(reason, [word === "unsupported" ? store.refused[name()] : "", now?.reason || "–"].filter(Boolean).join(" "));
+  setText(reason, [EXPLAINED.includes(word) ? store.refused[name()] : "", now?.reason || "–"].filter(Boolean).join(" "));
 }
 
 function refreshSettings(info, now) {

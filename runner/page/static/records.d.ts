@@ -43,6 +43,8 @@ export interface CameraState {
   untimed?: boolean;
   /** rate of its pictures, Hz, while the camera is slow; absent otherwise */
   slow_fps?: number;
+  /** by operator that is refused its pictures, why, in words; absent: none is */
+  refused?: Record<string, string>;
 }
 
 /** Who drives the vehicle, by its own account */
@@ -206,6 +208,8 @@ export interface CameraSample {
   buffer_ms: number | null;
   /** by uplink, since the pipeline was built; absent: there is one */
   received?: Record<string, UplinkReceived>;
+  /** why the vehicle refuses this operator its pictures, in words; absent: it does not */
+  refused?: string;
 }
 
 /** What the operator in control receives over one of several uplinks, as in `runner.core.events.LinkMeasured` */

@@ -16,6 +16,7 @@ export const INTERVALS = 1.3; // this many frame intervals without a picture are
  * @property {boolean|null} on
  * @property {boolean|null} sending
  * @property {boolean} [unopened] whether the vehicle cannot open the source
+ * @property {boolean} [declined] whether the vehicle refuses the station its pictures
  * @property {string} refused why there is no decoder, "" if there is one
  * @property {boolean} drawn whether a picture was drawn since the stream last started
  * @property {number} [waits_since] page time since which units arrive and none was drawn
@@ -32,12 +33,13 @@ export const INTERVALS = 1.3; // this many frame intervals without a picture are
  * @param {Times} s
  * @param {{frozen_ms: number}} limits
  * @param {number} now page time
- * @returns {"off"|"paused"|"lost"|"unsupported"|"frozen"|"damaged"|"late"|"synchronising"|"live"}
+ * @returns {"off"|"paused"|"lost"|"refused"|"unsupported"|"frozen"|"damaged"|"late"|"synchronising"|"live"}
  */
 export function judge(s, limits, now) {
   const reachable = s.connected && s.online;
   if (reachable && s.on === false) return "off";
   if (reachable && s.sending === false) return s.unopened ? "lost" : "paused";
+  if (reachable && s.declined) return "refused";
   if (!reachable || now - s.arrived > LOST_MS) return "lost";
   if (s.refused) return "unsupported";
   if (!s.drawn && s.stood_since === null) return now - (s.waits_since ?? now) > synchronisedAfter(s.wave_s) ? "frozen" : "synchronising";

@@ -97,7 +97,7 @@ export const store = {
   series: emptySeries([]),
   reminders: new Map(), // by key, what the driver is reminded of until it is settled, or the page no longer has control
   status: {}, // by camera, as judged by the worker
-  refused: {}, // by camera, why its video cannot be shown, or ""
+  refused: {}, // by camera, why there is no picture to show, or ""
   ages: {}, // by camera, latency from capture to drawing, its error bound, and its parts on the page
   slow: false, // whether too few of the received pictures are drawn
   skew_ms: null, // between the capture times of the oldest and the newest picture shown
@@ -215,10 +215,12 @@ export const who = () => whoDrives(driverView());
 export const inControl = () => who() === "you";
 
 /**
- * A camera's status as far as the driver must be alerted to it: pauses while nobody drives, and those by a weight of 0, are intended.
+ * A camera's status as far as the driver must be alerted to it: pauses while nobody drives, and those by a weight of 0,
+ * are intended, and so is that an operator who does not drive gets no pictures.
  * @param {string} name  @param {string|undefined} status of its picture
  */
 export function alertStatus(name, status = store.status[name]) {
+  if (status === "refused") return inControl() && !otherOperator() ? status : "off";
   const isUnshared = mode() !== "single" && decisionOf(name)?.weight === 0;
   return status === "paused" && (UNDRIVEN.includes(who()) || isUnshared) ? "off" : status;
 }

@@ -28,7 +28,8 @@ export class Stream {
   counts = { received: 0, due: 0, drawn: 0 };
   /** @type {unknown} */
   first = null; // for tests, the first picture drawn
-  reported = "synchronising"; // status
+  why = ""; // why there is no picture, in words; "" if there is one, or for another reason
+  reported = "synchronising "; // status, and why
   mark = ""; // that the canvas shows
   /** @type {StraightView|null} */
   straight = null; // shows the picture straightened
@@ -268,8 +269,10 @@ export class Stream {
     this.live.judge(this.drawing(), time);
     this.live.noteWaiting(time);
     if (this.canvas.isOutdated(this.overlayText(time), this.live.slowText())) this.paint(time);
-    const changed = this.status !== this.reported;
-    this.reported = this.status;
+    this.why = this.live.declined || this.decoding.refused;
+    const reported = `${this.status} ${this.why}`;
+    const changed = reported !== this.reported;
+    this.reported = reported;
     return changed;
   }
 

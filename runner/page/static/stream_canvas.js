@@ -56,7 +56,7 @@ export class StreamCanvas {
     const { canvas, context } = this;
     if (!canvas || !context) return false;
     this.resize(canvas, shown, isStraight, STALLED.includes(status));
-    if (shown && status !== "off" && status !== "unsupported") paintPicture(context, shown, isStraight);
+    if (shown && !["off", "refused", "unsupported"].includes(status)) paintPicture(context, shown, isStraight);
     else blank(context);
     this.drawGuides(context, canvas, steered);
     if (isStraight && shown?.image && !this.camera.calibrated && !this.guides?.shown) this.labelEstimate(context, canvas);

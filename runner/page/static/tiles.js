@@ -18,11 +18,12 @@ import { colourOf } from "./colours.js";
 import { announce, boxSize, byId, displayName, factor, latency, make, setAttribute, setText, size, whole } from "./format.js";
 
 export const SHAPES = {
-  live: "●", late: "▲", damaged: "◪", frozen: "■", lost: "✕", off: "○", paused: "❚❚", synchronising: "◌", unsupported: "⊘",
+  live: "●", late: "▲", damaged: "◪", frozen: "■", lost: "✕", off: "○", paused: "❚❚", synchronising: "◌", unsupported: "⊘", refused: "⊗",
 };
 const SHORT = { synchronising: "SYNC", unsupported: "NO PICTURE" }; // the overlay has the full word
-const SILENT = ["lost", "off", "paused"]; // no frames arrive: the last values are out of date
+const SILENT = ["lost", "off", "paused", "refused"]; // no frames arrive: the last values are out of date
 export const STALE = [...SILENT, "frozen"]; // the displayed picture is older than when it was drawn
+export const EXPLAINED = ["refused", "unsupported"]; // by `store.refused`
 const THIN = "\u2009"; // space
 const NO_AGE = { age_ms: undefined, bound_ms: undefined };
 const UNCERTAIN_MS = 20; // a latency with a larger error bound is marked
@@ -272,7 +273,7 @@ function refresh(name, index) {
 
 function refreshStatus(name, { element, status, shape, word, refused }) {
   const now = store.status[name] ?? "synchronising";
-  const why = now === "unsupported" ? store.refused[name] : (decisionOf(name)?.fault ?? (store.state?.online ? whyUndecided(name) : ""));
+  const why = EXPLAINED.includes(now) ? store.refused[name] : (decisionOf(name)?.fault ?? (store.state?.online ? whyUndecided(name) : ""));
   refused.hidden = !why;
   setText(refused, why ?? "");
   setAttribute(element, "data-status", now);

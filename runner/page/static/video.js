@@ -150,7 +150,7 @@ function onText(message) {
   if (message.kind === "hello") onHello(message);
   if (message.kind === "state") onState(message);
   if (message.kind === "control") holder = message.holder;
-  if (message.kind === "sample") station.bound = message.clock_bound_ms ?? NaN;
+  if (message.kind === "sample") onSample(message);
   toPage({ kind: "server", message });
 }
 
@@ -177,6 +177,11 @@ function onState(message) {
   station.online = message.online;
   if (wentOffline) judgeAll(); // mark each picture before the banner names the cause
   if (message.cameras) for (const stream of streams) stream.onDecision(message.cameras[stream.name]);
+}
+
+function onSample(message) {
+  station.bound = message.clock_bound_ms ?? NaN;
+  for (const stream of streams) stream.live.declined = message.cameras[stream.name]?.refused ?? "";
 }
 
 function applyGuides() {
@@ -230,7 +235,7 @@ function tick() {
 function judgeAll() {
   for (const stream of streams) {
     if (!stream.updateStatus()) continue;
-    toPage({ kind: "status", camera: stream.name, status: stream.status, why: stream.decoding.refused });
+    toPage({ kind: "status", camera: stream.name, status: stream.status, why: stream.why });
   }
   if (isAsleep) ground.draw(); // it shows the status of pictures
   if (streams.some(({ isWaiting }) => isWaiting)) wake(); // a picture that could not be straightened yet
