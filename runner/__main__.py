@@ -23,6 +23,7 @@ further verbs:
 
 An OVERRIDE is Hydra's: vehicle=delivery_robot, modes=paper, cameras.front_left.weight=2.
 conf=DIR (or the environment variable TOD_CONF) names a directory of your own; its files shadow the packaged ones.
+~/.config/tod-runner/site.yaml (or TOD_SITE) states what belongs to this machine, below overrides.
 
   tod-runner demo                                    drive the paper's vehicle on this machine
   tod-runner print total_kbps=3000                   what would run, and why

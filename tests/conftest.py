@@ -9,6 +9,7 @@ import uuid
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import helpers
 import pytest
@@ -50,6 +51,7 @@ def pytest_warning_recorded(warning_message: warnings.WarningMessage) -> None:
 @pytest.fixture(autouse=True)
 def clean_environment(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> None:
     monkeypatch.delenv("TOD_CONF", raising=False)
+    monkeypatch.setenv("TOD_SITE", "")
     monkeypatch.setenv("XDG_CACHE_HOME", str(shared_cache(tmp_path_factory)))
     monkeypatch.setenv("GST_REGISTRY", str(REGISTRY))
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path_factory.getbasetemp() / f"state-{uuid.uuid4().hex}"))
@@ -71,8 +73,8 @@ def unprinted(monkeypatch: pytest.MonkeyPatch) -> None:
 def composed_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Compose each packaged configuration once for all tests that use this."""
 
-    def compose(overrides: Sequence[str], user: Path | None = None) -> Composed:
-        return helpers.composed_once(tuple(overrides)) if user is None else real(overrides, user)
+    def compose(overrides: Sequence[str], user: Path | None = None, *more: Any) -> Composed:
+        return real(overrides, user, *more) if user or any(more) else helpers.composed_once(tuple(overrides))
 
     real = config.compose
     monkeypatch.setattr(config, "compose", compose)

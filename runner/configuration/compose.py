@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, cast
 
 from runner import schema
-from runner.configuration.files import GROUPS, bases_of, chosen_by, conf_directories, defaults, find_file, options
+from runner.configuration.files import GROUPS, ROOT, bases_of, chosen_by, conf_directories, defaults, find_file, options
 from runner.configuration.interpolation import expands_within, spliced, value_at
 from runner.configuration.origin import PICKED, Composed, Part, nested
 from runner.configuration.overrides import Override, choice_problems, parse_overrides, rule_problems
@@ -18,6 +20,8 @@ from runner.errors import COMMAND_LINE, ConfigError, Problem, suggest
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
+
+    from runner.configuration.site import Site
 
 # keys of a mount that stay when its kind of camera is replaced
 KEPT_KEYS = (
@@ -33,30 +37,65 @@ MAX_RESOLVED = 50_000  # values of a configuration with its interpolations expan
 PACKAGE_HEADER = "# @package _global_"  # a vehicle's file applies to the whole document
 
 
-def compose(overrides: Sequence[str], user: Path | None = None) -> Composed:
+def compose(
+    overrides: Sequence[str],
+    user: Path | None = None,
+    site: Path | None = None,
+    instead: Mapping[str, str] = MappingProxyType({}),
+) -> Composed:
     """Compose conf/config.yaml with the user's overrides.
 
-    user    directory whose files shadow the packaged ones one by one
-    raises  ConfigError
+    user     directory whose files shadow the packaged ones one by one
+    site     file of this machine, between these files and the overrides
+    instead  by group, the choice in place of that of the packaged conf/config.yaml
+    raises   ConfigError
     """
     from omegaconf import open_dict
 
     parsed = parse_overrides(overrides)
     directories = conf_directories(user)
     problems = [p for override in parsed for p in (*choice_problems(override, directories), *rule_problems(override))]
-    if problems:
+    of_site, more = _site(site, directories)
+    if problems := [*problems, *more]:
         raise ConfigError(problems)
     _check_headers({o.key: str(o.value) for o in parsed if o.key == "experiment"}, directories)
-    config, choices = _compose(parsed, directories)
+    by_site = _chosen_by(of_site, parsed)
+    config, choices = _compose([*by_site, *parsed], directories, instead, of_site.content if of_site else None)
     _check_headers(choices, directories)
     parts = [_part(override) for override in reversed(parsed) if override.deletes or not override.choice]
     files = list(_file_parts(directories, choices))
     if problems := list(_restated(files)):
         raise ConfigError(problems)
+    parts += [Part(label(of_site.path), (), of_site.content, of_site.path)] if of_site else []
     parts += reversed(files)
     with open_dict(config):
         del config["hydra"]
-    return _resolved(config, parts)
+    composed = _resolved(config, parts, choices)
+    if of_site and (problems := list(of_site.problems(composed.document))):
+        raise ConfigError(problems)
+    return composed
+
+
+def _site(path: Path | None, directories: Sequence[Path]) -> tuple[Site | None, list[Problem]]:
+    """The site file, if there is one, or its problems."""
+    if path is None:
+        return None, []
+    from runner.configuration.site import read_site
+
+    try:
+        site = read_site(path)
+    except ConfigError as error:
+        return None, list(error.problems)
+    words = parse_overrides([f"{group}={name}" for group, name in site.choices.items()])
+    problems = (problem for word in words for problem in choice_problems(word, directories))
+    return site, [replace(problem, file=label(path)) for problem in problems]
+
+
+def _chosen_by(site: Site | None, overrides: Sequence[Override]) -> list[Override]:
+    """The choices of a site file that no override replaces."""
+    stated = {override.key for override in overrides}
+    choices = site.choices.items() if site else ()
+    return parse_overrides([f"{group}={name}" for group, name in choices if group not in stated])
 
 
 def _check_headers(choices: Mapping[str, str], directories: Sequence[Path]) -> None:
@@ -132,7 +171,12 @@ def _part(override: Override) -> Part:
 # --- Hydra ------------------------------------------------------------------------------------------------------------
 
 
-def _compose(overrides: Sequence[Override], directories: Sequence[Path]) -> tuple[DictConfig, dict[str, str]]:
+def _compose(
+    overrides: Sequence[Override],
+    directories: Sequence[Path],
+    instead: Mapping[str, str],
+    site: Mapping[str, Any] | None,
+) -> tuple[DictConfig, dict[str, str]]:
     """Hydra's composition, and by group the chosen file."""
     from hydra import compose as hydra_compose
     from hydra import initialize_config_dir
@@ -145,14 +189,14 @@ def _compose(overrides: Sequence[Override], directories: Sequence[Path]) -> tupl
 
     # OmegaConf's resolver for environment variables is not supported: only files define values.
     OmegaConf.clear_resolver("oc.env")
-    search(directories)
-    root = find_file(directories, "", "config")
+    search(directories, instead, site)
+    root = find_file(directories, "", ROOT)
     chosen = {key for key, _ in chosen_by(root)}
     words = [o.hydra(chosen) for o in overrides]
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(str(directories[-1]), version_base="1.3"), without_launchers():
-            config = hydra_compose("config", words, return_hydra_config=True)
+            config = hydra_compose(ROOT, words, return_hydra_config=True)
     except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError(_list_problems(error, directories) or [_hydra_problem(error, directories)]) from None
     except (TypeError, ValueError) as error:
@@ -241,7 +285,7 @@ def _overriding(group: str, name: str, directories: Sequence[Path]) -> str:
 
 def _file_parts(directories: Sequence[Path], choices: dict[str, str]) -> Iterator[Part]:
     """The files behind a composition, in the order in which Hydra merged them."""
-    root = find_file(directories, "", "config")
+    root = find_file(directories, "", ROOT)
     yield Part(label(root), (), load_file(root), root)
     # Mounted files first: a vehicle file overrides values of the mount. An experiment overrides all others.
     for key, name in sorted(choices.items(), key=lambda item: ("@" not in item[0], item[0] == "experiment")):
@@ -282,9 +326,10 @@ def _with_bases(path: Path, group: str, package: schema.Path, directories: Seque
     yield Part(label(path), package, load_file(path), path)
 
 
-def _resolved(config: DictConfig, parts: Sequence[Part]) -> Composed:
+def _resolved(config: DictConfig, parts: Sequence[Part], choices: Mapping[str, str]) -> Composed:
     """The composed tree as plain data, interpolations resolved.
 
+    choices  by group, the chosen file
     raises  ConfigError
     """
     from omegaconf import OmegaConf
@@ -302,4 +347,4 @@ def _resolved(config: DictConfig, parts: Sequence[Part]) -> Composed:
         path = tuple(int(p) if p.isdigit() else p for p in re.split(r"[.\[\]]+", str(error.full_key or "")) if p)
         raise ConfigError([origin.problem(path, None, str(error).splitlines()[0])]) from None
     document, moved = spliced(written, document)
-    return Composed(cast("dict[str, Any]", document), list(parts), moved).without_graph_parts()
+    return Composed(cast("dict[str, Any]", document), list(parts), moved, choices).without_graph_parts()

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from runner.configuration.build import Builder, PlanCheck
@@ -63,6 +64,11 @@ class Configuration:
     def document(self) -> dict[str, Any]:
         """The configuration as plain data, not yet checked."""
         return self._composed.document
+
+    @property
+    def choices(self) -> Mapping[str, str]:
+        """By group, the chosen file."""
+        return self._composed.choices
 
     def listing(self) -> str:
         """The configuration as YAML, each value with the file or the override that it comes from as a comment."""
@@ -149,6 +155,12 @@ class Configuration:
         return Builder(self._composed, self._runnable, self._files, self._bags, self._check)
 
 
+def with_choice(overrides: Sequence[str], group: str, config: Configuration) -> list[str]:
+    """Overrides that also state what was chosen for a group, for a side that would choose something else by itself."""
+    stated = any(word.lstrip("+~").partition("=")[0] == group for word in overrides)
+    return [*overrides] if stated else [f"{group}={config.choices[group]}", *overrides]
+
+
 def _directory(overrides: Sequence[str], user: Path | str | None) -> tuple[Sequence[str], Path | None]:
     """The overrides without conf=DIR, and that directory, or the one named separately.
 
@@ -168,14 +180,18 @@ def configuration(
     runnable: bool = True,
     files: bool | None = None,
     check: PlanCheck | None = None,
+    site: Path | None = None,
+    instead: Mapping[str, str] = MappingProxyType({}),
 ) -> Configuration:
     """Compose files and overrides.
 
     overrides  Hydra overrides, as on the command line, also conf=DIR
     user       directory of files of your own; None: that of conf=, or none
     base       configuration to which the overrides apply; None: the packaged and the user's files
+    site       file of this machine, between the files and the overrides; None: none
+    instead    by group, the choice in place of that of the packaged conf/config.yaml
     raises     ConfigError if they cannot be composed
     """
     overrides, user = _directory(overrides, user)
-    composed = recompose(*base, overrides, user) if base else compose(overrides, user)
+    composed = recompose(*base, overrides, user) if base else compose(overrides, user, site, instead)
     return Configuration(composed, user, runnable=runnable, files=files, check=check)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import os
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
 from runner.configuration.yaml_file import load_file
-from runner.errors import ConfigError
+from runner.errors import ConfigError, UserError
 from runner.resources import directory
 
+ROOT = "config"  # the file that chooses all others
+SITE = "tod-runner-site"  # name of the site file to Hydra, like that of no file of a directory
+SITE_VARIABLE = "TOD_SITE"  # of the environment: names the site file
 LAYOUT = "layout"  # folder in the user's directory where the operator's page saves layouts; not a group
 GROUPS = ("vehicle", "cameras", "modes", "graph", "source", "pqos", "recording", "study", "link", "experiment")
 
@@ -74,3 +78,20 @@ def chosen_by(path: Path) -> list[tuple[str, str]]:
     entries = content.get("defaults") if isinstance(content, dict) else None
     chosen = [entry for entry in entries if isinstance(entry, dict)] if isinstance(entries, list) else []
     return [(str(key), str(value)) for entry in chosen for key, value in entry.items()]
+
+
+def site_file(environment: Mapping[str, str]) -> Path | None:
+    """The file that TOD_SITE names, otherwise site.yaml in the user's configuration directory, if there is one.
+
+    raises  UserError if TOD_SITE names no file; empty, it stands for none
+    """
+    named = environment.get(SITE_VARIABLE)
+    if named == "":
+        return None
+    if named is not None:
+        if not Path(named).is_file():
+            raise UserError("environment", SITE_VARIABLE, named, "is no file; an empty one stands for none")
+        return Path(named)
+    base = environment.get("XDG_CONFIG_HOME") or os.path.expanduser("~/.config")
+    standard = Path(base, "tod-runner", "site.yaml")
+    return standard if os.path.lexists(standard) else None

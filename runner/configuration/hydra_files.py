@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from hydra.conf import JobConf, OverridesConf, RuntimeConf
 from hydra.core.config_search_path import ConfigSearchPath
@@ -14,16 +15,25 @@ from hydra.core.object_type import ObjectType
 from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult, ConfigSource
 from hydra.plugins.search_path_plugin import SearchPathPlugin
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
+from runner.configuration.files import ROOT, SITE
 from runner.configuration.yaml_file import load_node, read
+from runner.resources import directory
 
 SCHEME = "tod-runner"
 Names = list[str]
 
 
 class CheckedFiles(ConfigSource):
-    """A directory of files, each checked before Hydra sees its content."""
+    """A directory of files, each checked before Hydra sees its content.
+
+    instead  by group, what is chosen in place of the choice of the packaged conf/config.yaml
+    site     what the site file states, composed after all other files; None: there is none
+    """
+
+    instead: Mapping[str, str] = {}
+    site: Mapping[str, Any] | None = None
 
     @staticmethod
     def scheme() -> str:
@@ -37,12 +47,28 @@ class CheckedFiles(ConfigSource):
 
     def is_config(self, config_path: str) -> bool:
         """Whether anything of that name exists; `load_config` reports why it cannot be read."""
-        return self._file(config_path).exists()
+        return config_path == SITE or self._file(config_path).exists()
 
     def load_config(self, config_path: str) -> ConfigResult:
         """raises ConfigError"""
+        if config_path == SITE:
+            return ConfigResult(
+                self.provider, self.full_path(), OmegaConf.create(dict(self.site or {})), {"package": "_global_"}
+            )
         file = self._file(config_path)
-        return ConfigResult(self.provider, self.full_path(), load_node(file), {"package": read(file).package})
+        node = load_node(file)
+        if config_path == ROOT:
+            self._adapt(node, file)
+        return ConfigResult(self.provider, self.full_path(), node, {"package": read(file).package})
+
+    def _adapt(self, node: DictConfig, file: Path) -> None:
+        """Choose what a side chooses by itself, and the site file as the last one."""
+        chosen = [dict(entry) if isinstance(entry, DictConfig) else entry for entry in node.get("defaults", ["_self_"])]
+        if file.is_relative_to(directory("conf")):
+            for entry in chosen:
+                if isinstance(entry, dict):
+                    entry |= {group: name for group, name in self.instead.items() if group in entry}
+        node["defaults"] = [*chosen, *([SITE] if self.site is not None else [])]
 
     def list(self, config_path: str, results_filter: ObjectType | None) -> Names:
         return sorted(file.stem for file in Path(self.path, config_path).glob("*.yaml"))
@@ -57,13 +83,14 @@ class Directories(SearchPathPlugin):
     directories: Sequence[Path] = ()
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        for directory in reversed(self.directories):
-            search_path.prepend(SCHEME, f"{SCHEME}://{directory}")
+        for each in reversed(self.directories):
+            search_path.prepend(SCHEME, f"{SCHEME}://{each}")
 
 
-def search(directories: Sequence[Path]) -> None:
-    """Make Hydra search these directories in order."""
+def search(directories: Sequence[Path], instead: Mapping[str, str], site: Mapping[str, Any] | None) -> None:
+    """Make Hydra search these directories in order; the others as in `CheckedFiles`."""
     Directories.directories = directories
+    CheckedFiles.instead, CheckedFiles.site = instead, site
     for plugin in (CheckedFiles, Directories):
         Plugins.instance().register(plugin)
 

@@ -38,12 +38,14 @@ class Part:
 class Composed:
     """The whole configuration as plain data, and its parts, the one with the highest precedence first.
 
-    moved  by path in the document, the original paths of entries that a list includes from another list
+    moved    by path in the document, the original paths of entries that a list includes from another list
+    choices  by group, the chosen file
     """
 
     document: dict[str, Any]
     parts: list[Part] = field(default_factory=list)
     moved: Mapping[schema.Path, schema.Path] = field(default_factory=dict)
+    choices: Mapping[str, str] = field(default_factory=dict)
 
     def problem(self, path: schema.Path, found: str | None, rule: str, others: Iterable[schema.Path] = ()) -> Problem:
         """A problem, attributed to its file or override, with the path inside that.

@@ -226,18 +226,23 @@ def _ros_pictures(setup: Setup, station: Station) -> DecodedPictures | None:
 
 @contextmanager
 def live_operator(
-    overrides: Sequence[str] = (), conf: Path | str | None = None, *, log: Path | None = None
+    overrides: Sequence[str] = (),
+    conf: Path | str | None = None,
+    *,
+    log: Path | None = None,
+    site: Path | None = None,
 ) -> Iterator[LiveOperator]:
     """Run an operator's side; at the end it signs off from the vehicle and stops.
 
     overrides  Hydra overrides, as on the command line, also conf=DIR
     conf       directory of files of your own, which shadow the packaged ones
     log        directory that the drive is recorded to
+    site       the site file of this machine; None: none is read
     raises     ConfigError, RunError, UserError if the directory already holds a drive
     """
     from runner import apply
 
-    config = configuration(overrides, conf, runnable=False, check=apply.check_operator)
+    config = configuration(overrides, conf, runnable=False, check=apply.check_operator, site=site)
     setup, document = config.setup(), config.document
     plans = compile_plans(setup)
     keyring = viewer_keyring(setup)

@@ -63,6 +63,7 @@ if TYPE_CHECKING:
     from runner.ros.cameras import RosCameras, SharedPicture
 
 PictureFormat = Literal["i420", "bgr", "rgb", "grey"]
+DRIVING = {"pqos": "live"}  # choices in place of the packaged ones: a vehicle drives where it is, not along a map
 STUCK_S = 2.0  # a thread that finishes nothing for this long is stuck
 WATCH_S = 0.25  # how often that is checked
 END_S = 5.0  # a loop that does not end within this is abandoned
@@ -378,10 +379,11 @@ def live_vehicle(
     state: Path | str | None = None,
     say: Callable[[str], None] = print,
     progress: Progress = lambda what, done: None,
+    site: Path | None = None,
 ) -> Iterator[LiveVehicle]:
     """Run the vehicle's side; at the end it is stopped and disconnected.
 
-    overrides, conf  as in `live_operator`
+    overrides, conf, site  as in `live_operator`; pqos is live unless stated
     log       directory that the drive is recorded to
     state     directory that keeps who is in control over a restart; None: the next process does not know
     say       called, from a separate thread, with one line per event
@@ -391,7 +393,7 @@ def live_vehicle(
     from runner import apply
 
     log = Path(log) if log else None
-    config = configuration(overrides, conf, files=False, check=apply.check_vehicle)
+    config = configuration(overrides, conf, files=False, check=apply.check_vehicle, site=site, instead=DRIVING)
     if config.document.get("strict"):
         config = config.drivable(apply.check_vehicle)
     (pqos, track), document, rates = config.pqos(), config.document, list[str]()

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
-from runner.configuration.files import GROUPS
+from runner.configuration.files import GROUPS, SITE_VARIABLE, site_file
 from runner.errors import COMMAND_LINE, ArgumentError, UserError, suggest
 from runner.schema import schema_document
 
@@ -22,6 +22,7 @@ class Verb(NamedTuple):
     sweeps    whether -m is accepted
     composes  whether it reads a configuration, and therefore takes overrides
     choices   by argument, its possible values; the first is the default
+    sited     whether it is about this machine, and therefore reads its site file
     """
 
     summary: str
@@ -31,6 +32,7 @@ class Verb(NamedTuple):
     sweeps: bool = False
     composes: bool = True
     choices: Mapping[str, tuple[str, ...]] = {}
+    sited: bool = False
 
 
 NO_YES = ("false", "true")
@@ -50,6 +52,7 @@ VERBS = {
         ("total_kbps", "format"),
         sweeps=True,
         choices={"format": ("text", "json", "yaml")},
+        sited=True,
     ),
     "init": Verb(
         "create a configuration directory of your own",
@@ -86,22 +89,26 @@ VERBS = {
         choices=OF_SIMULATED,
     ),
     "vehicle": Verb(
-        "the vehicle's side: cameras, RTSP server, rules", "runner.verbs.vehicle", ("log", "drives", "duration_s")
+        "the vehicle's side: cameras, RTSP server, rules",
+        "runner.verbs.vehicle",
+        ("log", "drives", "duration_s"),
+        sited=True,
     ),
     "operator": Verb(
-        "the operator's side: video, page, table", "runner.verbs.operator", ("log", "drives", "duration_s")
+        "the operator's side: video, page, table", "runner.verbs.operator", ("log", "drives", "duration_s"), sited=True
     ),
     "latency": Verb(
         "measure glass-to-glass latency",
         "runner.verbs.latency",
         ("camera", "duration_s", "loop"),
         choices={"loop": NO_YES},
+        sited=True,
     ),
-    "ros": Verb("the control link as ROS topics", "runner.verbs.ros", ("duration_s",)),
+    "ros": Verb("the control link as ROS topics", "runner.verbs.ros", ("duration_s",), sited=True),
     "demo": Verb(
         "both sides on this machine", "runner.verbs.demo", ("log", "output", "models", "duration_s"), sweeps=True
     ),
-    "record": Verb("record each camera losslessly", "runner.verbs.record", ("output", "duration_s")),
+    "record": Verb("record each camera losslessly", "runner.verbs.record", ("output", "duration_s"), sited=True),
     "model": Verb("rate-quality models from recordings", "runner.verbs.model", ("camera", "sequence", "output")),
     "report": Verb(
         "the paper's figures from real drives",
@@ -141,7 +148,9 @@ VERBS = {
         composes=False,
         choices={"rules": NO_YES},
     ),
-    "doctor": Verb("list missing dependencies of this machine", "runner.verbs.doctor", ("registry",), "VERB"),
+    "doctor": Verb(
+        "list missing dependencies of this machine", "runner.verbs.doctor", ("registry",), "VERB", sited=True
+    ),
     "completion": Verb("the completion script for bash or zsh", "runner.verbs.completion", (), "SHELL", composes=False),
 }
 
@@ -185,6 +194,7 @@ class Arguments:
 
     words   positional arguments, if the verb takes any
     sweeps  whether -m was given
+    site    the site file, if there is one and the verb reads it
     """
 
     verb: str
@@ -193,6 +203,7 @@ class Arguments:
     values: dict[str, str] = field(default_factory=dict)
     words: tuple[str, ...] = ()
     sweeps: bool = False
+    site: Path | None = None
 
     @staticmethod
     def parse(verb: str, words: Sequence[str]) -> Arguments:
@@ -231,8 +242,10 @@ class Arguments:
         if VERBS[verb].takes == DRIVE and not plain:
             raise ArgumentError(DRIVE, None, "must be given: a directory that log= wrote")
         conf = values.pop("conf", None) or os.environ.get("TOD_CONF")
-        _check_utf8("environment", "TOD_CONF", conf or "")
-        return Arguments(verb, overrides, Path(conf) if conf else None, values, tuple(plain), sweeps)
+        for name in ("TOD_CONF", SITE_VARIABLE):
+            _check_utf8("environment", name, os.environ.get(name, ""))
+        site = site_file(os.environ) if VERBS[verb].sited else None
+        return Arguments(verb, overrides, Path(conf) if conf else None, values, tuple(plain), sweeps, site)
 
     def runs(self) -> list[tuple[tuple[str, ...], Arguments]]:
         """Overrides and arguments of each run that -m expands to.

@@ -42,9 +42,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
-from runner.configuration.config import Configuration, configuration
+from runner.configuration.config import Configuration, configuration, with_choice
 from runner.configuration.experiment import LinkSettings, lane_overrides
-from runner.configuration.files import conf_directories
+from runner.configuration.files import SITE_VARIABLE, conf_directories
 from runner.drive.log import FILES, WITHOUT_LOG, Log, check_free
 from runner.errors import ArgumentError, os_errors_as
 from runner.link import LimitedLink, check_possible, limited_link
@@ -64,6 +64,7 @@ LOOK_S = 0.05  # how soon the other side is stopped once one has ended
 SIDE_END_S = signals.END_S + 0.2  # a side ends itself by force before it is killed
 END_S = 2.8  # both sides, link and broker
 DIRECTORIES = ("output", "log")  # arguments that get a directory for each run of a sweep
+WITHOUT_SITE = {SITE_VARIABLE: ""}  # both sides are on this machine, whatever it is otherwise a part of
 DRIVE = "drive"  # subdirectory of output= in which a drive is stored
 
 
@@ -190,6 +191,7 @@ def _prepare_run(
         raise ArgumentError("link", link.kind, "needs a log to show its effect: give log=DIR or output=OUT")
     if link:
         check_possible(link.kind)
+    own = replace(own, overrides=with_choice(own.overrides, "pqos", config))
     config = config.drivable(apply.check_plan)
     config.pqos()
     setup = config.setup()
@@ -279,10 +281,11 @@ def _sides(words: Sequence[str], link: LimitedLink | None, run: _Run) -> Iterato
         to_operator = (*to_operator, f"keys={run.keys.controller}")
     to_operator = (*to_operator, f"duration_s={run.duration_s}")
     with tempfile.TemporaryFile("w+") as stderr, tempfile.TemporaryDirectory() as state, ExitStack() as stack:
-        before, env = link.vehicle_command if link else (), {"XDG_STATE_HOME": state}  # each drive is a new one
+        before = link.vehicle_command if link else ()
+        own = {**WITHOUT_SITE, "XDG_STATE_HOME": state}  # each drive is a new one
         sides = (
-            VerbProcess("the vehicle's side", "vehicle", [*words, *to_vehicle], before, stderr, env),
-            VerbProcess("the operator's side", "operator", [*words, *to_operator], env=env),
+            VerbProcess("the vehicle's side", "vehicle", [*words, *to_vehicle], before, stderr, own),
+            VerbProcess("the operator's side", "operator", [*words, *to_operator], env=own),
         )
         for side in sides:
             stack.enter_context(signals.urgent(side.kill))

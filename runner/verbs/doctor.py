@@ -64,8 +64,11 @@ NEEDED = {  # extras of this package that a verb needs with any configuration
 def run(arguments: Arguments) -> int:
     verb = _verb(arguments)
     overrides = [study_word(word) for word in arguments.overrides] if verb == "model" else arguments.overrides
-    config = configuration(overrides, arguments.conf, runnable=False)
+    site = arguments.site if VERBS[verb].sited else None
+    config = configuration(overrides, arguments.conf, runnable=False, site=site)
     findings = list(examine(verb, config.setup(), config.document))
+    if site:
+        print(f"ok      site file {site}")
     for fine, what in findings:
         print(f"{'ok     ' if fine else 'MISSING'} {what}")
     if not findings:

@@ -24,9 +24,10 @@ import time
 from collections import deque
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from runner.configuration.config import configuration
+from runner.configuration.config import configuration, with_choice
 from runner.core.model import Camera, Vehicle
 from runner.errors import ArgumentError, RunError, suggest
 from runner.operator.station import Listener
@@ -66,11 +67,13 @@ def run(arguments: Arguments) -> int:
 
     duration = arguments.number("duration_s")
     looped = arguments.choice("loop") == "true"
-    setup = configuration(arguments.overrides, arguments.conf, runnable=False).setup()
+    site = None if looped else arguments.site
+    config = configuration(arguments.overrides, arguments.conf, runnable=False, site=site)
+    setup = config.setup()
     camera = _camera(setup.vehicle, arguments.values.get("camera"))
     keys = KeysOfAll.of(setup) if looped else None
     own = [*arguments.overrides, *([f"keys={keys.controller}"] if keys else [])]
-    page_keys = page_keyring(configuration(own, arguments.conf, runnable=False).setup())
+    page_keys = page_keyring(configuration(own, arguments.conf, runnable=False, site=site).setup())
     sys.setswitchinterval(SWITCH_S)
     readings: deque[CounterReading] = deque(maxlen=MOST_READINGS)
 
@@ -81,8 +84,9 @@ def run(arguments: Arguments) -> int:
     with ExitStack() as stack:
         if looped:
             stack.enter_context(private_broker(setup.control, keys.broker if keys else None, say))
-            stack.enter_context(_looped_vehicle(arguments, camera, [f"keys={keys.vehicle}"] if keys else []))
-        operator = stack.enter_context(live_operator(own, arguments.conf))
+            words = [*with_choice(arguments.overrides, "pqos", config), *([f"keys={keys.vehicle}"] if keys else [])]
+            stack.enter_context(_looped_vehicle(words, arguments.conf, camera))
+        operator = stack.enter_context(live_operator(own, arguments.conf, site=site))
         page = PageServer(operator.setup, operator.station, on_counter, keyring=page_keys)
         page.start()
         stack.callback(page.stop)
@@ -108,14 +112,14 @@ def _camera(vehicle: Vehicle, name: str | None) -> Camera:
 
 
 @contextmanager
-def _looped_vehicle(arguments: Arguments, camera: Camera, more: Sequence[str]) -> Iterator[None]:
+def _looped_vehicle(words: Sequence[str], conf: Path | None, camera: Camera) -> Iterator[None]:
     """Run the vehicle's side here; one of its cameras delivers pictures of the counter."""
     from runner.vehicle.live import live_vehicle
 
-    words = [*arguments.overrides, *more, f"+source@cameras.{camera.name}.source=appsrc"]
+    words = [*words, f"+source@cameras.{camera.name}.source=appsrc"]
     with (
         progress_bar() as progress,
-        live_vehicle(words, arguments.conf, say=say, progress=progress) as vehicle,
+        live_vehicle(words, conf, say=say, progress=progress) as vehicle,
     ):
         ended = threading.Event()
         thread = threading.Thread(target=_film, args=(vehicle, camera, ended), name="counter", daemon=True)

@@ -43,7 +43,7 @@ def run(arguments: Arguments) -> int:
     sys.setswitchinterval(SWITCH_S)
     with (
         LiveTable() as table,
-        live_operator(arguments.overrides, arguments.conf, log=arguments.drive()) as operator,
+        live_operator(arguments.overrides, arguments.conf, log=arguments.drive(), site=arguments.site) as operator,
     ):
         station = operator.station
         station.listeners.append(table)

@@ -61,7 +61,7 @@ def run(arguments: Arguments) -> int:
 def _print_configuration(arguments: Arguments) -> int:
     if "total_kbps" in arguments.values:
         raise ArgumentError("total_kbps", None, "has no effect with format=yaml")
-    config = configuration(arguments.overrides, arguments.conf)
+    config = configuration(arguments.overrides, arguments.conf, site=arguments.site)
     config.setup()
     _print(config.listing(), [])
     return 0
@@ -94,7 +94,7 @@ def _parameter_sets(plans: Sequence[Plan]) -> list[str]:
 
 def _plan(arguments: Arguments) -> tuple[Vehicle, Sequence[Plan], Decision, Uplinks]:
     total = arguments.number("total_kbps")
-    config = configuration(arguments.overrides, arguments.conf)
+    config = configuration(arguments.overrides, arguments.conf, site=arguments.site)
     setup = config.setup()
     decision = decide(setup.vehicle, None if total is None else exact(total))
     return setup.vehicle, compile_plans(setup), decision, _uplinks(config.document)

@@ -48,7 +48,7 @@ Show = Callable[[Mapping[str, "Recorded"]], None]
 def run(arguments: Arguments) -> int:
     duration, directory = _duration(arguments), _directory(arguments)
     apply = streaming()
-    config = configuration(arguments.overrides, arguments.conf, check=apply.check_plan)
+    config = configuration(arguments.overrides, arguments.conf, site=arguments.site, check=apply.check_plan)
     setup = as_offered(config.setup(), say)
     vehicle = setup.vehicle
     _check_sources(vehicle)

@@ -38,7 +38,7 @@ def run(arguments: Arguments) -> int:
     from runner.security.exposure import keyring_of
 
     duration = arguments.number("duration_s")
-    setup = configuration(arguments.overrides, arguments.conf, runnable=False).setup()
+    setup = configuration(arguments.overrides, arguments.conf, site=arguments.site, runnable=False).setup()
     check_discovery(setup.ros, setup.insecure)
     bridge = Bridge(setup, keyring_of(setup), say)
     try:

@@ -6,8 +6,11 @@ after duration_s. With log=DIR events, decisions and telemetry are written to DI
 with drives=DIR to DIR/TIME/drive.jsonl, where TIME is the start in UTC. Who is in control outlasts a restart, in
 ~/.local/state/tod-runner/vehicles (or below XDG_STATE_HOME).
 
-  tod-runner vehicle                                        the paper's vehicle with a synthetic drive
-  tod-runner vehicle source=v4l2 pqos=live                  real cameras; predictions come over the control link
+Predictions and positions come over the control link (pqos=live) unless a file or an override states another source.
+
+  tod-runner vehicle                                        the paper's vehicle with rendered pictures
+  tod-runner vehicle source=v4l2                            real cameras
+  tod-runner vehicle pqos=map                               as in the demo: positions of a simulated drive along a map
   tod-runner vehicle keys=tod-keys graph=h264_srt media.host=192.0.2.7 control.host=192.0.2.7 control.port=8883
                                                             connect to an operator that listens there
 """
@@ -37,6 +40,7 @@ def run(arguments: Arguments) -> int:
             state=state_directory() / "vehicles",
             say=say,
             progress=progress,
+            site=arguments.site,
         ) as vehicle,
         stopping(action=vehicle.loop.stop) as stop,
     ):

@@ -60,7 +60,7 @@ def main(words: list[str]) -> int:
     began, different = time.monotonic(), 0
     with tempfile.TemporaryDirectory() as empty:
         # Rendered clips of the user's cache would show up in the printed lines.
-        os.environ |= {"XDG_CACHE_HOME": empty}
+        os.environ |= {"XDG_CACHE_HOME": empty, "TOD_SITE": ""}
         os.environ.pop("TOD_CONF", None)
         with ProcessPoolExecutor(os.cpu_count(), initializer=_prepare) as pool:
             for section in sections:
@@ -241,7 +241,8 @@ def _prepare() -> None:
     shared = lru_cache(maxsize=8)(compose)
 
     def configuration(overrides: Sequence[str] = (), user: Path | None = None, **options: Any) -> config.Configuration:
-        return compose(overrides, user, **options) if options else shared(tuple(overrides), user)
+        given = {key: value for key, value in options.items() if value is not None}
+        return compose(overrides, user, **given) if given else shared(tuple(overrides), user)
 
     config.configuration = configuration
     gc.freeze()

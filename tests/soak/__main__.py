@@ -110,7 +110,7 @@ def main(chosen: Sequence[str]) -> int:
         return _run(chosen[0], seed, scale)
     print(f"seed {seed}, scale {scale:g}", flush=True)
     # For the parts, whose lines must appear immediately.
-    os.environ |= {"SOAK_SEED": str(seed), "PYTHONUNBUFFERED": "1"}
+    os.environ |= {"SOAK_SEED": str(seed), "PYTHONUNBUFFERED": "1", "TOD_SITE": ""}
     names = chosen or tuple(PARTS)
     lanes = [
         [name for name in names if name not in ALONE and (name in SECOND_LANE) == second] for second in (False, True)
