@@ -55,18 +55,21 @@ class ForeignBroker:
 class Control(Endpoint):
     """The MQTT broker.
 
-    prefix   what all topics begin with
-    foreign  None: `tod-runner keys` set it up, or it asks for no keys
+    prefix    what all topics begin with
+    foreign   None: `tod-runner keys` set it up, or it asks for no keys
+    embedded  whether this side starts it
     """
 
     prefix: str = PREFIX
     foreign: ForeignBroker | None = None
+    embedded: bool = False
 
     @staticmethod
     def of(data: Mapping[str, Any]) -> Control:
         """From the section `control` of a configuration.
 
-        raises  ModelError for keys of a foreign broker although it is none, and for a password in place of its file
+        raises  ModelError for keys of a foreign broker although it is none, for a password in place of its file, and for
+                a foreign broker that this side is to start
         """
         given = {each.name: data[each.name] for each in fields(ForeignBroker) if data.get(each.name)}
         if given and not data.get("foreign"):
@@ -75,8 +78,12 @@ class Control(Endpoint):
             raise ModelError(first, given[first], rule, *others)
         if ":" in given.get("credentials", ""):
             raise ModelError("credentials", "***", "must be the name of a file with one line user:password, not these")
+        if data.get("broker") and data.get("foreign"):
+            raise ModelError(
+                "broker", data["broker"], "must not be given: control.foreign is another broker", "foreign"
+            )
         foreign = ForeignBroker(**given) if data.get("foreign") else None
-        return Control(data["host"], data["port"], data.get("prefix", PREFIX), foreign)
+        return Control(data["host"], data["port"], data.get("prefix", PREFIX), foreign, bool(data.get("broker")))
 
 
 @dataclass(frozen=True, slots=True)

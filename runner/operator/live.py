@@ -277,6 +277,10 @@ def live_operator(
     operator = LiveOperator(setup, station, drive, build, requests)
     with ExitStack() as ending:  # in reverse order
         ending.callback(drive.close)
+        if setup.control.embedded:
+            from runner.mqtt.embedded import embedded_broker
+
+            ending.enter_context(embedded_broker(setup, station.note))
         metrics = SideMetrics(setup.vehicle.name, setup.metrics.operator_port, log)
         station.listeners.append(_MetricsListener(metrics))
         ending.callback(metrics.close)

@@ -88,8 +88,9 @@ class KeysOfAll(NamedTuple):
 
         raises  UserError, also if keys are missing although video or control leave this machine
         """
-        if setup.control.foreign:
-            raise ArgumentError("control.foreign", "true", "this verb starts a broker of its own")
+        if setup.control.foreign or setup.control.embedded:
+            word = ("control.foreign", "true") if setup.control.foreign else ("control.broker", "embedded")
+            raise ArgumentError(*word, "this verb starts a broker of its own")
         if setup.keys is None:
             keyring_of(setup)
             return None

@@ -25,7 +25,7 @@ from runner.configuration import agreement
 from runner.configuration.config import configuration
 from runner.core.model import Progress
 from runner.drive.log import Log, check_free
-from runner.errors import RunError
+from runner.errors import RunError, UserError
 from runner.graph import rtsp_url
 from runner.metrics.side import SideMetrics
 from runner.mqtt.link import ControlLink, login_of
@@ -336,6 +336,21 @@ def _link(
     return ControlLink(control, will, listen, on_connected, on_report, new_login(on_report), prefix=control.prefix)
 
 
+@contextmanager
+def _embedded_broker(setup: Setup, report: Callable[[str], None]) -> Iterator[None]:
+    """raises UserError also for a vehicle of which no address is the one"""
+    if not setup.control.embedded:
+        yield
+        return
+    if len(setup.uplinks) > 1:
+        rule = "a vehicle with several uplinks has several addresses: give it to the operator's side"
+        raise UserError("", "control.broker", "embedded", rule)
+    from runner.mqtt.embedded import embedded_broker
+
+    with embedded_broker(setup, report):
+        yield
+
+
 def _check_ros(setup: Setup) -> None:
     """raises UserError if the ROS node would discover unauthenticated nodes"""
     if any(camera.topic for camera in setup.vehicle.cameras.values()):
@@ -430,6 +445,7 @@ def live_vehicle(
             partial(may_listen, setup),
         )
         ending.callback(side.stop)
+        ending.enter_context(_embedded_broker(setup, report))
         control = _VehicleControl(setup, document, report, keyring)
         ending.callback(control.close)
         metrics = SideMetrics(setup.vehicle.name, setup.metrics.vehicle_port, log)

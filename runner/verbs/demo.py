@@ -196,7 +196,7 @@ def _prepare_run(
     config.pqos()
     setup = config.setup()
     # In network namespaces of its own, a link replaces the hosts.
-    is_open = setup.keys is None and not setup.control.foreign
+    is_open = setup.keys is None and not (setup.control.foreign or setup.control.embedded)
     keys = None if is_open and link and link.kind == "netns" else KeysOfAll.of(setup)
     if keys and link and link.kind == "relay":
         rule = "rewrites ports in RTSP, which keys encrypt; link=netns passes it unread"

@@ -116,7 +116,7 @@ def examine(verb: str, setup: Setup, document: Mapping[str, Any]) -> Iterator[Di
         yield from bindings
         if all(finding.fine for finding in bindings):
             yield from _elements(verb, setup)
-    if verb == "demo":
+    if _starts_broker(verb, setup):
         yield _broker()
     yield from _ports(verb, setup)
     if verb in CONNECTING and setup.keys is not None and find_spec("cryptography"):
@@ -215,9 +215,13 @@ def _elements(verb: str, setup: Setup) -> Iterator[Diagnosis]:
         yield Diagnosis(True, f"{len(names)} GStreamer elements")
 
 
+def _starts_broker(verb: str, setup: Setup) -> bool:
+    return verb == "demo" or (setup.control.embedded and verb in ("vehicle", "operator"))
+
+
 def _broker() -> Diagnosis:
     try:
-        return Diagnosis(True, f"MQTT broker {find_mosquitto()}, for the demo")
+        return Diagnosis(True, f"MQTT broker {find_mosquitto()}, which this verb starts")
     except RunError as error:
         return Diagnosis(False, str(error))
 
@@ -227,7 +231,7 @@ def _ports(verb: str, setup: Setup) -> Iterator[Diagnosis]:
     ports: dict[str, Endpoint] = {}
     if verb in ("vehicle", "demo"):
         ports["media.port"] = setup.media
-    if verb == "demo":
+    if _starts_broker(verb, setup):
         ports["control.port"] = setup.control
     if verb == "latency" or (verb in ("operator", "demo") and setup.page.serve):
         ports["page.port"] = setup.page.endpoint
