@@ -11,7 +11,6 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from runner.core.commands import Command, KnobValue
@@ -30,7 +29,7 @@ from runner.gst.outage import ReportMerger
 from runner.gst.pipeline import CameraPipeline, OnReport, Openings
 from runner.gst.probes import PassingBuffer
 from runner.gst.receiver import OnPicture, OnUnit, Receiver, Reception
-from runner.gst.recorder import Recorded, Recorder, Stage
+from runner.gst.recorder import Recorded, Stage
 from runner.gst.registry import (
     LIVE,
     check_operator,
@@ -44,7 +43,7 @@ from runner.gst.rtspsrc import limit_teardown
 from runner.gst.server import CameraServer
 from runner.gst.source import source_problem
 from runner.gst.supervised import CameraCaller
-from runner.gst.timers import Guarded, every
+from runner.gst.timers import Guarded, every, later
 from runner.gst.video_files import VideoFile, VideoFiles
 from runner.gst.watched import WatchedSource
 from runner.records.reception import Arrivals, SentFrame, UplinkReceived, UplinkSent
@@ -58,6 +57,7 @@ if TYPE_CHECKING:
     from runner.gst.parameter_sets import parameter_set_notes
     from runner.gst.pictures import decode_video
     from runner.gst.received_uplinks import Addresses
+    from runner.gst.recording_side import RecordingSide
     from runner.gst.secure import StreamLogin
     from runner.gst.sequence import discover
     from runner.gst.video_reader import Unit, read_video
@@ -92,6 +92,7 @@ __all__ = [
 ]
 
 OFFLINE = {  # by name, its module
+    "RecordingSide": "recording_side",
     "decode_video": "pictures",
     "discover": "sequence",
     "parameter_set_notes": "parameter_sets",
@@ -378,6 +379,7 @@ class OperatorSide:
     keyring     of this operator; None: no authentication
     vehicle     its name, which its certificate must state
     uplinks     addresses of the vehicle by uplink, as far as known; None: it has one way
+    cameras     those to receive until `receive` names others; None: all
     raises      RunError if a plugin that `video` needs is not installed
     """
 
@@ -393,6 +395,7 @@ class OperatorSide:
         keyring: Keyring | None = None,
         vehicle: str = "",
         uplinks: Addresses | None = None,
+        cameras: Collection[str] | None = None,
     ) -> None:
         plans = _with_video(plans, video, "operator")
         self._glib = GlibThread()
@@ -411,12 +414,25 @@ class OperatorSide:
             for plan in plans
         }
 
+        self._running: Mapping[str, Receiver] = {}  # replaced as a whole: other threads read it
+
         def start() -> None:
-            for receiver in self._receivers.values():
-                receiver.start()
+            self._run(frozenset(self._receivers if cameras is None else cameras))
             self._tails = every(TAILS_MS, self._request_tails, lambda what: on_report("receivers", what))
 
         self._glib.call("starting the receivers", start)
+
+    def receive(self, cameras: Collection[str]) -> None:
+        """Receive these cameras, and no others: of those the vehicle sends nothing here. Returns immediately."""
+        later(0, partial(self._run, frozenset(cameras)))
+
+    def _run(self, cameras: Collection[str]) -> None:
+        before, self._running = self._running, {n: r for n, r in self._receivers.items() if n in cameras}
+        for name, receiver in self._receivers.items():
+            if name in before and name not in cameras:
+                receiver.stop()
+            elif name in cameras and name not in before:
+                receiver.start()
 
     def sample(self, sending: Mapping[str, bool], anew: bool = False) -> dict[str, Reception]:
         """Reception of each camera; to be called a few times a second.
@@ -425,10 +441,14 @@ class OperatorSide:
         anew     ask at once for those that the vehicle has refused: it may decide otherwise now
         raises   RunError if GStreamer hangs
         """
-        receivers = self._receivers
-        return self._glib.call(
-            "reading the receivers' counters", lambda: {n: r.sample(sending.get(n), anew) for n, r in receivers.items()}
-        )
+
+        def sample() -> dict[str, Reception]:
+            return {
+                name: receiver.sample(sending.get(name), anew) if name in self._running else receiver.stopped_at
+                for name, receiver in self._receivers.items()
+            }
+
+        return self._glib.call("reading the receivers' counters", sample)
 
     def admit(self, uplinks: Addresses) -> None:
         """Receive from these addresses of the vehicle, by uplink, and from no others. From any thread."""
@@ -440,55 +460,20 @@ class OperatorSide:
         return {name: each.rtp.uplinks.counts() for name, each in self._receivers.items() if each.rtp.uplinks}
 
     def _request_tails(self) -> None:
-        for receiver in self._receivers.values():
+        for receiver in self._running.values():
             receiver.rtp.request_tails()
 
     def take_arrivals(self) -> dict[str, Arrivals]:
         """Arrivals since the last call, by uplink, "" if the vehicle has one; to be called from one thread."""
-        return take_arrivals(self._receivers)
+        return take_arrivals(self._running)
 
     def stop(self) -> None:
         def stop() -> None:
             GLib.source_remove(self._tails)
-            for receiver in self._receivers.values():
-                receiver.stop()
+            self._run(())
 
         self._glib.end(stop)
         self._reports.flush()
-
-
-class RecordingSide:
-    """Records cameras of the vehicle, each from its source into a file.
-
-    files       by camera, the file that is written
-    duration_s  length of the recordings, s; None: until `finish`
-    """
-
-    def __init__(self, plans: Sequence[Plan], files: Mapping[str, Path], duration_s: float | None) -> None:
-        self._glib = GlibThread()
-        plans = _with_clip_range(plans)
-        self._recorders = {p.camera.name: Recorder(p, str(files[p.camera.name]), duration_s) for p in plans}
-        self._glib.call("starting the recorders", self._for_each(Recorder.start))
-
-    def sample(self) -> dict[str, Recorded]:
-        """Progress of each camera's recording."""
-        recorders = self._recorders
-        return self._glib.call("reading the recorders' counters", lambda: {n: r.sample() for n, r in recorders.items()})
-
-    def finish(self) -> None:
-        """Finish every file with all frames delivered so far; returns immediately."""
-        self._glib.call("ending the files", self._for_each(Recorder.finish))
-
-    def stop(self) -> None:
-        """Stop immediately; unfinished files stay incomplete."""
-        self._glib.end(self._for_each(Recorder.stop))
-
-    def _for_each(self, do: Callable[[Recorder], None]) -> Callable[[], None]:
-        def each() -> None:
-            for recorder in self._recorders.values():
-                do(recorder)
-
-        return each
 
 
 if not TYPE_CHECKING:

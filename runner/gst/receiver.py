@@ -144,6 +144,7 @@ class Receiver:
         self._supervised.must_wait = lambda: time.monotonic() < self._refused_until
         self._refused, self._refused_until = 0, 0.0  # refusals in a row; until when the vehicle is not asked again
         self._before = Reception()  # counters of earlier pipelines
+        self.stopped_at = Reception()  # counters when it was stopped
         self._latency, self._decode = RecentValue[float](), RecentValue[float]()  # ms, of a sampled frame
         self._entered: tuple[int | None, float] = (None, 0.0)  # PTS of the newest access unit, and when it arrived
         self._foreign_reported = False
@@ -158,7 +159,12 @@ class Receiver:
         self._supervised.start()
 
     def stop(self) -> None:
+        """Stop receiving; it may be started again, and its counters continue."""
         self._supervised.stop()
+        if self._built:
+            counted = self._count()
+            self.stopped_at = replace(counted, width=0, height=0, latency_ms=None, latency_at=None, decode_ms=None)
+            self._before = replace(self._before, foreign=counted.foreign)
         self._close_filter()
 
     def sample(self, should_send: bool | None, anew: bool = False) -> Reception:

@@ -60,7 +60,11 @@ class SupervisedPipeline:
         self.before_stop: Callable[[], object] = lambda: None
 
     def start(self) -> None:
+        """Build and start it, also again after `stop`: then once the previous pipeline has released its port."""
         self._stopped = False
+        self._begin()
+
+    def _build(self) -> None:
         pipeline = Gst.parse_launch(self._launch)
         if not isinstance(pipeline, Gst.Pipeline):  # a single element is returned without a pipeline
             element, pipeline = pipeline, Gst.Pipeline.new(None)
@@ -79,7 +83,7 @@ class SupervisedPipeline:
         if self._retry:
             self._retry.cancel()
             self._retry = None
-        self._stopped = True
+        self._stopped, self._ended = True, time.monotonic()
         self._tear_down()
 
     def _tear_down(self) -> None:
@@ -111,17 +115,17 @@ class SupervisedPipeline:
             self._outage.report_failure(why, self._lost)
         self._ended = now
         self._tear_down()
-        self._retry = later(max(0.0, self._begun + RETRY_S - now), self._retry_start)
+        self._retry = later(max(0.0, self._begun + RETRY_S - now), self._begin)
 
-    def _retry_start(self) -> None:
+    def _begin(self) -> None:
         if self._change and self._change.is_alive() and time.monotonic() - self._ended < STOPPED_S:
-            self._retry = later(STOPPING_S, self._retry_start)
+            self._retry = later(STOPPING_S, self._begin)
             return
         if self.must_wait():
-            self._retry = later(RETRY_S, self._retry_start)
+            self._retry = later(RETRY_S, self._begin)
             return
         self._retry = None
-        self.start()
+        self._build()
 
     def _on_failed(self, _bus: Gst.Bus, message: Gst.Message) -> None:
         if concerns_file(message) or self._retry or self._stopped:

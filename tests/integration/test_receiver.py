@@ -296,3 +296,42 @@ def test_work_that_hangs_in_gstreamer_s_thread_is_reported(monkeypatch):
             assert str(raised.value) == f"GStreamer hangs: {what} takes more than 0.2 s"
         finally:
             freed.set()
+
+
+def test_cameras_are_received_while_they_are_asked_for():
+    setup, plans = compiled()
+    with sending(setup, plans) as vehicle, receiving(plans) as (side, messages, more):
+        more()
+
+        def watched():
+            return {name for name in CAMERAS if vehicle.read()[name].encoded.frames}
+
+        assert watched() == set(CAMERAS)
+        side.receive(["rear"])
+        until(lambda: watched() == {"rear"})
+        at_stop = side.sample(SENDING)["front"]
+        assert (at_stop.frames > 0, at_stop.width, at_stop.latency_ms) == (True, 0, None)
+        side.receive([])
+        until(lambda: watched() == set())
+        assert side.sample(SENDING)["front"] == at_stop  # although the vehicle says that it sends
+        side.receive(CAMERAS)
+        more()
+        assert side.sample(SENDING)["front"].frames > at_stop.frames  # its counters go on
+        assert {received.rebuilt for received in side.sample(SENDING).values()} == {0}
+        assert messages == []
+
+
+def test_a_side_may_begin_without_any_camera():
+    from runner.apply import OperatorSide
+
+    setup, plans = compiled()
+    with sending(setup, plans) as vehicle:
+        side = OperatorSide(plans, lambda *_: None, cameras=())
+        try:
+            assert {received.frames for received in side.sample(SENDING).values()} == {0}
+            assert side.take_arrivals()[""].frames == {}
+            side.receive(["front"])
+            until(lambda: side.sample(SENDING)["front"].frames > 5)
+            assert not vehicle.read()["rear"].encoded.frames
+        finally:
+            side.stop()
