@@ -86,3 +86,14 @@ def test_an_operator_stays_while_another_process_of_it_reports_or_only_a_connect
     assert operators.stays("a", 1.5, ended=2, will=False) is None
     assert operators.stays("a", 1.5, ended=None, will=True) == BROKE
     assert operators.stays("stranger", 1.5, ended=None, will=False) is None
+
+
+def test_an_operator_may_be_present_to_watch_only() -> None:
+    operators = Operators(1.0)
+    operators.connected("station", 0.0, watching=True)
+    operators.connected("driver", 0.0)
+    assert (operators.present, operators.watching) == ({"station", "driver"}, {"station"})
+    operators.message_received("station", 0.5)  # such as a report
+    assert operators.watching == {"station"}
+    operators.connected("station", 1.0)
+    assert operators.watching == set()

@@ -277,11 +277,13 @@ class OperatorConnected(_Event):
     operator   its id; the vehicle takes it from the topic of the request. Absent: not stated, as in earlier logs
     role       by its keys, stated by the vehicle; without keys everybody is a supervisor
     attention  stated by the operator's page with its heartbeat; the vehicle derives `AttentionChanged` from it
+    watching   true: it only watches, and must not be given control
     """
 
     operator: str | None = None
     role: Role | None = None
     attention: Attention | None = None
+    watching: bool | None = None
 
 
 class Departure(StrEnum):

@@ -96,7 +96,7 @@ class SimulatedVehicle:
 
     def _note_presence(self, t: float) -> None:
         before, present = self.run.state, self._operators.present
-        for event in presence_events(before, present, lambda _: Role.CONTROLLER, t, Departure.SILENT):
+        for event in presence_events(before, present, (), lambda _: Role.CONTROLLER, t, Departure.SILENT):
             self.take(event)
         in_control = self.run.state.driving.in_control
         if in_control != before.driving.in_control:

@@ -309,7 +309,7 @@ class ControlLoop:
         """Any message of an operator shows its presence."""
         before = self._operators.present
         if isinstance(event, OperatorConnected):
-            self._operators.connected(sender, t)
+            self._operators.connected(sender, t, watching=event.watching is True)
         elif isinstance(event, OperatorDisconnected):
             self._operators.signed_off(sender)
         else:
@@ -332,7 +332,8 @@ class ControlLoop:
             self.on_report(f"operator {name} is present")
         for name in sorted(before - now):
             self.on_report(f"operator {name} {departure}")
-        self._notice(presence_events(self._run.state, now, self.access.role, t, departure))
+        watching = self._operators.watching
+        self._notice(presence_events(self._run.state, now, watching, self.access.role, t, departure))
 
     def _take(self, event: Event, answer: Answer | None = None) -> None:
         driving = self._run.state.driving

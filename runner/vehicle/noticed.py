@@ -23,6 +23,7 @@ from runner.records.vehicle import CameraReading
 def presence_events(
     known: State,
     present: Collection[str],
+    watching: Collection[str],
     role_of: Callable[[str], Role | None],
     t: float,
     departure: Departure,
@@ -30,10 +31,12 @@ def presence_events(
     """Which operators have come, in which role, and which have gone.
 
     present    names of those that are; "" is the vehicle's own program, which drives nothing
+    watching   names of those who only watch, whatever their keys allow
     role_of    None: its keys were withdrawn
     departure  how those that are no longer present have left
     """
-    roles = {name: role for name in sorted(present) if name and (role := role_of(name))}
+    allowed = {name: role for name in sorted(present) if name and (role := role_of(name))}
+    roles = {name: Role.WATCHER if name in watching else role for name, role in allowed.items()}
     for name in known.driving.present.keys() - roles.keys():
         yield OperatorDisconnected(t=t, operator=name, departure=Departure.WITHDRAWN if name in present else departure)
     for name, role in roles.items():

@@ -27,6 +27,7 @@ class _Operator:
     last_message: float
     present: bool = False
     announced: bool = False
+    watching: bool = False
     clock_asked: float = -inf
     runs: dict[int, float] = field(default_factory=dict)  # by process, when it last sent a reception report
     delays: deque[float] = field(default_factory=lambda: deque(maxlen=DELAYS))
@@ -46,10 +47,15 @@ class Operators:
     def present(self) -> frozenset[str]:
         return frozenset(name for name, operator in self._known.items() if operator.present)
 
-    def connected(self, name: str, t: float) -> bool:
+    @property
+    def watching(self) -> frozenset[str]:
+        """Those who say that they only watch."""
+        return frozenset(name for name, operator in self._known.items() if operator.watching)
+
+    def connected(self, name: str, t: float, *, watching: bool = False) -> bool:
         """An operator announces itself, initially or as its heartbeat; returns whether it was absent."""
         operator = self._operator(name, t)
-        operator.announced = True
+        operator.announced, operator.watching = True, watching
         return self.message_received(name, t)
 
     def message_received(self, name: str, t: float) -> bool:
