@@ -11,7 +11,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from math import inf
@@ -24,6 +24,7 @@ from runner.core.evidence import REPORT_S
 from runner.drive.log import Log
 from runner.errors import RunError
 from runner.metrics.side import SideMetrics
+from runner.operator.demand import Demand
 from runner.operator.log import DriveLog
 from runner.operator.station import Listener, Station
 from runner.plans import compile_plans
@@ -54,6 +55,7 @@ class LiveOperator:
     station  this end of the control link; its listeners must be added before `start`
 
     requests  in order of time; each is sent at its time since the vehicle came online
+    demand    what to receive, see `show`; None: every camera, all the time
     """
 
     def __init__(
@@ -63,8 +65,12 @@ class LiveOperator:
         log: Log,
         build: Callable[[OnUnit | None], OperatorSide],
         requests: Sequence[TimedRequest] = (),
+        demand: Demand | None = None,
     ) -> None:
         self.setup, self.station = setup, station
+        self._demand, self._following = demand, threading.Lock()
+        self._received = frozenset[str]()  # as the demand was last followed
+        self.on_dropped: Callable[[Collection[str]], None] = lambda cameras: None  # that are no longer received
         self._log, self._build = log, build
         self._side: OperatorSide | None = None
         self._stopped = threading.Event()
@@ -84,8 +90,11 @@ class LiveOperator:
         on_unit     called, from the camera's streaming thread, with each access unit that arrives
         duration_s  from the moment the vehicle is online, or START_S after this call; None: until stopped
         """
+        if self._demand:
+            self._follow(self._demand)
         self.station.connect()
-        self._await_vehicle()
+        if not self._demand:
+            self._await_vehicle()
         self._side = self._build(on_unit)
         self._log.begin()
         self._duration_s = inf if duration_s is None else duration_s
@@ -99,6 +108,25 @@ class LiveOperator:
         deadline = time.monotonic() + CONTROL_FIRST_S
         while not self.station.state and time.monotonic() < deadline and not self._stopped.wait(POLL_S):
             pass
+
+    def show(self, cameras: Collection[str], is_open: bool) -> None:
+        """Receive these cameras, and drive while a page is open. From any thread; for a side that follows a demand."""
+        assert self._demand
+        with self._following:
+            self._demand.ask(cameras, is_open=is_open, now=time.monotonic())
+        self._follow(self._demand)
+
+    def _follow(self, demand: Demand) -> None:
+        with self._following:
+            now = time.monotonic()
+            cameras = demand.cameras(now)
+            self.station.appear(demand.presence(now, in_control=self.station.is_in_control))
+            if self._side is None or cameras == self._received:
+                return
+            dropped, self._received = self._received - cameras, cameras
+            self._side.receive(cameras)
+        if dropped:
+            self.on_dropped(dropped)
 
     def runs(self, wait_s: float = 0.0) -> bool:
         """Whether it is still sampling after a time; returns immediately if not.
@@ -172,6 +200,8 @@ class LiveOperator:
                     self.station.note(last_fault)
 
     def _sample(self, side: OperatorSide) -> None:
+        if self._demand:
+            self._follow(self._demand)
         if addresses := self.station.addresses:
             side.admit(addresses)
         state = self.station.state
@@ -231,6 +261,7 @@ def live_operator(
     *,
     log: Path | None = None,
     site: Path | None = None,
+    on_demand: bool = False,
 ) -> Iterator[LiveOperator]:
     """Run an operator's side; at the end it signs off from the vehicle and stops.
 
@@ -238,6 +269,7 @@ def live_operator(
     conf       directory of files of your own, which shadow the packaged ones
     log        directory that the drive is recorded to
     site       the site file of this machine; None: none is read
+    on_demand  receive, and show itself to the vehicle, only as `LiveOperator.show` says
     raises     ConfigError, RunError, UserError if the directory already holds a drive
     """
     from runner import apply
@@ -272,9 +304,10 @@ def live_operator(
             keyring=keyring,
             vehicle=setup.vehicle.name,
             uplinks=station.addresses if setup.uplinks else None,
+            cameras=() if on_demand else None,
         )
 
-    operator = LiveOperator(setup, station, drive, build, requests)
+    operator = LiveOperator(setup, station, drive, build, requests, Demand() if on_demand else None)
     with ExitStack() as ending:  # in reverse order
         ending.callback(drive.close)
         if setup.control.embedded:

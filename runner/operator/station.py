@@ -29,6 +29,7 @@ from runner.mqtt.messages import (
     read_telemetry,
     topic,
 )
+from runner.operator.demand import Presence
 from runner.operator.latency import Latency, stages
 from runner.operator.meter import MeasuredRates, ReceptionMeter
 from runner.operator.notes import Refusals, change_notes, driver_words
@@ -144,6 +145,7 @@ class Station:
         self.state: VehicleState | None = None  # None: the vehicle is offline
         self._published: VehicleState | None = None  # the last state that the vehicle published
         self.attention: Attention | None = None  # of the driver, as the page detects it
+        self._presence = Presence.DRIVING
         self._telemetry: Telemetry | None = None
         self.addresses: Mapping[str, tuple[str, ...]] = {}  # that the vehicle sends from, by uplink, as it last said
         self._newest, self._newest_steering = Newest(), Newest()
@@ -200,10 +202,30 @@ class Station:
         else:
             self._requests.send(event, on_reply)
 
+    @property
+    def is_in_control(self) -> bool:
+        """Whether the vehicle says that this operator is in control."""
+        state = self.state  # another thread may replace it
+        return state is not None and state.operator == self.identity
+
+    def appear(self, presence: Presence) -> None:
+        """Show this operator to the vehicle like this from now on; without a call it drives."""
+        if presence is self._presence:
+            return
+        self._presence = presence
+        if presence is Presence.ABSENT:
+            self.link.publish(self._to_request, of_run(SIGNED_OFF, self._run))
+        else:
+            self._announce()
+
     def _announce(self) -> None:
         """Announce this operator as present, also to a vehicle that is temporarily silent."""
+        if self._presence is Presence.ABSENT:
+            return
         attention = self.attention  # another thread may replace it
-        presence = {"event": "operator_connected", **({"attention": attention} if attention else {})}
+        presence: JsonObject = {"event": "operator_connected", **({"attention": attention} if attention else {})}
+        if self._presence is Presence.WATCHING:
+            presence = {"event": "operator_connected", "watching": True}
         is_online = self.state is not None
         if is_online or self._may_reach_vehicle():
             self._requests.send(presence, awaited=is_online)
@@ -263,6 +285,8 @@ class Station:
 
         arrivals  by uplink; "": the vehicle has one
         """
+        if self._presence is Presence.ABSENT:
+            return
         now = time.monotonic()
         as_of = self._requests.vehicle_now(now) if self._may_reach_vehicle() else None
         for uplink, reports in self._reports.items():

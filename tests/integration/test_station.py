@@ -17,6 +17,7 @@ from runner.gst.receiver import Reception
 from runner.mqtt.broker import private_broker
 from runner.mqtt.link import ControlLink
 from runner.mqtt.messages import OFFLINE, topic
+from runner.operator.demand import Presence
 from runner.operator.latency import stages
 from runner.operator.meter import MeasuredRates
 from runner.operator.station import SILENT_S, CameraRow, Listener, Station
@@ -273,6 +274,25 @@ def test_the_heartbeat_states_the_drivers_attention(both):
             "operator_connected",
             attention,
         )
+
+
+def test_a_station_that_is_absent_says_nothing_but_goodbye_and_hears_everything(both):
+    station, vehicle, _ = both
+    vehicle.request("operator_connected")
+    station.appear(Presence.ABSENT)
+    assert vehicle.request("operator_disconnected")["id"].startswith("signed off ")
+    vehicle.requests.clear()
+    vehicle.reports.clear()
+    since = len(vehicle.answers)
+    began = time.monotonic()
+    report_until(station, vehicle, lambda: time.monotonic() - began > 1)
+    assert (vehicle.requests, vehicle.reports, len(vehicle.answers)) == ([], [], since)
+    assert station.state.mode == "automatic"
+    station.appear(Presence.WATCHING)
+    assert vehicle.request("operator_connected")["watching"] is True
+    vehicle.requests.clear()
+    station.appear(Presence.DRIVING)
+    assert "watching" not in vehicle.request("operator_connected")
 
 
 def test_the_slowest_camera_that_should_send_is_reported(both):

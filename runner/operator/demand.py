@@ -1,0 +1,53 @@
+"""What an operator's side receives that has the pictures sent only while somebody looks at them. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from enum import Enum, auto
+
+LINGER_S = 2.0  # what nobody looks at any more is received for so long: a page may be loading again
+
+
+class Presence(Enum):
+    """How an operator's side shows itself to the vehicle."""
+
+    ABSENT = auto()  # it only hears what the vehicle publishes
+    WATCHING = auto()  # it is sent pictures, but must not be given control
+    DRIVING = auto()  # it drives, or would
+
+
+@dataclass
+class Demand:
+    """What the open windows of all pages ask for. Times are s."""
+
+    _shown: frozenset[str] = frozenset()
+    _is_open: bool = False
+    _seen: dict[str, float] = field(default_factory=dict)  # by camera, when it was last asked for
+    _opened: float = float("-inf")  # when a page was last open
+
+    def ask(self, cameras: Collection[str], *, is_open: bool, now: float) -> None:
+        """Windows show these cameras from now on.
+
+        is_open  whether one of them is a page, with which a person drives, and not only a picture
+        """
+        self._note(now)
+        self._shown, self._is_open = frozenset(cameras), is_open
+        self._note(now)
+
+    def cameras(self, now: float) -> frozenset[str]:
+        """The cameras to receive."""
+        self._note(now)
+        return frozenset(name for name, seen in self._seen.items() if now - seen < LINGER_S)
+
+    def presence(self, now: float, *, in_control: bool) -> Presence:
+        """How to show it to the vehicle. An operator that is in control does not leave by closing the page."""
+        self._note(now)
+        if in_control or now - self._opened < LINGER_S:
+            return Presence.DRIVING
+        return Presence.WATCHING if self.cameras(now) else Presence.ABSENT
+
+    def _note(self, now: float) -> None:
+        self._seen |= dict.fromkeys(self._shown, now)
+        if self._is_open:
+            self._opened = now
