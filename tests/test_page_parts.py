@@ -349,7 +349,7 @@ def waiting():
 
 def test_no_handler_is_pending_once_the_page_has_stopped(monkeypatch):
     """Python 3.11 may crash at exit while a handler is pending."""
-    monkeypatch.setattr("runner.page.server.STOP_S", 30)  # enough, however busy the machine is
+    monkeypatch.setattr("runner.page.loop.STOP_S", 30)  # enough, however busy the machine is
     hello = f"GET /live?viewer=me HTTP/1.1\r\nHost: localhost:PORT\r\n{UPGRADE}\r\n\r\n"
     before = waiting()  # a library that another test has used may keep a loop of its own
     with socket.socket() as line:

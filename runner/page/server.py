@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-import mimetypes
 import socket
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, replace
-from pathlib import Path
 from typing import Any
 
 from aiohttp import WSMsgType, web
@@ -28,9 +24,11 @@ from runner.operator.station import LinkState, Listener, Station
 from runner.page.access import Access
 from runner.page.connections import MAX_BODY, Connections, abort
 from runner.page.counter import CounterReading, counter_reading
+from runner.page.documents import Documents, document
 from runner.page.history import History
 from runner.page.layouts import Answer, PageLayouts
 from runner.page.login import PageLogin
+from runner.page.loop import PageLoop
 from runner.page.tls import PageTls
 from runner.page.viewer import PageViewer
 from runner.page.windows import Windows
@@ -40,17 +38,13 @@ from runner.records.operator import Sample
 from runner.records.vehicle import Outcome, VehicleState, state_to_json
 from runner.security.keyring import TOKEN, Keyring
 from runner.settings import Setup
-from runner.system.files import plotly_script
 from runner.system.ports import check_port_free
 from runner.system.reports import LimitedReports
 
-STATIC = Path(__file__).with_name("static")
 FROZEN_MS = 120  # a picture that is frozen for this long is marked within 150 ms
 NOTES = 50  # kept for pages that open later
 REPORTED = tuple(attention.value for attention in Attention if attention is not Attention.ABSENT)  # by pages
 SEND_BUFFER_BYTES = 131_072  # small: a viewer that does not read is noticed here, not megabytes later
-START_S = 10.0  # the port is known to be free: only a stalled machine takes longer
-STOP_S = 0.5  # how long open connections may take to close
 LOOPBACK = ("127.0.0.1", "localhost")  # names of the page without keys
 PING_S = 0.5
 UNRESPONSIVE_S = 2.0  # a viewer that has not answered a ping for this long is dropped, and reconnects if it is alive
@@ -83,6 +77,8 @@ class PageServer(Listener):
     ) -> None:
         self._setup, self._station, self._on_counter = setup, station, on_counter
         self._vehicle = vehicle = setup.vehicle
+        self._loop = PageLoop()
+        self._call_soon = self._loop.call_soon
         report = LimitedReports(station.note)  # of what browsers and others on the network can cause
         self._connections = Connections(PageTls(keyring, station.note) if keyring else None, report)
         self._holder = keyring.watched_holder(station.note) if keyring else None
@@ -94,14 +90,11 @@ class PageServer(Listener):
             vehicle, self._layouts, self._call_soon, lambda stated: self._windows.broadcast("layout", stated)
         )
         check_port_free(setup.page.endpoint)
-        self._plotly = plotly_script("page")
+        self._documents = Documents()
         self._index = {name: number for number, name in enumerate(vehicle.cameras)}
         self._recent = [_recent(camera) for camera in vehicle.cameras.values()]
         self._history = History()
         self._notes: deque[Mapping[str, Any]] = deque(maxlen=NOTES)
-        self._loop = asyncio.new_event_loop()
-        self._stopped = asyncio.Event()
-        self._thread = threading.Thread(target=self._run, name="page", daemon=True)
 
     @property
     def url(self) -> str:
@@ -116,16 +109,12 @@ class PageServer(Listener):
         return self._holder.get().hosts if self._holder else (*LOOPBACK, self._setup.page.host)
 
     def start(self) -> None:
-        self._thread.start()
-        asyncio.run_coroutine_threadsafe(self._start(), self._loop).result(START_S)
+        self._loop.start(self._start())
         for note in self._layouts.notes(self._vehicle):
             self._station.note(note)
 
     def stop(self) -> None:
-        with suppress(TimeoutError):  # a connection that does not close ends with the process
-            asyncio.run_coroutine_threadsafe(self._connections.close(), self._loop).result(STOP_S)
-        self._call_soon(self._stopped.set)
-        self._thread.join(STOP_S)
+        self._loop.stop(self._connections.close())
 
     def on_state(self, state: VehicleState | None) -> None:
         self._call_soon(self._windows.broadcast, "state", _stated(state, self._station))
@@ -146,31 +135,15 @@ class PageServer(Listener):
         """A newly received access unit."""
         self._call_soon(self._show, camera, unit)
 
-    def _call_soon(self, callback: Callable[..., object], *values: object) -> None:
-        """Call a function in the page's thread, unless the page has stopped."""
-        with suppress(RuntimeError):
-            self._loop.call_soon_threadsafe(callback, *values)
-
-    def _run(self) -> None:
-        """Serve until stopped, then cancel pending tasks: Python 3.11 may crash on them at exit."""
-        with asyncio.Runner(loop_factory=lambda: self._loop) as runner:
-            runner.run(self._stopped.wait())
-
     # --- in the page's thread -----------------------------------------------------------------------------------------
 
     async def _start(self) -> None:
         middlewares = [self._connections.on_request_complete, self._access.add_headers, self._access.check]
         app = web.Application(middlewares=middlewares, client_max_size=MAX_BODY)
         app.router.add_get("/live", self._on_viewer)
-        app.router.add_get("/plotly.js", _file_handler(self._plotly))
-        app.router.add_get("/", _static_handler(STATIC / "index.html"))
-        app.router.add_get("/counter", _static_handler(STATIC / "counter.html"))
-        if self._access.login:
-            app.router.add_get("/login", _static_handler(STATIC / "login.html"))
-            app.router.add_post("/login/challenge", self._access.on_challenge)
-            app.router.add_post("/login", self._access.on_login)
-        for file in STATIC.iterdir():
-            app.router.add_get(f"/static/{file.name}", _static_handler(file))
+        app.router.add_get("/", document("index.html"))
+        app.router.add_get("/counter", document("counter.html"))
+        self._documents.add_to(app, self._access)
         await self._connections.serve(app, self._setup.page.endpoint)
 
     def _on_attention(self, attention: Attention | None) -> None:
@@ -379,22 +352,3 @@ def _native(camera: Camera) -> dict[str, int]:
     """Size of the source's image, and where the full image begins in it, px."""
     width, height = camera.source_size
     return {"width": width, "height": height, "left": camera.in_source.x, "top": camera.in_source.y}
-
-
-def _static_handler(file: Path) -> Any:
-    """A handler that serves a small file from memory: a page requests dozens of them when it opens."""
-    body, kind = file.read_bytes(), mimetypes.guess_type(file.name)[0]
-
-    async def serve(_request: web.Request) -> web.Response:
-        return web.Response(body=body, content_type=kind or "application/octet-stream")
-
-    return serve
-
-
-def _file_handler(path: Path) -> Any:
-    """A handler that sends a large file from disk."""
-
-    async def send(_request: web.Request) -> web.FileResponse:
-        return web.FileResponse(path)
-
-    return send
