@@ -44,6 +44,7 @@ from runner.records.vehicle import (
     NOTHING_ENCODED,
     CameraState,
     CameraTelemetry,
+    Position,
     Telemetry,
     UplinkLost,
     UplinkMeasured,
@@ -201,6 +202,12 @@ class Station:
             self._requests.refuse(on_reply, self.link.fault or "the vehicle is offline")
         else:
             self._requests.send(event, on_reply)
+
+    @property
+    def position(self) -> Position | None:
+        """Where the vehicle is, as it last said; None: unknown."""
+        telemetry = self._telemetry
+        return telemetry.position if telemetry else None
 
     @property
     def is_in_control(self) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from aiohttp import web
@@ -32,7 +33,8 @@ class Connections:
         self._awaiting_request: set[RequestHandler] = set()  # new connections without a complete request
         self._strangers: dict[RequestHandler, float] = {}  # connections that have shown no access, and when they came
 
-    async def serve(self, app: web.Application, endpoint: Endpoint) -> None:
+    async def serve(self, app: web.Application, at: Endpoint | Path) -> None:
+        """at  address, or the name of a Unix socket"""
         logger = logging.Logger("page")
         logger.addHandler(_FaultHandler(lambda text: self._report(text, "")))
         self._runner = web.AppRunner(
@@ -40,10 +42,13 @@ class Connections:
         )
         await self._runner.setup()
         self._loop = asyncio.get_running_loop()
+        if isinstance(at, Path):
+            self._server = await self._loop.create_unix_server(self._new, at)
+            return
         tls = self._tls.context if self._tls else None
         handshake_s = REQUEST_S if tls else None  # until it has ended, `_expire` has nothing to close
         self._server = await self._loop.create_server(
-            self._new, endpoint.host, endpoint.port, ssl=tls, ssl_handshake_timeout=handshake_s
+            self._new, at.host, at.port, ssl=tls, ssl_handshake_timeout=handshake_s
         )
 
     async def close(self) -> None:
@@ -53,6 +58,13 @@ class Connections:
     def grant(self, request: web.Request) -> None:
         """The connection of a request has shown access."""
         self._strangers.pop(request.protocol, None)
+
+    @web.middleware
+    async def grant_all(self, request: web.Request, handler: Any) -> web.StreamResponse:
+        """Of a Unix socket, which only its owner can open."""
+        self.grant(request)
+        response: web.StreamResponse = await handler(request)
+        return response
 
     @web.middleware
     async def on_request_complete(self, request: web.Request, handler: Any) -> web.StreamResponse:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import socket
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, replace
+from pathlib import Path
+from socket import SO_SNDBUF, SOL_SOCKET
 from typing import Any
 
 from aiohttp import WSMsgType, web
@@ -29,6 +30,7 @@ from runner.page.history import History
 from runner.page.layouts import Answer, PageLayouts
 from runner.page.login import PageLogin
 from runner.page.loop import PageLoop
+from runner.page.summaries import summaries
 from runner.page.tls import PageTls
 from runner.page.viewer import PageViewer
 from runner.page.windows import Windows
@@ -64,6 +66,9 @@ class PageServer(Listener):
                 are refused
     keyring     of the operator, to serve other machines over HTTPS if they have its token; None: loopback only
     layouts     of the operator; None: layouts cannot be saved
+    socket      Unix socket, at which the program serves this page that starts one process for each of several vehicles;
+                None: it is served to browsers
+    on_shown    called in the page's thread with the cameras that all windows show, and whether one of them is a page
     raises      RunError if the port is in use or plotly is not installed
     """
 
@@ -74,8 +79,11 @@ class PageServer(Listener):
         on_counter: Callable[[CounterReading], None] | None = None,
         keyring: Keyring | None = None,
         layouts: Layouts | None = None,
+        socket: Path | None = None,
+        on_shown: Callable[[Collection[str], bool], None] = lambda cameras, is_open: None,
     ) -> None:
         self._setup, self._station, self._on_counter = setup, station, on_counter
+        self._socket, self._on_shown = socket, on_shown
         self._vehicle = vehicle = setup.vehicle
         self._loop = PageLoop()
         self._call_soon = self._loop.call_soon
@@ -89,7 +97,8 @@ class PageServer(Listener):
         self._page_layouts = PageLayouts(
             vehicle, self._layouts, self._call_soon, lambda stated: self._windows.broadcast("layout", stated)
         )
-        check_port_free(setup.page.endpoint)
+        if socket is None:
+            check_port_free(setup.page.endpoint)
         self._documents = Documents()
         self._index = {name: number for number, name in enumerate(vehicle.cameras)}
         self._recent = [_recent(camera) for camera in vehicle.cameras.values()]
@@ -131,6 +140,10 @@ class PageServer(Listener):
     def on_note(self, note: Note) -> None:
         self._call_soon(self._add_note, {"time": note.t, "text": note.text})
 
+    def forget(self, cameras: Collection[str]) -> None:
+        """These cameras are no longer received: a page that shows them later begins with newer pictures."""
+        self._call_soon(self._forget, cameras)
+
     def show(self, camera: str, unit: AccessUnit) -> None:
         """A newly received access unit."""
         self._call_soon(self._show, camera, unit)
@@ -138,13 +151,17 @@ class PageServer(Listener):
     # --- in the page's thread -----------------------------------------------------------------------------------------
 
     async def _start(self) -> None:
-        middlewares = [self._connections.on_request_complete, self._access.add_headers, self._access.check]
+        check = self._connections.grant_all if self._socket else self._access.check
+        middlewares = [self._connections.on_request_complete, self._access.add_headers, check]
         app = web.Application(middlewares=middlewares, client_max_size=MAX_BODY)
         app.router.add_get("/live", self._on_viewer)
+        if self._socket:
+            app.router.add_get("/summary", summaries(self._station))
+            return await self._connections.serve(app, self._socket)
         app.router.add_get("/", document("index.html"))
         app.router.add_get("/counter", document("counter.html"))
         self._documents.add_to(app, self._access)
-        await self._connections.serve(app, self._setup.page.endpoint)
+        return await self._connections.serve(app, self._setup.page.endpoint)
 
     def _on_attention(self, attention: Attention | None) -> None:
         self._station.attention = attention
@@ -156,6 +173,15 @@ class PageServer(Listener):
     def _add_note(self, note: Mapping[str, Any]) -> None:
         self._notes.append(note)
         self._windows.broadcast("note", note)
+
+    def _forget(self, cameras: Collection[str]) -> None:
+        for name in cameras:
+            self._recent[self._index[name]] = _recent(self._vehicle.cameras[name])
+
+    def _state_shown(self) -> None:
+        windows = list(self._windows)
+        shown = [name for name, index in self._index.items() if any(index in window.cameras for window in windows)]
+        self._on_shown(shown, not all(window.monitor for window in windows))
 
     def _show(self, camera: str, unit: AccessUnit) -> None:
         index = self._index[camera]
@@ -173,7 +199,7 @@ class PageServer(Listener):
         cameras = [index for name, index in self._index.items() if name in shown or not monitor]
         connection = request.transport.get_extra_info("socket") if request.transport else None
         if connection is not None:
-            connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
+            connection.setsockopt(SOL_SOCKET, SO_SNDBUF, SEND_BUFFER_BYTES)
         ws = web.WebSocketResponse(compress=False, max_msg_size=MAX_MESSAGE_BYTES, autoping=False)
         try:
             await ws.prepare(request)
@@ -183,6 +209,7 @@ class PageServer(Listener):
         self._windows.add(viewer)
         self._send_current_state(viewer)
         self._windows.opened(viewer, request.query.get("before"))
+        self._state_shown()
         tasks = [asyncio.create_task(_send(ws, viewer)), asyncio.create_task(_ping(ws, request, self._access))]
         try:
             await self._listen(ws, viewer, request)
@@ -192,6 +219,7 @@ class PageServer(Listener):
             for task in tasks:
                 task.cancel()
             self._windows.closed(viewer)
+            self._state_shown()
         return ws
 
     async def _listen(self, ws: web.WebSocketResponse, viewer: PageViewer, request: web.Request) -> None:

@@ -1,0 +1,84 @@
+"""What a list of several vehicles shows of one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from msgspec import UNSET
+
+from runner.core.events import Attention
+from runner.core.model import Mode
+from runner.operator.station import Station
+from runner.records.vehicle import VehicleState
+
+UNSEEN = (Attention.SLOW, Attention.HIDDEN, Attention.ABSENT)
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """A vehicle as its station knows it now.
+
+    fault       why there is no control link; None: there is one
+    driver      id of the operator in control; None: nobody is
+    is_own      whether that is this station's
+    speed_mps   None: unknown
+    latency_ms  of the oldest picture of the cameras that are received here, with its error bound; None: unknown
+    believed_kbps  what the uplink is believed to carry; None: unknown
+    alarms      in words
+    cameras     names of those that are on, in the vehicle's order
+    received    names of those that are received here
+    """
+
+    online: bool
+    fault: str | None
+    mode: Mode | None
+    driver: str | None
+    is_own: bool
+    speed_mps: float | None
+    latency_ms: float | None
+    bound_ms: float | None
+    total_kbps: float | None
+    actual_kbps: float
+    believed_kbps: float | None
+    alarms: tuple[str, ...]
+    cameras: tuple[str, ...]
+    received: tuple[str, ...]
+
+
+def summary(station: Station) -> Summary:
+    """From any thread."""
+    state, rows = station.state, station.rows()  # another thread may replace the state
+    position, clock = station.position if state else None, station.latency.clock
+    received = [row for row in rows if row.rates.fps]
+    latencies = [row.received.latency_ms for row in received]
+    known = [ms for ms in latencies if ms is not None]
+    return Summary(
+        online=state is not None,
+        fault=station.link.fault,
+        mode=state.mode if state else None,
+        driver=state.operator or None if state else None,
+        is_own=station.is_in_control,
+        speed_mps=position.speed_mps if position and position.speed_mps is not UNSET else None,
+        latency_ms=max(known) if known and len(known) == len(latencies) else None,
+        bound_ms=1000 * clock.bound_s if clock else None,
+        total_kbps=float(state.total_kbps) if state else None,
+        actual_kbps=sum(row.rates.kbps for row in received),
+        believed_kbps=float(state.believed.kbps) if state and state.believed is not UNSET else None,
+        alarms=tuple(_alarms(state)) if state else (),
+        cameras=tuple(name for name, camera in state.cameras.items() if camera.on) if state else (),
+        received=tuple(row.name for row in received),
+    )
+
+
+def _alarms(state: VehicleState) -> Iterator[str]:
+    """What is wrong on the vehicle, or with its driver."""
+    if state.fault:
+        yield state.fault
+    for name, camera in state.cameras.items():
+        if camera.fault:
+            yield f"{name}: {camera.fault}"
+        elif state.operator and camera.on and not camera.sending:
+            yield f"{name}: paused"
+    if state.operator and state.attention in UNSEEN:
+        yield f"the driver's page is {state.attention}"
