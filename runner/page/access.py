@@ -15,11 +15,12 @@ from runner.page.login import COOKIE, PageLogin
 from runner.schema import shortened
 from runner.system.reports import LimitedReports
 
+LOOPBACK = ("127.0.0.1", "localhost")  # names of the page without keys
 DEFAULT_PORTS = {"http": 80, "https": 443}
 # Inline styles: Plotly adds style elements and attributes of its own. Inline scripts stay forbidden.
 POLICY = (
     "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; worker-src 'self'; "
-    "frame-ancestors 'none'; base-uri 'none'; form-action 'self'; object-src 'none'"
+    "frame-ancestors 'self'; base-uri 'none'; form-action 'self'; object-src 'none'"
 )
 LOGIN_POLICY = POLICY.replace(" 'unsafe-inline'", "")
 HEADERS = {
@@ -81,7 +82,7 @@ class Access:
             self._report_refusal(request, foreign)
             raise web.HTTPForbidden(text="accepted only from this server's own pages\n")
         if not self.is_granted(request):
-            if request.path == "/":
+            if request.path.endswith("/"):  # a page, and none of its parts
                 raise web.HTTPSeeOther(f"/login?{request.rel_url.raw_query_string}".rstrip("?"))
             if request.path not in UNPROTECTED:
                 self._report_refusal(request, "not logged in")

@@ -22,7 +22,7 @@ from runner.graph import video_codec
 from runner.h264.access_unit import AccessUnit, RecentUnits
 from runner.mqtt.messages import read_message
 from runner.operator.station import LinkState, Listener, Station
-from runner.page.access import Access
+from runner.page.access import LOOPBACK, Access
 from runner.page.connections import MAX_BODY, Connections, abort
 from runner.page.counter import CounterReading, counter_reading
 from runner.page.documents import Documents, document
@@ -47,7 +47,6 @@ FROZEN_MS = 120  # a picture that is frozen for this long is marked within 150 m
 NOTES = 50  # kept for pages that open later
 REPORTED = tuple(attention.value for attention in Attention if attention is not Attention.ABSENT)  # by pages
 SEND_BUFFER_BYTES = 131_072  # small: a viewer that does not read is noticed here, not megabytes later
-LOOPBACK = ("127.0.0.1", "localhost")  # names of the page without keys
 PING_S = 0.5
 UNRESPONSIVE_S = 2.0  # a viewer that has not answered a ping for this long is dropped, and reconnects if it is alive
 CLOSE_TYPES = (WSMsgType.CLOSE, WSMsgType.CLOSING, WSMsgType.CLOSED, WSMsgType.ERROR)

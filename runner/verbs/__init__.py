@@ -95,7 +95,10 @@ VERBS = {
         sited=True,
     ),
     "operator": Verb(
-        "the operator's side: video, page, table", "runner.verbs.operator", ("log", "drives", "duration_s"), sited=True
+        "the operator's side: video, page, table",
+        "runner.verbs.operator",
+        ("vehicles", "log", "drives", "duration_s", "socket"),
+        sited=True,
     ),
     "latency": Verb(
         "measure glass-to-glass latency",

@@ -1,4 +1,4 @@
-"""usage: tod-runner operator [OVERRIDE ...] [duration_s=N] [log=DIR | drives=DIR]
+"""usage: tod-runner operator [OVERRIDE ...] [vehicles=[NAME, ...]] [duration_s=N] [log=DIR | drives=DIR]
 
 The operator's side: receives and decodes every camera with the operator graph of the configuration. A browser on this
 machine shows the page at http://127.0.0.1:8090/ (page.port): all pictures, the modes S, A and C, regions of interest,
@@ -8,9 +8,14 @@ decisions; it waits at most 20 s for a vehicle that is offline. With log=DIR eve
 DIR/operator.jsonl, for `report` and `export`; with drives=DIR to DIR/TIME/operator.jsonl, where TIME is the start in
 UTC. With experiment= it sends that experiment's requests at their times.
 
+With vehicles=[a, b] the page is a list of these vehicles, each named as its file in vehicle/; vehicles=all lists all
+that the broker knows. Opening one there drives it. Each has a station in a process of its own, which receives pictures
+only while somebody looks at them. With drives=DIR those of each vehicle go to DIR/NAME/TIME.
+
   tod-runner operator                      everything from the vehicle at media.host
   tod-runner operator keys=keys/alice media.host=192.0.2.7 control.host=192.0.2.1 control.port=8883
   tod-runner operator page.serve=false     the table only
+  tod-runner operator vehicles=all         one page for all vehicles
   tod-runner operator ros.pictures=true    with decoded pictures as ROS topics, see docs/ros.md
 """
 
@@ -24,11 +29,13 @@ from typing import TYPE_CHECKING
 
 from runner.configuration.layout import WITHOUT_KEYS, Layouts
 from runner.operator.live import LiveOperator, live_operator
+from runner.operator.station import Listener
+from runner.records.lines import Note
 from runner.security.exposure import page_keyring
 from runner.system.memory import freeze_loaded
 from runner.system.signals import stopping
 from runner.verbs import Arguments
-from runner.verbs.screen import SWITCH_S, streaming
+from runner.verbs.screen import SWITCH_S, say, streaming
 from runner.verbs.table import LiveTable, show_summary
 
 if TYPE_CHECKING:
@@ -38,7 +45,13 @@ SHOW_S = 0.25
 
 
 def run(arguments: Arguments) -> int:
+    if "vehicles" in arguments.values:
+        from runner.verbs import fleet
+
+        return fleet.run(arguments)
     streaming()
+    if socket := arguments.path("socket"):
+        return _run_behind(socket, arguments)
     duration = arguments.number("duration_s")
     sys.setswitchinterval(SWITCH_S)
     with (
@@ -59,11 +72,35 @@ def run(arguments: Arguments) -> int:
     return stop.status
 
 
+class _Notes(Listener):
+    """Prints each note as a line of its own."""
+
+    def on_note(self, note: Note) -> None:
+        say(note.text)
+
+
+def _run_behind(socket: Path, arguments: Arguments) -> int:
+    """Run one of several stations behind the page of a list, see `runner.verbs.fleet`; ends with that process."""
+    sys.setswitchinterval(SWITCH_S)
+    with live_operator(arguments.overrides, arguments.conf, log=arguments.drive(), on_demand=True) as operator:
+        operator.station.listeners.append(_Notes())
+        with _served(operator, arguments.conf, socket) as page:
+            assert page
+            operator.on_dropped = page.forget
+            operator.start(page.show)
+            freeze_loaded()
+            with stopping(action=operator.end) as stop:
+                while operator.runs(SHOW_S):
+                    pass
+    return stop.status
+
+
 @contextmanager
-def _served(operator: LiveOperator, conf: Path | None) -> Iterator[PageServer | None]:
+def _served(operator: LiveOperator, conf: Path | None, socket: Path | None = None) -> Iterator[PageServer | None]:
     """The page, unless the configuration switches it off.
 
-    conf  the user's directory, with the operator's layouts
+    conf    the user's directory, with the operator's layouts
+    socket  see `PageServer`
     """
     setup, station = operator.setup, operator.station
     if not setup.page.serve:
@@ -72,10 +109,14 @@ def _served(operator: LiveOperator, conf: Path | None) -> Iterator[PageServer | 
     from runner.page.server import PageServer
 
     layouts = Layouts(conf, station.identity if setup.keys else WITHOUT_KEYS)
-    page = PageServer(setup, station, keyring=page_keyring(setup), layouts=layouts)
+    if socket:
+        page = PageServer(setup, station, layouts=layouts, socket=socket, on_shown=operator.show)
+    else:
+        page = PageServer(setup, station, keyring=page_keyring(setup), layouts=layouts)
     station.listeners.append(page)
     page.start()
-    station.note(f"page: {page.url}")
+    if socket is None:
+        station.note(f"page: {page.url}")
     try:
         yield page
     finally:

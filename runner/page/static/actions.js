@@ -70,7 +70,7 @@ export const ACTIONS = {
 // Only the page shows what these change, so a monitor passes them on to it.
 const OF_PAGE = ["camera_left", "camera_front", "camera_right", "camera_rear", "reverse", "view", "birdseye", "drawer",
   "map", "monitors", "sound", "full_image", "total_lower", "total_raise"];
-const channel = new BroadcastChannel("tod-actions");
+const channel = new BroadcastChannel(`tod-actions ${location.pathname}`);
 
 export function startActions() {
   for (const name of OF_PAGE) passOn(name, () => false);

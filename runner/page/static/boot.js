@@ -26,7 +26,7 @@ addEventListener("hashchange", () => location.reload()); // #counter may name an
 worker.addEventListener("error", (event) => event instanceof ErrorEvent || globalThis.loadAgain?.()); // it was not loaded
 
 function liveUrl() {
-  const url = new URL("/live", location.href);
+  const url = new URL("live", location.href); // next to the page: a list of vehicles has one for each
   url.protocol = url.protocol.replace("http", "ws");
   url.search = String(new URLSearchParams({ viewer: viewerToken(), browser: browserId(), ...(shown && { show: shown.join() }) }));
   return url.href;

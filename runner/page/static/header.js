@@ -27,6 +27,7 @@ export function selectMode(selected) {
 function refresh() {
   setText(byId("vehicle"), store.hello?.vehicle ?? "…");
   document.title = [...(globalThis.boot.shown ?? []).map(displayName), store.hello?.vehicle, "tod-runner"].filter(Boolean).join(" · ");
+  document.body.style.setProperty("--vehicle", JSON.stringify(store.hello ? `${store.hello.vehicle}: ` : ""));
   refreshModes();
   refreshBanner();
   refreshConnection();

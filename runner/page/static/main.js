@@ -24,6 +24,7 @@ import { startEdit } from "./edit.js";
 import { startActions } from "./actions.js";
 import { startKeys } from "./keys.js";
 import { startGamepads } from "./gamepads.js";
+import { startOthers } from "./others.js";
 
 startTheme();
 startViews();
@@ -42,7 +43,7 @@ startActions();
 startKeys();
 startGamepads();
 startSound();
-if (store.view !== "monitor") for (const part of [startTotal, startPanel, startTabs, startCharts]) part();
+if (store.view !== "monitor") for (const part of [startTotal, startPanel, startTabs, startCharts, startOthers]) part();
 start();
 
 /** For tests and benchmarks. With #measure in the address, the first picture of each camera is kept as well. */

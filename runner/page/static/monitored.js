@@ -11,7 +11,7 @@ import { displayName } from "./format.js";
 const REPORT_MS = 500; // at most; usually its worker makes a monitor report more often, also while it is hidden
 const SILENT_MS = 3000; // a monitor that has not reported for this long has crashed
 const NO_AGE = { age_ms: null, bound_ms: NaN };
-const channel = new BroadcastChannel("tod-status");
+const channel = new BroadcastChannel(`tod-status ${location.pathname}`);
 const ownId = String(Math.random());
 
 /**

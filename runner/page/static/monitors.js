@@ -9,7 +9,7 @@ import { send } from "./link.js";
 import { byId, displayName, make, setText } from "./format.js";
 
 const dialog = byId("monitors", HTMLDialogElement);
-const path = (names) => `/?show=${names.map(encodeURIComponent).join()}`;
+const path = (names) => `${location.pathname}?show=${names.map(encodeURIComponent).join()}`;
 
 /** The rows of the layout with more than one picture, and each camera. */
 function groups({ cameras, layout }) {

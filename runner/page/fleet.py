@@ -1,0 +1,162 @@
+"""Serves one page for several vehicles: the list of them, and each one's page, behind which is a station of its own."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from aiohttp import ClientError, WSMsgType, web
+
+from runner.page.access import LOOPBACK, Access
+from runner.page.connections import MAX_BODY, Connections
+from runner.page.documents import Documents, document
+from runner.page.login import PageLogin
+from runner.page.loop import PageLoop
+from runner.page.relay import RETRY_S, STATION, relay, station_session
+from runner.page.tls import PageTls
+from runner.security.keyring import TOKEN, Keyring
+from runner.settings import Endpoint
+from runner.system.ports import check_port_free
+from runner.system.reports import LimitedReports
+
+LIST_S = 0.25  # between two lists to a browser
+SILENT_S = 2.0  # a station that sends no summary for this long does not respond; it sends four a second
+NOT_RUNNING = "its station is not running"
+
+
+@dataclass
+class Listed:
+    """A vehicle of the list.
+
+    socket   of its station; None: it has none
+    fault    why its station does not work; None: it does
+    summary  what that said last, see `runner.operator.summary`; None: nothing, or not any more
+    """
+
+    name: str
+    socket: Path | None
+    fault: str | None = NOT_RUNNING
+    summary: Mapping[str, Any] | None = None
+    tasks: set[asyncio.Task[None]] = field(default_factory=set)
+
+    def row(self) -> dict[str, Any]:
+        return {"name": self.name, "fault": self.fault, "summary": self.summary}
+
+
+class FleetServer:
+    """The page of several vehicles.
+
+    endpoint  where browsers reach it
+    keyring   of the operator, to serve other machines over HTTPS if they have its token; None: loopback only
+    note      called with a message for the operator
+    raises    RunError if the port is in use or plotly is not installed
+    """
+
+    def __init__(self, endpoint: Endpoint, keyring: Keyring | None, note: Callable[[str], None]) -> None:
+        self._endpoint = endpoint
+        report = LimitedReports(note)
+        self._connections = Connections(PageTls(keyring, note) if keyring else None, report)
+        self._holder = keyring.watched_holder(note) if keyring else None
+        login = PageLogin(keyring.watched(TOKEN, note).get) if keyring else None
+        self._access = Access(login, lambda: self._names, self._connections, report)
+        check_port_free(endpoint)
+        self._documents, self._page = Documents(), document("index.html")
+        self._vehicles: dict[str, Listed] = {}
+        self._loop = PageLoop()
+
+    @property
+    def url(self) -> str:
+        if self._holder is None:
+            return f"http://{self._endpoint}/"
+        return f"https://{Endpoint(next(iter(self._names), self._endpoint.host), self._endpoint.port)}/"
+
+    @property
+    def _names(self) -> tuple[str, ...]:
+        return self._holder.get().hosts if self._holder else (*LOOPBACK, self._endpoint.host)
+
+    def start(self) -> None:
+        self._loop.start(self._start())
+
+    def stop(self) -> None:
+        self._loop.stop(self._stop())
+
+    def add(self, name: str, socket: Path | None, fault: str | None = NOT_RUNNING) -> None:
+        """List a vehicle, whose station serves at this socket; None: it has no station, for a reason."""
+        self._loop.call_soon(self._add, Listed(name, socket, fault))
+
+    def report(self, name: str, fault: str | None) -> None:
+        """State why a vehicle's station is not running; None: it is."""
+        self._loop.call_soon(self._report, name, fault)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """What the list shows now. From any thread."""
+        return [vehicle.row() for vehicle in list(self._vehicles.values())]
+
+    # --- in the page's thread -----------------------------------------------------------------------------------------
+
+    async def _start(self) -> None:
+        middlewares = [self._connections.on_request_complete, self._access.add_headers, self._access.check]
+        app = web.Application(middlewares=middlewares, client_max_size=MAX_BODY)
+        app.router.add_get("/", document("fleet.html"))
+        app.router.add_get("/list", self._on_list)
+        app.router.add_get("/vehicle/{name}/", self._on_page)
+        app.router.add_get("/vehicle/{name}/live", self._on_live)
+        self._documents.add_to(app, self._access)
+        await self._connections.serve(app, self._endpoint)
+
+    async def _stop(self) -> None:
+        for vehicle in self._vehicles.values():
+            for task in vehicle.tasks:
+                task.cancel()
+        await self._connections.close()
+
+    def _add(self, vehicle: Listed) -> None:
+        self._vehicles[vehicle.name] = vehicle
+        if vehicle.socket:
+            vehicle.tasks.add(asyncio.get_running_loop().create_task(self._follow(vehicle, vehicle.socket)))
+
+    def _report(self, name: str, fault: str | None) -> None:
+        self._vehicles[name].fault = fault
+
+    async def _follow(self, vehicle: Listed, socket: Path) -> None:
+        """Keep what a station says up to date, as long as it runs."""
+        while True:
+            with suppress(ClientError, OSError, TimeoutError, ValueError):
+                async with station_session(socket) as session, session.ws_connect(f"{STATION}/summary") as station:
+                    while (message := await station.receive(SILENT_S)).type is WSMsgType.TEXT:
+                        vehicle.summary = json.loads(message.data)
+            vehicle.summary = None
+            await asyncio.sleep(RETRY_S)
+
+    async def _on_page(self, request: web.Request) -> web.StreamResponse:
+        self._vehicle(request)
+        response: web.Response = await self._page(request)
+        return response
+
+    async def _on_live(self, request: web.Request) -> web.WebSocketResponse:
+        vehicle = self._vehicle(request)
+        if vehicle.socket is None:
+            raise web.HTTPServiceUnavailable(text=f"{vehicle.fault}\n")
+        return await relay(request, vehicle.socket, lambda: self._access.is_granted(request))
+
+    def _vehicle(self, request: web.Request) -> Listed:
+        name = request.match_info["name"]
+        if name not in self._vehicles:
+            raise web.HTTPNotFound(text=f"no such vehicle; there are {', '.join(self._vehicles) or 'none'}\n")
+        return self._vehicles[name]
+
+    async def _on_list(self, request: web.Request) -> web.WebSocketResponse:
+        """Send the list whenever it has changed, until the browser leaves or may no longer see it."""
+        ws = web.WebSocketResponse(compress=False, heartbeat=1.0)
+        await ws.prepare(request)
+        while not ws.closed and self._access.is_granted(request):
+            await ws.send_json({"vehicles": self.rows()})
+            with suppress(TimeoutError):
+                await ws.receive(LIST_S)
+        await ws.close()
+        return ws

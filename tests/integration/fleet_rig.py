@@ -1,0 +1,114 @@
+"""Three vehicles, a broker, and the page of a station for all of them, as programs."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+from rig import SMALL_ROBOT, free_port
+from runner.mqtt.broker import private_broker
+from runner.settings import Endpoint
+from runner.system.children import environment
+
+NAMES = ("courier-1", "courier-2", "courier-3")
+SOURCE = (*SMALL_ROBOT, "source=test", "fps_max=10", "modes=open_loop", "pqos=constant", "pqos.kbps=900")
+
+
+class Programs:
+    """A broker and the programs of both sides, each ended with the block.
+
+    words  of all of them
+    log    directory of their output
+    """
+
+    def __init__(self, log: Path, words: Sequence[str] = SOURCE) -> None:
+        self.control, self.page = free_port(), free_port()
+        self.words = (*words, f"control.port={self.control}")
+        self.media = {name: free_port() for name in NAMES}
+        self._log, self._stack = log, ExitStack()
+        self.processes: dict[str, subprocess.Popen[bytes]] = {}
+
+    def __enter__(self) -> Programs:
+        self._stack.enter_context(private_broker(Endpoint("127.0.0.1", self.control)))
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for process in self.processes.values():
+            process.send_signal(signal.SIGTERM)
+        for process in self.processes.values():
+            try:
+                process.wait(30)
+            finally:
+                process.kill()
+        self._stack.close()
+
+    def of(self, name: str) -> list[str]:
+        """What only this vehicle has."""
+        first = 20_000 + 400 * NAMES.index(name)
+        return [f"name={name}", f"media.port={self.media[name]}", f"media.rtp_ports=[{first},{first + 199}]"]
+
+    def vehicle(self, name: str, *words: str) -> None:
+        self.start(name, "vehicle", *self.of(name), *words)
+
+    def station(self, vehicles: str, *words: str) -> None:
+        self.start("station", "operator", f"vehicles={vehicles}", f"page.port={self.page}", *words)
+
+    def start(self, name: str, verb: str, *words: str) -> None:
+        with (self._log / f"{name}.txt").open("ab") as output:
+            self.processes[name] = subprocess.Popen(
+                [sys.executable, "-m", "runner", verb, *self.words, *words],
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env=environment() | {"PYTHONUNBUFFERED": "1"},
+            )
+
+    def output(self, name: str) -> str:
+        return (self._log / f"{name}.txt").read_text()
+
+    def file(self) -> str:
+        """A file of all vehicles."""
+        path = self._log / "vehicles.yaml"
+        path.write_text(json.dumps({name: self._own(name) for name in NAMES}))
+        return str(path)
+
+    def _own(self, name: str) -> dict[str, object]:
+        first = 20_000 + 400 * NAMES.index(name)
+        media = {"port": self.media[name], "rtp_ports": [first, first + 199]}
+        return {"vehicle": "delivery_robot", "media": media}
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.page}/"
+
+
+@contextmanager
+def three(log: Path, *words: str) -> Iterator[Programs]:
+    """Three vehicles and their station."""
+    with Programs(log) as programs:
+        for name in NAMES:
+            programs.vehicle(name, *words)
+        programs.station(programs.file())
+        yield programs
+
+
+def pids_of(programs: Programs) -> dict[str, int]:
+    """The processes of the stations behind the page, by vehicle."""
+    parent = programs.processes["station"].pid
+    found = {}
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdecimal():
+            try:
+                line = (entry / "cmdline").read_bytes().decode().split("\0")
+                above = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+            except (OSError, ValueError):
+                continue
+            if above == parent and (name := next((w[5:] for w in line if w.startswith("name=")), None)):
+                found[name] = int(entry.name)
+    return found
+
+
