@@ -427,12 +427,12 @@ class OperatorSide:
         later(0, partial(self._run, frozenset(cameras)))
 
     def _run(self, cameras: Collection[str]) -> None:
-        before, self._running = self._running, {n: r for n, r in self._receivers.items() if n in cameras}
-        for name, receiver in self._receivers.items():
-            if name in before and name not in cameras:
-                receiver.stop()
-            elif name in cameras and name not in before:
-                receiver.start()
+        before, running = self._running, {n: r for n, r in self._receivers.items() if n in cameras}
+        for name in running.keys() - before.keys():
+            self._receivers[name].start()
+        self._running = running
+        for name in before.keys() - running.keys():
+            self._receivers[name].stop()
 
     def sample(self, sending: Mapping[str, bool], anew: bool = False) -> dict[str, Reception]:
         """Reception of each camera; to be called a few times a second.

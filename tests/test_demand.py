@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from runner.operator.demand import LINGER_S, Demand, Presence
+from runner.operator.demand import LINGER_S, Demand
+from runner.operator.station import Presence
 
 
 def shown(demand: Demand, t: float, *, in_control: bool = False) -> tuple[set[str], Presence]:

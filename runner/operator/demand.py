@@ -4,17 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass, field
-from enum import Enum, auto
+
+from runner.operator.station import Presence
 
 LINGER_S = 2.0  # what nobody looks at any more is received for so long: a page may be loading again
-
-
-class Presence(Enum):
-    """How an operator's side shows itself to the vehicle."""
-
-    ABSENT = auto()  # it only hears what the vehicle publishes
-    WATCHING = auto()  # it is sent pictures, but must not be given control
-    DRIVING = auto()  # it drives, or would
 
 
 @dataclass

@@ -24,9 +24,8 @@ from runner.core.evidence import REPORT_S
 from runner.drive.log import Log
 from runner.errors import RunError
 from runner.metrics.side import SideMetrics
-from runner.operator.demand import Demand
 from runner.operator.log import DriveLog
-from runner.operator.station import Listener, Station
+from runner.operator.station import Listener, Station, is_in_control
 from runner.plans import compile_plans
 from runner.records.operator import Sample
 from runner.records.vehicle import Outcome, VehicleState
@@ -38,6 +37,7 @@ from runner.system.service import notify
 if TYPE_CHECKING:
     from runner.apply import OnUnit, OperatorSide
     from runner.configuration.experiment import TimedRequest
+    from runner.operator.demand import Demand
     from runner.ros.pictures import DecodedPictures
 
 SAMPLE_S = 0.25
@@ -120,7 +120,7 @@ class LiveOperator:
         with self._following:
             now = time.monotonic()
             cameras = demand.cameras(now)
-            self.station.appear(demand.presence(now, in_control=self.station.is_in_control))
+            self.station.appear(demand.presence(now, in_control=is_in_control(self.station)))
             if self._side is None or cameras == self._received:
                 return
             dropped, self._received = self._received - cameras, cameras
@@ -242,6 +242,12 @@ class _MetricsListener(Listener):
         self._metrics.take(sample)
 
 
+def _demand() -> Demand:
+    from runner.operator.demand import Demand
+
+    return Demand()
+
+
 def _ros_pictures(setup: Setup, station: Station) -> DecodedPictures | None:
     """The ROS node that publishes decoded pictures; None if they are not published.
 
@@ -307,7 +313,7 @@ def live_operator(
             cameras=() if on_demand else None,
         )
 
-    operator = LiveOperator(setup, station, drive, build, requests, Demand() if on_demand else None)
+    operator = LiveOperator(setup, station, drive, build, requests, _demand() if on_demand else None)
     with ExitStack() as ending:  # in reverse order
         ending.callback(drive.close)
         if setup.control.embedded:

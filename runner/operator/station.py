@@ -5,6 +5,7 @@ from __future__ import annotations
 import secrets
 import time
 from collections.abc import Mapping, Sequence
+from enum import Enum, auto
 from typing import TYPE_CHECKING, NamedTuple
 
 from msgspec import UNSET, UnsetType
@@ -29,7 +30,6 @@ from runner.mqtt.messages import (
     read_telemetry,
     topic,
 )
-from runner.operator.demand import Presence
 from runner.operator.latency import Latency, stages
 from runner.operator.meter import MeasuredRates, ReceptionMeter
 from runner.operator.notes import Refusals, change_notes, driver_words
@@ -44,7 +44,6 @@ from runner.records.vehicle import (
     NOTHING_ENCODED,
     CameraState,
     CameraTelemetry,
-    Position,
     Telemetry,
     UplinkLost,
     UplinkMeasured,
@@ -61,6 +60,14 @@ if TYPE_CHECKING:
 MAX_VEHICLES = 100  # whose names are remembered
 ONE_WAY_S = 10.0  # how long a silent vehicle may still receive: an outage of one direction must not end its streams
 FOUND_S = 2.0  # a vehicle that the broker does not know after this time is probably misspelt
+
+
+class Presence(Enum):
+    """How an operator's side shows itself to the vehicle."""
+
+    ABSENT = auto()  # it only hears what the vehicle publishes
+    WATCHING = auto()  # it is sent pictures, but must not be given control
+    DRIVING = auto()  # it drives, or would
 
 
 class Listener:
@@ -147,7 +154,7 @@ class Station:
         self._published: VehicleState | None = None  # the last state that the vehicle published
         self.attention: Attention | None = None  # of the driver, as the page detects it
         self._presence = Presence.DRIVING
-        self._telemetry: Telemetry | None = None
+        self.telemetry: Telemetry | None = None
         self.addresses: Mapping[str, tuple[str, ...]] = {}  # that the vehicle sends from, by uplink, as it last said
         self._newest, self._newest_steering = Newest(), Newest()
         self._uplinks_lost: set[str] = set()  # by their wills, since the vehicle was last heard
@@ -202,18 +209,6 @@ class Station:
             self._requests.refuse(on_reply, self.link.fault or "the vehicle is offline")
         else:
             self._requests.send(event, on_reply)
-
-    @property
-    def position(self) -> Position | None:
-        """Where the vehicle is, as it last said; None: unknown."""
-        telemetry = self._telemetry
-        return telemetry.position if telemetry else None
-
-    @property
-    def is_in_control(self) -> bool:
-        """Whether the vehicle says that this operator is in control."""
-        state = self.state  # another thread may replace it
-        return state is not None and state.operator == self.identity
 
     def appear(self, presence: Presence) -> None:
         """Show this operator to the vehicle like this from now on; without a call it drives."""
@@ -323,7 +318,7 @@ class Station:
         return f"{totals}\n{driver_words(driving, self.identity, self.own_time(driving.since))}"
 
     def _sample(self, over: Mapping[str, Mapping[str, UplinkReceived]]) -> Sample:
-        telemetry, clock = self._telemetry if self.state else None, self.latency.clock
+        telemetry, clock = self.telemetry if self.state else None, self.latency.clock
         measured = telemetry.cameras if telemetry else {}
         cameras = {
             row.name: _camera_sample(row, measured.get(row.name), over.get(row.name, UNSET)) for row in self.rows()
@@ -370,7 +365,7 @@ class Station:
         """The vehicle is online once state and telemetry have arrived."""
         before, state = self.state, self._published
         self._last_message = time.monotonic()
-        if state is None or before is state or not self._telemetry:
+        if state is None or before is state or not self.telemetry:
             return
         self._set_state(state)
         if before:
@@ -392,7 +387,7 @@ class Station:
             return  # old: no heartbeat, and not the vehicle's current time
         self._requests.vehicle_time = (telemetry.t, arrived)
         self._uplinks_lost.clear()
-        self._telemetry = telemetry
+        self.telemetry = telemetry
         if telemetry.uplinks is not UNSET:
             self.addresses = {name: each.addresses for name, each in telemetry.uplinks.items()}
         self._vehicle_online()
@@ -438,8 +433,14 @@ class Station:
     def _vehicle_lost(self, why: str) -> None:
         if self.state:
             self.note(why)
-        self._telemetry = None
+        self.telemetry = None
         self._set_state(None)
+
+
+def is_in_control(station: Station) -> bool:
+    """Whether the vehicle says that the operator of this station is in control."""
+    state = station.state  # another thread may replace it
+    return state is not None and state.operator == station.identity
 
 
 def _expiring(ends: Mapping[str, float]) -> tuple[str, ...]:

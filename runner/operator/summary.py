@@ -9,7 +9,7 @@ from msgspec import UNSET
 
 from runner.core.events import Attention
 from runner.core.model import Mode
-from runner.operator.station import Station
+from runner.operator.station import Station, is_in_control
 from runner.records.vehicle import VehicleState
 
 UNSEEN = (Attention.SLOW, Attention.HIDDEN, Attention.ABSENT)
@@ -49,7 +49,8 @@ class Summary:
 def summary(station: Station) -> Summary:
     """From any thread."""
     state, rows = station.state, station.rows()  # another thread may replace the state
-    position, clock = station.position if state else None, station.latency.clock
+    telemetry, clock = station.telemetry if state else None, station.latency.clock
+    position = telemetry.position if telemetry else None
     received = [row for row in rows if row.rates.fps]
     latencies = [row.received.latency_ms for row in received]
     known = [ms for ms in latencies if ms is not None]
@@ -58,7 +59,7 @@ def summary(station: Station) -> Summary:
         fault=station.link.fault,
         mode=state.mode if state else None,
         driver=state.operator or None if state else None,
-        is_own=station.is_in_control,
+        is_own=is_in_control(station),
         speed_mps=position.speed_mps if position and position.speed_mps is not UNSET else None,
         latency_ms=max(known) if known and len(known) == len(latencies) else None,
         bound_ms=1000 * clock.bound_s if clock else None,

@@ -82,7 +82,7 @@ class PageServer(Listener):
         on_shown: Callable[[Collection[str], bool], None] = lambda cameras, is_open: None,
     ) -> None:
         self._setup, self._station, self._on_counter = setup, station, on_counter
-        self._socket, self._on_shown = socket, on_shown
+        self._socket = socket
         self._vehicle = vehicle = setup.vehicle
         self._loop = PageLoop()
         self._call_soon = self._loop.call_soon
@@ -91,7 +91,10 @@ class PageServer(Listener):
         self._holder = keyring.watched_holder(station.note) if keyring else None
         login = PageLogin(keyring.watched(TOKEN, station.note).get) if keyring else None
         self._access = Access(login, lambda: self._names, self._connections, report)
-        self._windows = Windows(self._on_attention)
+        names = list(vehicle.cameras)
+        self._windows = Windows(
+            self._on_attention, lambda shown, is_open: on_shown([names[index] for index in shown], is_open)
+        )
         self._layouts = layouts or Layouts()
         self._page_layouts = PageLayouts(
             vehicle, self._layouts, self._call_soon, lambda stated: self._windows.broadcast("layout", stated)
@@ -177,11 +180,6 @@ class PageServer(Listener):
         for name in cameras:
             self._recent[self._index[name]] = _recent(self._vehicle.cameras[name])
 
-    def _state_shown(self) -> None:
-        windows = list(self._windows)
-        shown = [name for name, index in self._index.items() if any(index in window.cameras for window in windows)]
-        self._on_shown(shown, not all(window.monitor for window in windows))
-
     def _show(self, camera: str, unit: AccessUnit) -> None:
         index = self._index[camera]
         unit = self._recent[index].add(unit._replace(captured=self._station.latency.captured(camera, unit.captured)))
@@ -208,7 +206,6 @@ class PageServer(Listener):
         self._windows.add(viewer)
         self._send_current_state(viewer)
         self._windows.opened(viewer, request.query.get("before"))
-        self._state_shown()
         tasks = [asyncio.create_task(_send(ws, viewer)), asyncio.create_task(_ping(ws, request, self._access))]
         try:
             await self._listen(ws, viewer, request)
@@ -218,7 +215,6 @@ class PageServer(Listener):
             for task in tasks:
                 task.cancel()
             self._windows.closed(viewer)
-            self._state_shown()
         return ws
 
     async def _listen(self, ws: web.WebSocketResponse, viewer: PageViewer, request: web.Request) -> None:

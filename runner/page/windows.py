@@ -15,12 +15,16 @@ class Windows:
     """In the page's thread.
 
     on_attention  called with whether the driver can see the pictures, from the windows of the page in control
+    on_shown      called when a window has been opened or closed, with the indexes of the cameras that all windows show,
+                  and whether one of them is a page
     """
 
-    def __init__(self, on_attention: Callable[[Attention | None], None]) -> None:
+    def __init__(
+        self, on_attention: Callable[[Attention | None], None], on_shown: Callable[[set[int], bool], None]
+    ) -> None:
         self._viewers: list[PageViewer] = []  # the newest last
         self._control = Control()
-        self._on_attention = on_attention
+        self._on_attention, self._on_shown = on_attention, on_shown
 
     def __iter__(self) -> Iterator[PageViewer]:
         return iter(self._viewers)
@@ -35,12 +39,14 @@ class Windows:
         if not viewer.monitor:
             self._control.on_opened(viewer.token, time.monotonic(), before)
         self.state_control()
+        self._state_shown()
 
     def closed(self, viewer: PageViewer) -> None:
         self._viewers.remove(viewer)
         if viewer.token not in {other.token for other in self._viewers if not other.monitor}:
             self._control.on_closed(viewer.token, time.monotonic())
         self.state_control()
+        self._state_shown()
 
     def broadcast(self, kind: str, message: Mapping[str, Any]) -> None:
         for viewer in self._viewers:
@@ -75,6 +81,10 @@ class Windows:
             message = {"holder": holder, "abandoned": abandoned, "elsewhere": elsewhere, "covered": covered}
             viewer.post("control", message)
         self._on_attention(self._attention())
+
+    def _state_shown(self) -> None:
+        shown = {camera for viewer in self._viewers for camera in viewer.cameras}
+        self._on_shown(shown, not all(viewer.monitor for viewer in self._viewers))
 
     def _attention(self) -> Attention | None:
         driving = [viewer for viewer in self._viewers if self.holder_for(viewer) == "you"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
+from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 
@@ -27,7 +28,7 @@ class RestartedProcess:
         self._process: VerbProcess | None = None
         self._failures = 0
         self._due = self._started = float("-inf")
-        self._last_line = ""
+        self._last = deque[str](maxlen=2)  # lines of its output: why it failed
         self.fault: str | None = None  # how it ended, until it runs again
 
     def look(self, now: float) -> None:
@@ -45,7 +46,7 @@ class RestartedProcess:
         self._process = None
         pause = pause_s(self._failures, *BACKOFF_S)
         self._failures, self._due = self._failures + 1, now + pause
-        why = f": {self._last_line}" if status and self._last_line else ""
+        why = f": {'; '.join(self._last)}" if status > 0 and self._last else ""
         self.fault = f"its station ended ({ending(status)}){why}; starting again in {pause:g} s"
 
     def request_end(self) -> None:
@@ -66,11 +67,12 @@ class RestartedProcess:
         with os.fdopen(write, "w") as stderr:
             self._process = VerbProcess(self.name, self._verb, self._words, stderr=stderr)
         self._started, self.fault = now, None
+        self._last.clear()
         threading.Thread(target=self._read, args=(read,), name=f"output of {self.name}", daemon=True).start()
 
     def _read(self, descriptor: int) -> None:
         with suppress(OSError), os.fdopen(descriptor, errors="replace") as lines:
             for line in map(str.rstrip, lines):
                 if line:
-                    self._last_line = line
+                    self._last.append(line)
                     self._on_line(line)

@@ -57,7 +57,9 @@ class Fleet:
         words += [f"conf={self._arguments.conf}"] if self._arguments.conf else []
         drives = self._arguments.path("drives")
         words += [f"drives={drives / name}"] if drives else []
-        self._stations[name] = RestartedProcess(f"the station of {name}", "operator", words, lambda line: show(name, line))
+        self._stations[name] = RestartedProcess(
+            f"the station of {name}", "operator", words, lambda line: show(name, line)
+        )
         self._faults[name] = ""
         self._page.add(name, socket)
 
@@ -100,6 +102,8 @@ def run(arguments: Arguments) -> int:
     given = vehicles_of(arguments.values["vehicles"])
     if "log" in arguments.values:
         raise ArgumentError("log", arguments.values["log"], "is for one vehicle: give drives=DIR")
+    if both := next((word for word in arguments.overrides if word.partition("=")[0] in ("vehicle", "name")), None):
+        raise ArgumentError("vehicles", arguments.values["vehicles"], f"states what {both} does: give one of them")
     setup = _composed(arguments, given)
     duration = arguments.number("duration_s")
     with signals.stopping(END_S) as stop, ExitStack() as stack:

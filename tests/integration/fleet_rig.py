@@ -55,13 +55,18 @@ class Programs:
     def vehicle(self, name: str, *words: str) -> None:
         self.start(name, "vehicle", *self.of(name), *words)
 
-    def station(self, vehicles: str, *words: str) -> None:
-        self.start("station", "operator", f"vehicles={vehicles}", f"page.port={self.page}", *words)
+    def station(self, vehicles: str) -> None:
+        of_vehicle = ("vehicle=", *(() if vehicles.endswith(".yaml") else ("cameras.", "~cameras.")))
+        common = [word for word in self.words if not word.startswith(of_vehicle)]
+        self._run("station", "operator", *common, f"vehicles={vehicles}", f"page.port={self.page}")
 
     def start(self, name: str, verb: str, *words: str) -> None:
+        self._run(name, verb, *self.words, *words)
+
+    def _run(self, name: str, verb: str, *words: str) -> None:
         with (self._log / f"{name}.txt").open("ab") as output:
             self.processes[name] = subprocess.Popen(
-                [sys.executable, "-m", "runner", verb, *self.words, *words],
+                [sys.executable, "-m", "runner", verb, *words],
                 stdout=output,
                 stderr=subprocess.STDOUT,
                 env=environment() | {"PYTHONUNBUFFERED": "1"},
@@ -110,5 +115,3 @@ def pids_of(programs: Programs) -> dict[str, int]:
             if above == parent and (name := next((w[5:] for w in line if w.startswith("name=")), None)):
                 found[name] = int(entry.name)
     return found
-
-

@@ -17,10 +17,9 @@ from runner.gst.receiver import Reception
 from runner.mqtt.broker import private_broker
 from runner.mqtt.link import ControlLink
 from runner.mqtt.messages import OFFLINE, topic
-from runner.operator.demand import Presence
 from runner.operator.latency import stages
 from runner.operator.meter import MeasuredRates
-from runner.operator.station import SILENT_S, CameraRow, Listener, Station
+from runner.operator.station import SILENT_S, CameraRow, Listener, Presence, Station
 from runner.records.reception import Arrival, Arrivals
 from runner.records.vehicle import CameraTelemetry
 from runner.settings import Endpoint

@@ -16,7 +16,8 @@ function onRows(rows) {
   const text = !rows ? "✕ station unreachable" : rows.length ? `${online} of ${rows.length} online` : "none known yet";
   setText(byId("connection"), text);
   setAttribute(byId("connection"), "data-state", rows ? "fine" : "bad");
-  document.title = [alarming.length && `▲ ${alarming.map(({ name }) => name).join(", ")}`, "Vehicles", "tod-runner"].filter(Boolean).join(" · ");
+  const alarm = alarming.length && `▲ ${alarming.map(({ name }) => name).join(", ")}`;
+  document.title = [alarm, "Vehicles", "tod-runner"].filter(Boolean).join(" · ");
 }
 
 startTheme();

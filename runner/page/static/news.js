@@ -23,7 +23,7 @@ function refresh() {
 function showToast({ text, level }) {
   [...toasts.children].find((each) => each.getAttribute("data-text") === text)?.remove();
   const shape = level === "problem" ? "✕ " : "";
-  const element = make("div", { class: "toast", "data-level": level, "data-text": text }, shape + text);
+  const element = make("div", { class: "toast", "data-level": level, "data-text": text }, make("span", {}, shape + text));
   element.append(make("button", { "aria-label": "close", onclick: () => element.remove() }, "×"));
   toasts.append(element);
   while (toasts.children.length > MAX_TOASTS) toasts.firstChild?.remove();

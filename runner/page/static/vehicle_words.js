@@ -58,8 +58,12 @@ function linkWords({ received, actual_kbps, total_kbps, believed_kbps }) {
 /** @param {Row} row */
 export const alarmsOf = ({ summary }) => summary?.alarms ?? [];
 
-/** The camera of the small picture: the one that looks ahead, by its name, otherwise the first that is on. @param {Row} row */
+/**
+ * The camera of the small picture: the one that looks ahead, by its name, otherwise the first that is on; null: none is.
+ * @param {Row} row
+ */
 export function pictureOf({ summary }) {
   const cameras = summary?.online ? summary.cameras : [];
-  return cameras.find((name) => /front.*cent|cent.*front/.test(name)) ?? cameras.find((name) => name.includes("front")) ?? cameras[0] ?? null;
+  const ahead = cameras.filter((name) => name.includes("front"));
+  return ahead.find((name) => name.includes("cent")) ?? ahead[0] ?? cameras[0] ?? null;
 }

@@ -20,16 +20,19 @@ class Card {
   constructor(name, mayLeave) {
     this.name = name;
     this.camera = ""; // of the small picture, "" while there is none
-    this.parts = Object.fromEntries(["state", "driver", "speed", "latency", "link"].map((part) => [part, make("span", { class: part })]));
+    const names = ["state", "driver", "speed", "latency", "link"];
+    this.parts = Object.fromEntries(names.map((part) => [part, make("span", { class: part })]));
     this.alarms = make("ul", { class: "alarms", role: "status", "aria-label": `Alarms of ${name}` });
     this.view = make("div", { class: "view", hidden: true });
     this.watch = make("button", { class: "watch", "aria-pressed": "false", onclick: () => this.toggle() }, "Picture");
-    const open = make("a", { class: "open", href: pageOf(name), onclick: (event) => mayLeave(name) || event.preventDefault() }, "Open");
+    const onclick = (event) => mayLeave(name) || event.preventDefault();
+    const open = make("a", { class: "open", href: pageOf(name), onclick }, "Open");
     const { state, driver, speed, latency, link } = this.parts;
     const figures = make("dl", {}, ...[["Speed", speed], ["Latency", latency], ["Link", link]].map(([title, value]) =>
       make("div", {}, make("dt", {}, title), make("dd", {}, value))));
     this.element = make("article", { class: "vehicle-card", "aria-label": name },
-      make("header", {}, make("h2", {}, name), state), driver, figures, this.alarms, this.view, make("div", { class: "buttons" }, open, this.watch));
+      make("header", {}, make("h2", {}, name), state), driver, figures, this.alarms, this.view,
+      make("div", { class: "buttons" }, open, this.watch));
   }
 
   toggle() {
@@ -63,8 +66,8 @@ class Card {
     this.view.hidden = !camera;
     if (camera === this.camera) return;
     this.camera = camera;
-    const source = `${pageOf(this.name)}?show=${encodeURIComponent(camera)}`;
-    this.view.replaceChildren(...(camera ? [make("iframe", { src: source, title: `${this.name}, ${camera}`, inert: true, tabindex: -1 })] : []));
+    const src = `${pageOf(this.name)}?show=${encodeURIComponent(camera)}`;
+    this.view.replaceChildren(...(camera ? [make("iframe", { src, title: `${this.name}, ${camera}`, inert: true })] : []));
   }
 }
 

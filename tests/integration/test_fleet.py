@@ -1,0 +1,188 @@
+"""One page for several vehicles: what is listed, opened and watched, and the processes behind it."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from contextlib import ExitStack
+
+import pytest
+from fleet_rig import NAMES, Programs, pids_of, three
+
+from browser import shot, visit
+from rig import needs_browser, until
+from runner.mqtt.link import ControlLink
+from runner.mqtt.messages import topic
+from runner.settings import Endpoint
+
+
+class Heard:
+    """What the vehicles publish."""
+
+    def __init__(self, control: int) -> None:
+        self.state, self.telemetry = {}, {}
+        listen = {topic("+", "state"): self._on(self.state), topic("+", "telemetry"): self._on(self.telemetry)}
+        self.link = ControlLink(Endpoint("127.0.0.1", control), None, listen, lambda _: None, print)
+        self.link.connect()
+
+    def _on(self, kept):
+        def keep(message):
+            kept[message.topic.split("/")[1]] = json.loads(message.payload)
+
+        return keep
+
+    def encoding(self, name):
+        """The cameras of a vehicle that somebody receives: the others have no encoder."""
+        cameras = self.telemetry.get(name, {}).get("cameras", {})
+        return {camera for camera, each in cameras.items() if each["frames"]}
+
+    def driver(self, name):
+        return self.state.get(name, {}).get("operator")
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory):
+    with three(tmp_path_factory.mktemp("fleet")) as programs:
+        heard = Heard(programs.control)
+        until(lambda: all(heard.state.get(name, {}).get("online") for name in NAMES), 120)
+        yield programs, heard
+        heard.link.close()
+
+
+@pytest.fixture
+def page(fleet, chromium):
+    """The list, with all vehicles online."""
+    programs, _ = fleet
+    with ExitStack() as stack:
+        tab = stack.enter_context(chromium.new_context(viewport={"width": 1366, "height": 768}))
+        page, wrong = tab.new_page(), []
+        tab.on("weberror", lambda error: wrong.append(str(error.error)))
+        await_page(programs)
+        visit(page, programs.url)
+        until(lambda: page.locator(".state[data-level=fine]").count() == 3, 120, 0.1)
+        yield page
+        assert wrong == []
+
+
+def await_page(programs):
+    until(lambda: "page: http" in programs.output("station"), 60, 0.1)
+
+
+def card(page, name):
+    return page.locator(f"article[aria-label={name}]")
+
+
+def live(page):
+    return page.locator(".tile[data-status=live]").count()
+
+
+def leave(page, name):
+    """Open another vehicle; a vehicle whose speed is unknown is left with a second press."""
+    card(page, name).locator("a.open").click()
+    if f"/vehicle/{name}/" not in page.url:
+        card(page, name).locator("a.open").click()
+    until(lambda: page.url.endswith(f"/vehicle/{name}/"), every_s=0.05)
+
+
+@needs_browser
+def test_a_vehicle_that_is_only_listed_costs_its_uplink_nothing(fleet, page):
+    _, heard = fleet
+    until(lambda: set(heard.telemetry) == set(NAMES))
+    for name in NAMES:
+        assert "Nobody drives" in card(page, name).inner_text()
+        assert (heard.encoding(name), heard.driver(name)) == (set(), None)
+    assert page.title() == "Vehicles · tod-runner"
+    shot(page, "fleet")
+
+
+@needs_browser
+def test_a_picture_on_demand_is_of_one_camera_and_gives_no_control(fleet, page):
+    _, heard = fleet
+    button = card(page, "courier-2").locator("button.watch")
+    button.click()
+    picture = page.frame_locator("iframe")
+    until(lambda: picture.locator(".tile[data-status=live]").count() == 1, every_s=0.1)
+    until(lambda: heard.encoding("courier-2") == {"front"})
+    assert heard.driver("courier-2") is None
+    assert picture.locator("body").evaluate("() => document.title") == "front · courier-2 · tod-runner"
+    shot(page, "fleet_picture")
+    button.click()
+    until(lambda: heard.encoding("courier-2") == set())
+
+
+@needs_browser
+def test_opening_a_vehicle_drives_it_and_switching_ends_its_pictures(fleet, page):
+    _, heard = fleet
+    card(page, "courier-1").locator("a.open").click()
+    until(lambda: live(page) == 3, every_s=0.1)
+    until(lambda: heard.driver("courier-1"))
+    assert page.title() == "courier-1 · tod-runner"
+    assert page.inner_text("#vehicle") == "courier-1"
+    card(page, "courier-3").locator("button.watch").click()
+    until(lambda: page.frame_locator("iframe").locator(".tile[data-status=live]").count() == 1, every_s=0.1)
+    page.keyboard.press("v")
+    shot(page, "fleet_drive")
+    leave(page, "courier-2")
+    until(lambda: live(page) == 3, every_s=0.1)
+    until(lambda: heard.encoding("courier-1") == set())
+    until(lambda: heard.encoding("courier-3") == {"front"})
+    assert "You drive" in card(page, "courier-1").inner_text()  # leaving a page releases nothing
+    until(lambda: "the driver's page is absent" in card(page, "courier-1").inner_text(), every_s=0.1)
+
+
+@needs_browser
+def test_a_station_that_crashes_is_started_again(fleet, page):
+    programs, _ = fleet
+    card(page, "courier-3").locator("a.open").click()
+    until(lambda: live(page) == 3, every_s=0.1)
+    before = pids_of(programs)
+    os.kill(before["courier-3"], signal.SIGKILL)
+    until(lambda: live(page) == 0, every_s=0.05)
+    until(lambda: live(page) == 3, every_s=0.1)
+    after = pids_of(programs)
+    assert after["courier-3"] != before["courier-3"]
+    assert [after[name] for name in NAMES[:2]] == [before[name] for name in NAMES[:2]]
+    assert "courier-3: its station ended (killed by SIGKILL); starting again in 0.5 s" in programs.output("station")
+
+
+@needs_browser
+def test_an_unknown_vehicle_is_refused_with_the_known_ones(fleet, page):
+    programs, _ = fleet
+    answer = page.request.get(f"{programs.url}vehicle/courier-9/")
+    assert (answer.status, answer.text()) == (404, f"no such vehicle; there are {', '.join(NAMES)}\n")
+
+
+def test_stations_end_with_their_parent_however_it_ends(tmp_path):
+    for number in (signal.SIGTERM, signal.SIGKILL):
+        with Programs(tmp_path) as programs:
+            programs.station(programs.file())
+            until(lambda programs=programs: set(pids_of(programs)) == set(NAMES), 60)
+            pids = pids_of(programs).values()
+            os.kill(programs.processes["station"].pid, number)
+            programs.processes["station"].wait(30)
+            until(lambda pids=pids: not any(is_alive(pid) for pid in pids), 30)
+
+
+def is_alive(pid):
+    try:
+        return open(f"/proc/{pid}/stat").read().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+@needs_browser
+def test_all_vehicles_that_the_broker_knows_are_listed(tmp_path, chromium):
+    """One has a file here, in conf; of the other only the name is known."""
+    with Programs(tmp_path) as programs:
+        programs.vehicle("courier-1")
+        programs.start("robot", "vehicle", f"media.port={programs.media['courier-2']}")
+        programs.station("all")
+        with chromium.new_context() as tab:
+            page = tab.new_page()
+            await_page(programs)
+            visit(page, programs.url)
+            until(lambda: page.locator(".state[data-level=fine]").count() == 1, 120, 0.1)
+            assert "● online" in card(page, "delivery_robot").inner_text()
+            until(lambda: card(page, "courier-1").count(), 60, 0.1)
+            assert "no station: " in card(page, "courier-1").inner_text()
