@@ -68,8 +68,8 @@ class Control(Endpoint):
     def of(data: Mapping[str, Any]) -> Control:
         """From the section `control` of a configuration.
 
-        raises  ModelError for keys of a foreign broker although it is none, for a password in place of its file, and for
-                a foreign broker that this side is to start
+        raises  ModelError for keys of a foreign broker although it is none, for a password in place of its file, and
+                for a foreign broker that this side is to start
         """
         given = {each.name: data[each.name] for each in fields(ForeignBroker) if data.get(each.name)}
         if given and not data.get("foreign"):

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from msgspec import UNSET
 
 from runner.configuration import agreement
-from runner.configuration.config import configuration
+from runner.configuration.config import Configuration, configuration
 from runner.core.model import Progress
 from runner.drive.log import Log, check_free
 from runner.errors import RunError, UserError
@@ -385,6 +385,13 @@ def ros_cameras(
     return RosCameras(setup.ros, setup.vehicle.cameras.values(), push, on_report, setup.insecure)
 
 
+def _checked(overrides: Sequence[str], conf: Path | str | None, site: Path | None) -> Configuration:
+    from runner import apply
+
+    config = configuration(overrides, conf, files=False, check=apply.check_vehicle, site=site, instead=DRIVING)
+    return config.drivable(apply.check_vehicle) if config.document.get("strict") else config
+
+
 @contextmanager
 def live_vehicle(
     overrides: Sequence[str] = (),
@@ -408,9 +415,7 @@ def live_vehicle(
     from runner import apply
 
     log = Path(log) if log else None
-    config = configuration(overrides, conf, files=False, check=apply.check_vehicle, site=site, instead=DRIVING)
-    if config.document.get("strict"):
-        config = config.drivable(apply.check_vehicle)
+    config = _checked(overrides, conf, site)
     (pqos, track), document, rates = config.pqos(), config.document, list[str]()
     setup = as_offered(config.setup(), rates.append)
     keyring = vehicle_keyring(setup)
