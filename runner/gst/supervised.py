@@ -98,7 +98,7 @@ class SupervisedPipeline:
         """If it waits to be built again, do so now."""
         if self._retry:
             self._retry.cancel()
-            self._retry_start()
+            self._begin()
 
     def restart(self, why: str | None) -> None:
         """Tear down now, rebuild soon; nothing happens if it is stopped.
