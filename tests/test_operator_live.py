@@ -19,14 +19,15 @@ def operator(hangs: int, notes: list[str], samples: list[Any]) -> LiveOperator:
     """An operator whose first samples fail."""
     left = [RunError(HANGS)] * hangs
 
-    def sample(_sending: Any) -> dict[str, Any]:
+    def sample(_sending: Any, *, anew: bool) -> dict[str, Any]:
+        assert not anew
         if left:
             raise left.pop()
         return {}
 
     side: Any = SimpleNamespace(sample=sample, received=dict, stop=lambda: None)
     station: Any = SimpleNamespace(
-        state=object(),
+        state=None,
         connect=lambda: None,
         close=lambda: None,
         link=SimpleNamespace(is_behind=lambda: True),

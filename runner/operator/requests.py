@@ -56,6 +56,10 @@ class Requests:
         t, arrived = self.vehicle_time
         return round(t + now - arrived, 6)
 
+    def own_time(self, t: float) -> float:
+        """A time of the vehicle by this machine's clock, s since 1970."""
+        return time.time() - (self.vehicle_now(time.monotonic()) - t)
+
     def heard_within(self, seconds: float) -> bool:
         """Whether the vehicle has stated its time within the last seconds."""
         t, arrived = self.vehicle_time

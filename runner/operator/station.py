@@ -179,6 +179,7 @@ class Station:
         self._requests = Requests(
             lambda request: self.link.publish(self._to_request, request), self.answer_s, self.note
         )
+        self.own_time = self._requests.own_time
         listen = {
             topic("+", "state"): self._on_any_state,
             topic(vehicle.name, "reply", self.identity): self._requests.on_reply,
@@ -301,10 +302,6 @@ class Station:
             CameraRow(name, self._rates[name], received, cameras.get(name), refused.get(name, ""))
             for name, received in self.samples.items()
         ]
-
-    def own_time(self, t: float) -> float:
-        """A time of the vehicle by this machine's clock, s since 1970."""
-        return time.time() - (self._requests.vehicle_now(time.monotonic()) - t)
 
     def headline(self) -> str:
         state = self.state  # another thread may replace it
