@@ -23,6 +23,7 @@ from msgspec import UNSET
 
 from runner.configuration import agreement
 from runner.configuration.config import Configuration, configuration
+from runner.core.driving import Driving
 from runner.core.model import Progress
 from runner.drive.log import Log, check_free
 from runner.errors import RunError, UserError
@@ -83,15 +84,26 @@ class LiveVehicle:
 
     side     the cameras
     loop     events in, commands out; `loop.post` takes events from any thread
+    driving  who drives it now
     failure  why the vehicle had to end; None: it is running, or was stopped
     """
 
-    def __init__(self, side: VehicleSide, loop: ControlLoop) -> None:
+    def __init__(
+        self, side: VehicleSide, loop: ControlLoop, holder: KeptHolder, on_driving: Callable[[Driving], None]
+    ) -> None:
         self.side, self.loop = side, loop
+        self.driving = Driving()
+        self._holder, self._on_driving = holder, on_driving
+        loop.on_driving = self._follow
         self.failure: RunError | None = None
         self._thread: threading.Thread | None = None
         self._ended = threading.Event()
         self._watchdog = threading.Thread(target=self._watch, name="watchdog", daemon=True)
+
+    def _follow(self, driving: Driving) -> None:
+        self.driving = driving
+        self._holder.keep(driving.holder or "")
+        self._on_driving(driving)
 
     def start(self) -> None:
         """Run the loop in a thread, until the vehicle is stopped."""
@@ -402,15 +414,17 @@ def live_vehicle(
     say: Callable[[str], None] = print,
     progress: Progress = lambda what, done: None,
     site: Path | None = None,
+    on_driving: Callable[[Driving], None] = lambda driving: None,
 ) -> Iterator[LiveVehicle]:
     """Run the vehicle's side; at the end it is stopped and disconnected.
 
     overrides, conf, site  as in `live_operator`; pqos is live unless stated
-    log       directory that the drive is recorded to
-    state     directory that keeps who is in control over a restart; None: the next process does not know
-    say       called, from a separate thread, with one line per event
-    progress  called with the progress of rendering a synthetic drive
-    raises    ConfigError, RunError
+    log         directory that the drive is recorded to
+    state       directory that keeps who is in control over a restart; None: the next process does not know
+    say         called, from a separate thread, with one line per event
+    progress    called with the progress of rendering a synthetic drive
+    on_driving  called, in the loop's thread, with who drives whenever that changes: for a steering stack
+    raises      ConfigError, RunError
     """
     from runner import apply
 
@@ -462,10 +476,9 @@ def live_vehicle(
 
         holder = KeptHolder(Path(state) / f"{setup.vehicle.name}.json" if state else None, report)
         ending.callback(holder.close)
-        access = Access(keyring, report)
-        loop = ControlLoop(setup, side, pqos, track, drive, publish, report, access, holder.former, holder.keep)
+        loop = ControlLoop(setup, side, pqos, track, drive, publish, report, Access(keyring, report), holder.former)
         side.on_turned = loop.wake
-        live = LiveVehicle(side, loop)
+        live = LiveVehicle(side, loop, holder, on_driving)
         if ros := ros_cameras(setup, side.push_shared, report):
             ending.callback(ros.close)
         ending.callback(live.stop)

@@ -89,7 +89,7 @@ class ControlLoop:
     on_report    called with one line per event and its result
     access       who may request what
     former       the operator that was in control when this vehicle's last process ended, "" for none
-    keep_holder  called with the operator whose the control is, "" for none, to be the former one of the next process
+    on_driving   called, in the loop's thread, with who drives whenever that changes
 
     An exception in the loop is reported and counted in `errors`; the loop continues. `beat` is when the loop last
     finished a piece of work (time.monotonic), `busy_with` what it is doing.
@@ -104,7 +104,7 @@ class ControlLoop:
     on_report: Callable[[str], None]
     access: Access
     former: str = ""
-    keep_holder: Callable[[str], None] = lambda operator: None
+    on_driving: Callable[[Driving], None] = lambda driving: None
     errors: int = 0
     beat: float = 0.0
     busy_with: str = ""
@@ -356,8 +356,7 @@ class ControlLoop:
         self._publisher.again = True
         if now.why != before.why:
             self.on_report(now.why)
-        if now.holder != before.holder:
-            self.keep_holder(now.holder or "")
+        self._guarded("driving", lambda: self.on_driving(now))
         if now.drivers != before.drivers:
             self._notice(copies_events(self._run.state, self._cameras, t))
             self._guarded("control", lambda: self.applier.give_control(now.drivers))
