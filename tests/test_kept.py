@@ -61,20 +61,21 @@ def test_nothing_is_kept_without_a_directory() -> None:
 
 
 def test_an_operator_without_keys_has_its_id_again_and_no_other_has_it_meanwhile() -> None:
-    first, second = KeptIdentity(), KeptIdentity()
+    first, second = KeptIdentity("robot"), KeptIdentity("robot")
     assert first.value != second.value
     first.close()
-    again, third = KeptIdentity(), KeptIdentity()
+    again, third = KeptIdentity("robot"), KeptIdentity("robot")
     assert again.value == first.value
     assert len({each.value for each in (second, again, third)}) == 3
     assert all(IDENTITY.fullmatch(each.value) for each in (second, again, third))
     for each in (second, again, third):
         each.close()
-    assert KeptIdentity().value == first.value
+    assert KeptIdentity("robot").value == first.value
+    assert KeptIdentity("other").value not in {each.value for each in (second, again, third)}
 
 
 def test_an_operator_has_an_id_where_nothing_can_be_kept() -> None:
     state_directory().parent.mkdir(parents=True)
     state_directory().touch()
-    first, second = KeptIdentity(), KeptIdentity()
+    first, second = KeptIdentity("robot"), KeptIdentity("robot")
     assert first.value != second.value

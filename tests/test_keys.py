@@ -134,6 +134,7 @@ def test_each_holder_has_the_files_of_its_role(authority):
         "car": {"people.json", "srt.passphrase"},
         "broker": {"passwords", "access", "mosquitto.conf"},
         "a-controller": {"media.secret", "page.token"},
+        "a-supervisor": {"media.secret", "page.token"},
         "a-watcher": {"media.secret", "page.token"},
         "a-predictor": set(),
         "a-positioner": set(),

@@ -17,6 +17,7 @@ from msgspec import UNSET
 from test_keys import ALLOWED, PRESENCE
 
 from runner.configuration.config import configuration
+from runner.core.driving import Control, Driving
 from runner.core.events import EVENTS, to_json
 from runner.core.roles import DRIVER_EVENTS, Role, denial
 from runner.core.step import step
@@ -371,6 +372,71 @@ def test_the_published_state_names_the_operator_in_control() -> None:
         watched.loop.take(Request("driver", {"event": "operator_disconnected"}))
         until(lambda: named() is UNSET)
         until(lambda: (watched.loop.take(Request("other", {"event": "control_taken"})), named() == "other")[1])
+
+
+def test_control_passes_with_pictures_and_everybody_learns_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An acceptance counts only the cameras that reports name, too."""
+    monkeypatch.setattr("runner.vehicle.operators.SILENT_S", 60)
+    watched, told = Watched(), list[Driving]()
+    watched.loop.on_driving = told.append
+    cameras = list(watched.loop.vehicle.cameras)
+
+    def ask(sender: str, **document: Any) -> Outcome:
+        outcomes: list[Outcome] = []
+        watched.loop.take(Request(sender, document, outcomes.append))
+        until(lambda: outcomes)
+        return outcomes[0]
+
+    def reports(*names: str) -> None:
+        units = tuple(UnitReceived(name, 0.0, 0.1, 1000, True) for name in names)
+        watched.loop.take(QueuedReport("bob", ReceptionReport(at=1.0, as_of=0.0, units=units, packets=1, lost=0)))
+
+    with watched.running():
+        for name in ("ann", "bob"):
+            assert ask(name, event="operator_connected").result == "applied"
+        assert watched.side.drivers == ("ann",)
+        assert ask("bob", event="mode_selected", mode="single").reason == "ann is in control"
+        assert ask("bob", event="control_requested").result == "applied"
+        assert ask("ann", event="control_offered", to="bob").result == "applied"
+        assert watched.side.drivers == ("ann", "bob")
+        reports(*cameras[1:])
+        refused = ask("bob", event="control_accepted", live=cameras)
+        assert refused.reason == f"not yet live for 1 s at the station of bob: {cameras[0]}"
+        reports(*cameras)
+        assert ask("bob", event="control_accepted", live=cameras[1:]).reason == refused.reason
+        reports(*cameras)
+        assert ask("bob", event="control_accepted", live=cameras).result == "applied"
+        assert watched.side.drivers == ("bob",)
+        assert ask("ann", event="mode_selected", mode="single").reason == "bob is in control"
+    states = [state.driving for state in watched.of(VehicleState)]
+    for driving in told:
+        assert driving.holder is None or driving in states, "each is published at once"
+    said = [
+        "control was free, and nobody but ann is here to drive",
+        "bob asks for control",
+        "ann offers control to bob",
+    ]
+    reported = [line for line in watched.reports if "control" in line and not line.startswith("refused")]
+    assert reported == [*said, "bob has accepted control from ann"]
+
+
+def test_the_former_holder_counts_as_lost_until_it_returns() -> None:
+    watched = Watched()
+    watched.loop.former = "ann"
+
+    def driving() -> Any:
+        return next((state.driving for state in reversed(watched.of(VehicleState))), None)
+
+    with watched.running():
+        until(lambda: watched.of(VehicleState))
+        assert (driving().state, driving().holder, watched.side.drivers) == (Control.LOST, "ann", ("ann",))
+        outcomes: list[Outcome] = []
+        watched.loop.take(Request("bob", {"event": "operator_connected"}))
+        watched.loop.take(Request("bob", {"event": "mode_selected", "mode": "single"}, outcomes.append))
+        until(lambda: outcomes)
+        assert outcomes[0].reason.startswith("ann was in control and is lost: ")
+        until(lambda: (watched.loop.take(Request("ann", {"event": "operator_connected"})), driving().in_control)[1])
+        assert driving().in_control == "ann"
 
 
 def test_a_repeated_request_is_not_answered_before_what_it_asks_for_is_applied(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -146,7 +146,7 @@ class Station:
         self._vehicle, self._settings = vehicle, settings
         control, login = setup.control, login_of(setup.control, keyring, self.note)
         self.user = login.identity or None if login else None  # this operator's name in its keys; None: it has none
-        self._kept = None if self.user else KeptIdentity()
+        self._kept = None if self.user else KeptIdentity(vehicle.name)
         self.identity = self._kept.value if self._kept else str(self.user)  # of this operator
         self.answer_s = answer_s(setup.expires_s)
         self.listeners: list[Listener] = []

@@ -9,7 +9,7 @@ import uuid
 from pathlib import Path
 from typing import IO
 
-MOST_OPERATORS = 64  # at once on one machine without keys; further ones have ids of their own for one process
+MOST_OPERATORS = 64  # of a vehicle at once, on one machine without keys; further ones have ids for one process
 IDENTITY = re.compile(r"[0-9a-f]{12}")
 
 
@@ -18,23 +18,23 @@ def state_directory() -> Path:
 
 
 class KeptIdentity:
-    """An id for an operator without keys, its own until `close`, and afterwards that of the next one on this machine.
+    """An id for an operator without keys: its own until `close`, then that of the next one here for this vehicle.
 
     So one that crashes and is started again is known to the vehicle, which gives control back to it.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, vehicle: str) -> None:
         self._file: IO[str] | None = None
         self.value = uuid.uuid4().hex[:12]
         try:
-            self._lock_one(state_directory())
+            self._lock_one(state_directory() / "operators", vehicle)
         except OSError:
             self.close()  # nothing can be kept here: the id is of this process only
 
-    def _lock_one(self, directory: Path) -> None:
+    def _lock_one(self, directory: Path, vehicle: str) -> None:
         directory.mkdir(parents=True, exist_ok=True)
         for number in range(1, MOST_OPERATORS + 1):
-            file = self._file = (directory / f"operator-{number}").open("a+", encoding="ascii", errors="replace")
+            file = self._file = (directory / f"{vehicle}.{number}").open("a+", encoding="ascii", errors="replace")
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:

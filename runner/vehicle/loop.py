@@ -117,7 +117,7 @@ class ControlLoop:
         self._inbox = Inbox()
         self.refusals = Refusals(self._now, self._inbox.is_full, self.on_report)
         self._operators, self._attention = Operators(self.setup.expires_s), StatedAttention()
-        self._pictures = SeenPictures()
+        self._pictures = SeenPictures(self.vehicle)
         self._uplinks, self._sending, self._key_frames = MeasuredUplinks(self.vehicle), SendingTimes(), KeyFrames()
         self._publisher, self._replies = Publisher(self.setup.latency, self.publish), Replies()
         self._report_once = RepeatedReports(self.on_report)

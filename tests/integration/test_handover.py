@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from machines import Machine, machines
 
-from rig import ROBOT, until
+from rig import ROBOT, run, until
 from runner.mqtt.broker import find_mosquitto
 from runner.system import children
 
@@ -91,7 +91,7 @@ class Site:
     """A vehicle, its broker, and operators' sides, each of which may end and be started again."""
 
     def __init__(self, machine: Machine, directory: Path) -> None:
-        self._machine, self._directory = machine, directory
+        self._machine, self.directory = machine, directory
         self.start_broker()
         self.start_vehicle()
 
@@ -99,17 +99,17 @@ class Site:
         return subprocess.Popen(children.bound([*self._machine.command, *words]), stdout=subprocess.DEVNULL)
 
     def start_broker(self) -> None:
-        (settings := self._directory / "mosquitto.conf").write_text(f"listener 1884 {HOST}\nallow_anonymous true\n")
+        (settings := self.directory / "mosquitto.conf").write_text(f"listener 1884 {HOST}\nallow_anonymous true\n")
         self.broker = self._run(find_mosquitto(), "-c", str(settings))
 
     def start_vehicle(self) -> None:
-        words = [*WORDS, f"drives={self._directory / 'drives'}"]
-        state = f"XDG_STATE_HOME={self._directory / 'vehicle'}"
+        words = [*WORDS, f"drives={self.directory / 'drives'}"]
+        state = f"XDG_STATE_HOME={self.directory / 'vehicle'}"
         self.vehicle = self._run("env", state, sys.executable, "-m", "runner", "vehicle", *words)
 
     def operator(self, name: str) -> Driver:
         """The one of this name has the id that the last process of this name had."""
-        return Driver(self._machine, self._directory / name)
+        return Driver(self._machine, self.directory / name)
 
 
 @pytest.fixture
@@ -154,6 +154,19 @@ def test_control_is_handed_over_with_pictures(site: Site) -> None:
         gaps = alice.longest_gap(began, passed), bob.longest_gap(passed - 1, passed + 1)
         print(f"longest gaps: {1000 * gaps[0]:.0f} and {1000 * gaps[1]:.0f} ms")
         assert max(gaps) < MOST_GAP_S
+    site.vehicle.terminate()
+    site.vehicle.wait()
+    replayed = run("replay", f"input={next(site.directory.glob('drives/*'))}").stdout.splitlines()
+    decided = [line for line in map(json.loads, replayed) if line["event"].startswith("control_")]
+    outcomes = [(line["event"], line["accepted"]) for line in decided]
+    assert ("control_accepted", False) in outcomes
+    assert [name for name, accepted in outcomes if accepted][:5] == [
+        "control_passed",
+        "control_requested",
+        "control_offered",
+        "control_accepted",
+        "control_passed",
+    ]
 
 
 def test_a_station_that_dies_in_the_middle_leaves_control_with_the_other(site: Site) -> None:
