@@ -6,8 +6,8 @@ from runner.operator.demand import LINGER_S, Demand
 from runner.operator.station import Presence
 
 
-def shown(demand: Demand, t: float, *, in_control: bool = False) -> tuple[set[str], Presence]:
-    return set(demand.cameras(t)), demand.presence(t, in_control=in_control)
+def shown(demand: Demand, t: float, *, holds_control: bool = False) -> tuple[set[str], Presence]:
+    return set(demand.cameras(t)), demand.presence(t, holds_control=holds_control)
 
 
 def test_nothing_is_received_until_somebody_looks() -> None:
@@ -37,9 +37,9 @@ def test_a_picture_beside_stays_when_the_page_is_closed() -> None:
     assert shown(demand, 10.0 + LINGER_S) == ({"rear"}, Presence.WATCHING)
 
 
-def test_who_is_in_control_does_not_leave_by_closing_the_page() -> None:
+def test_who_is_holds_control_does_not_leave_by_closing_the_page() -> None:
     demand = Demand()
     demand.ask(["front"], is_open=True, now=0.0)
     demand.ask([], is_open=False, now=1.0)
-    assert shown(demand, 60.0, in_control=True) == (set(), Presence.DRIVING)
+    assert shown(demand, 60.0, holds_control=True) == (set(), Presence.DRIVING)
     assert shown(demand, 61.0) == (set(), Presence.ABSENT)

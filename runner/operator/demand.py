@@ -33,10 +33,10 @@ class Demand:
         self._note(now)
         return frozenset(name for name, seen in self._seen.items() if now - seen < LINGER_S)
 
-    def presence(self, now: float, *, in_control: bool) -> Presence:
-        """How to show it to the vehicle. An operator that is in control does not leave by closing the page."""
+    def presence(self, now: float, *, holds_control: bool) -> Presence:
+        """How to show it to the vehicle. An operator that holds control does not leave by closing the page."""
         self._note(now)
-        if in_control or now - self._opened < LINGER_S:
+        if holds_control or now - self._opened < LINGER_S:
             return Presence.DRIVING
         return Presence.WATCHING if self.cameras(now) else Presence.ABSENT
 

@@ -25,7 +25,7 @@ from runner.drive.log import Log
 from runner.errors import RunError
 from runner.metrics.side import SideMetrics
 from runner.operator.log import DriveLog
-from runner.operator.station import Listener, Station, is_in_control
+from runner.operator.station import Listener, Station, holds_control
 from runner.plans import compile_plans
 from runner.records.operator import Sample
 from runner.records.vehicle import Outcome, VehicleState
@@ -120,7 +120,7 @@ class LiveOperator:
         with self._following:
             now = time.monotonic()
             cameras = demand.cameras(now)
-            self.station.appear(demand.presence(now, in_control=is_in_control(self.station)))
+            self.station.appear(demand.presence(now, holds_control=holds_control(self.station)))
             if self._side is None or cameras == self._received:
                 return
             dropped, self._received = self._received - cameras, cameras

@@ -434,10 +434,10 @@ class Station:
         self._set_state(None)
 
 
-def is_in_control(station: Station) -> bool:
-    """Whether the vehicle says that the operator of this station is in control."""
+def holds_control(station: Station) -> bool:
+    """Whether this station's operator is in control by the vehicle's word, or was until it was lost."""
     state = station.state  # another thread may replace it
-    return state is not None and state.operator == station.identity
+    return state is not None and state.driving is not UNSET and state.driving.holder == station.identity
 
 
 def _expiring(ends: Mapping[str, float]) -> tuple[str, ...]:

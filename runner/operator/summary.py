@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 from msgspec import UNSET
 
+from runner.core.driving import Control
 from runner.core.events import Attention
 from runner.core.model import Mode
-from runner.operator.station import Station, is_in_control
+from runner.operator.station import Station, holds_control
 from runner.records.vehicle import VehicleState
 
 UNSEEN = (Attention.SLOW, Attention.HIDDEN, Attention.ABSENT)
@@ -20,8 +21,12 @@ class Summary:
     """A vehicle as its station knows it now.
 
     fault       why there is no control link; None: there is one
-    driver      id of the operator in control; None: nobody is
-    is_own      whether that is this station's
+    control     whether an operator is in control, or was until it was lost; None: unknown
+    holder      id of that operator; None: there is none
+    held_s      for how long it has been in this state, s
+    offered     id of the operator to whom control is offered; None: none
+    requested   ids of those that ask for it
+    is_own      whether the holder is this station's operator
     speed_mps   None: unknown
     latency_ms  of the oldest picture of the cameras that are received here, with its error bound; None: unknown
     believed_kbps  what the uplink is believed to carry; None: unknown
@@ -33,7 +38,11 @@ class Summary:
     online: bool
     fault: str | None
     mode: Mode | None
-    driver: str | None
+    control: Control | None
+    holder: str | None
+    held_s: float
+    offered: str | None
+    requested: tuple[str, ...]
     is_own: bool
     speed_mps: float | None
     latency_ms: float | None
@@ -51,6 +60,7 @@ def summary(station: Station) -> Summary:
     state, rows = station.state, station.rows()  # another thread may replace the state
     telemetry, clock = station.telemetry if state else None, station.latency.clock
     position = telemetry.position if telemetry else None
+    driving = state.driving if state and state.driving is not UNSET else None
     received = [row for row in rows if row.rates.fps]
     latencies = [row.received.latency_ms for row in received]
     known = [ms for ms in latencies if ms is not None]
@@ -58,8 +68,12 @@ def summary(station: Station) -> Summary:
         online=state is not None,
         fault=station.link.fault,
         mode=state.mode if state else None,
-        driver=state.operator or None if state else None,
-        is_own=is_in_control(station),
+        control=driving.state if driving else None,
+        holder=driving.holder if driving else None,
+        held_s=max(0.0, telemetry.t - driving.since) if driving and telemetry else 0.0,
+        offered=driving.offered if driving else None,
+        requested=driving.requested if driving else (),
+        is_own=holds_control(station),
         speed_mps=position.speed_mps if position and position.speed_mps is not UNSET else None,
         latency_ms=max(known) if known and len(known) == len(latencies) else None,
         bound_ms=1000 * clock.bound_s if clock else None,

@@ -6,11 +6,11 @@ import asyncio
 import json
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from aiohttp import ClientError, WSMsgType, web
+from aiohttp import ClientError, ClientWebSocketResponse, WSMessage, WSMsgType, web
 
 from runner.page.access import LOOPBACK, Access
 from runner.page.connections import MAX_BODY, Connections
@@ -18,6 +18,7 @@ from runner.page.documents import Documents, document
 from runner.page.login import PageLogin
 from runner.page.loop import PageLoop
 from runner.page.relay import RETRY_S, STATION, relay, station_session
+from runner.page.summaries import RELEASE
 from runner.page.tls import PageTls
 from runner.security.keyring import TOKEN, Keyring
 from runner.settings import Endpoint
@@ -36,16 +37,19 @@ class Listed:
     socket   of its station; None: it has none
     fault    why its station does not work; None: it does
     summary  what that said last, see `runner.operator.summary`; None: nothing, or not any more
+    answer   why control was not released when somebody wanted to; "": it was, or nobody did
     """
 
     name: str
     socket: Path | None
     fault: str | None = NOT_RUNNING
     summary: Mapping[str, Any] | None = None
-    tasks: set[asyncio.Task[None]] = field(default_factory=set)
+    answer: str = ""
+    station: ClientWebSocketResponse | None = None
+    task: asyncio.Task[None] | None = None
 
     def row(self) -> dict[str, Any]:
-        return {"name": self.name, "fault": self.fault, "summary": self.summary}
+        return {"name": self.name, "fault": self.fault, "summary": self.summary, "answer": self.answer}
 
 
 class FleetServer:
@@ -111,27 +115,17 @@ class FleetServer:
 
     async def _stop(self) -> None:
         for vehicle in self._vehicles.values():
-            for task in vehicle.tasks:
-                task.cancel()
+            if vehicle.task:
+                vehicle.task.cancel()
         await self._connections.close()
 
     def _add(self, vehicle: Listed) -> None:
         self._vehicles[vehicle.name] = vehicle
         if vehicle.socket:
-            vehicle.tasks.add(asyncio.get_running_loop().create_task(self._follow(vehicle, vehicle.socket)))
+            vehicle.task = asyncio.get_running_loop().create_task(_follow(vehicle, vehicle.socket))
 
     def _report(self, name: str, fault: str | None) -> None:
         self._vehicles[name].fault = fault
-
-    async def _follow(self, vehicle: Listed, socket: Path) -> None:
-        """Keep what a station says up to date, as long as it runs."""
-        while True:
-            with suppress(ClientError, OSError, TimeoutError, ValueError):
-                async with station_session(socket) as session, session.ws_connect(f"{STATION}/summary") as station:
-                    while (message := await station.receive(SILENT_S)).type is WSMsgType.TEXT:
-                        vehicle.summary = json.loads(message.data)
-            vehicle.summary = None
-            await asyncio.sleep(RETRY_S)
 
     async def _on_page(self, request: web.Request) -> web.StreamResponse:
         self._vehicle(request)
@@ -157,6 +151,32 @@ class FleetServer:
         while not ws.closed and self._access.is_granted(request):
             await ws.send_json({"vehicles": self.rows()})
             with suppress(TimeoutError):
-                await ws.receive(LIST_S)
+                await self._on_message(await ws.receive(LIST_S))
         await ws.close()
         return ws
+
+    async def _on_message(self, message: WSMessage) -> None:
+        """Release control of a vehicle: its name is the browser's only message."""
+        vehicle = self._vehicles.get(message.data) if message.type is WSMsgType.TEXT else None
+        if vehicle and vehicle.station:
+            vehicle.answer = ""
+            await vehicle.station.send_str(RELEASE)
+
+
+async def _follow(vehicle: Listed, socket: Path) -> None:
+    """Keep what a station says up to date, as long as it runs."""
+    while True:
+        with suppress(ClientError, OSError, TimeoutError, ValueError):
+            async with station_session(socket) as session, session.ws_connect(f"{STATION}/summary") as station:
+                vehicle.station = station
+                while (message := await station.receive(SILENT_S)).type is WSMsgType.TEXT:
+                    _take(vehicle, json.loads(message.data))
+        vehicle.station = vehicle.summary = None
+        await asyncio.sleep(RETRY_S)
+
+
+def _take(vehicle: Listed, said: dict[str, Any]) -> None:
+    if "answer" in said:
+        vehicle.answer = said["answer"]
+    else:
+        vehicle.summary = said

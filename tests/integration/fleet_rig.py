@@ -9,8 +9,9 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
 
-from rig import SMALL_ROBOT, free_port
+from rig import SMALL_ROBOT, free_port, until
 from runner.mqtt.broker import private_broker
 from runner.settings import Endpoint
 from runner.system.children import environment
@@ -38,13 +39,7 @@ class Programs:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for process in self.processes.values():
-            process.send_signal(signal.SIGTERM)
-        for process in self.processes.values():
-            try:
-                process.wait(30)
-            finally:
-                process.kill()
+        self.end(*self.processes)
         self._stack.close()
 
     def of(self, name: str) -> list[str]:
@@ -59,6 +54,17 @@ class Programs:
         of_vehicle = ("vehicle=", *(() if vehicles.endswith(".yaml") else ("cameras.", "~cameras.")))
         common = [word for word in self.words if not word.startswith(of_vehicle)]
         self._run("station", "operator", *common, f"vehicles={vehicles}", f"page.port={self.page}")
+
+    def end(self, *names: str) -> None:
+        """End some of them."""
+        ended = [self.processes.pop(name) for name in names]
+        for process in ended:
+            process.send_signal(signal.SIGTERM)
+        for process in ended:
+            try:
+                process.wait(30)
+            finally:
+                process.kill()
 
     def start(self, name: str, verb: str, *words: str) -> None:
         self._run(name, verb, *self.words, *words)
@@ -115,3 +121,25 @@ def pids_of(programs: Programs) -> dict[str, int]:
             if above == parent and (name := next((w[5:] for w in line if w.startswith("name=")), None)):
                 found[name] = int(entry.name)
     return found
+
+
+def await_page(programs: Programs) -> None:
+    until(lambda: "page: http" in programs.output("station"), 60, 0.1)
+
+
+def card(page: Any, name: str) -> Any:
+    """A vehicle in the list."""
+    return page.locator(f"article[aria-label={name}]")
+
+
+def live(page: Any) -> int:
+    """How many pictures of the vehicle that is open are live."""
+    return int(page.locator(".tile[data-status=live]").count())
+
+
+def leave(page: Any, name: str) -> None:
+    """Open another vehicle: one whose speed is unknown is left with a second press."""
+    card(page, name).locator("a.open").click()
+    if "press again" in page.inner_text("#toasts"):
+        card(page, name).locator("a.open").click()
+    until(lambda: page.url.endswith(f"/vehicle/{name}/"), every_s=0.02)

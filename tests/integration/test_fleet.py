@@ -8,7 +8,7 @@ import signal
 from contextlib import ExitStack
 
 import pytest
-from fleet_rig import NAMES, Programs, pids_of, three
+from fleet_rig import NAMES, Programs, await_page, card, leave, live, pids_of, three
 
 from browser import shot, visit
 from rig import needs_browser, until
@@ -63,26 +63,6 @@ def page(fleet, chromium):
         until(lambda: page.locator(".state[data-level=fine]").count() == 3, 120, 0.1)
         yield page
         assert wrong == []
-
-
-def await_page(programs):
-    until(lambda: "page: http" in programs.output("station"), 60, 0.1)
-
-
-def card(page, name):
-    return page.locator(f"article[aria-label={name}]")
-
-
-def live(page):
-    return page.locator(".tile[data-status=live]").count()
-
-
-def leave(page, name):
-    """Open another vehicle; a vehicle whose speed is unknown is left with a second press."""
-    card(page, name).locator("a.open").click()
-    if f"/vehicle/{name}/" not in page.url:
-        card(page, name).locator("a.open").click()
-    until(lambda: page.url.endswith(f"/vehicle/{name}/"), every_s=0.05)
 
 
 @needs_browser

@@ -7,8 +7,12 @@ import { latency, whole } from "./format.js";
  * @property {boolean} online
  * @property {string|null} fault why there is no control link
  * @property {string|null} mode
- * @property {string|null} driver id of the operator in control
- * @property {boolean} is_own whether that is this station's
+ * @property {"free"|"held"|"lost"|null} control
+ * @property {string|null} holder id of the operator that is in control, or was until it was lost
+ * @property {number} held_s
+ * @property {string|null} offered to whom control is offered
+ * @property {string[]} requested who asks for it
+ * @property {boolean} is_own whether the holder is this station's operator
  * @property {number|null} speed_mps
  * @property {number|null} latency_ms
  * @property {number|null} bound_ms
@@ -19,7 +23,8 @@ import { latency, whole } from "./format.js";
  * @property {string[]} cameras
  * @property {string[]} received
  *
- * @typedef {{name: string, fault: string|null, summary: Summary|null}} Row fault: why its station does not run
+ * @typedef {{name: string, fault: string|null, summary: Summary|null, answer: string}} Row
+ *   fault: why its station does not run; answer: why control was not released
  * @typedef {{level: "fine"|"near"|"late"|"unknown", text: string}} Words
  */
 
@@ -31,11 +36,23 @@ export function stateOf({ fault, summary }) {
   return summary.fault ? { level: "late", text: `✕ ${summary.fault}` } : { level: "unknown", text: "○ offline" };
 }
 
-/** Who drives it. @param {Row} row @returns {Words} */
+/** Who drives it, and who wants to. @param {Row} row @returns {Words} */
 export function driverOf({ summary }) {
-  if (!summary?.online) return { level: "unknown", text: "–" };
-  if (summary.is_own) return { level: "fine", text: "You drive" };
-  return summary.driver ? { level: "near", text: `${summary.driver} drives` } : { level: "unknown", text: "Nobody drives" };
+  if (!summary?.online || !summary.control) return { level: "unknown", text: "–" };
+  const { control, holder, is_own, held_s, offered, requested } = summary;
+  const further = [offered ? `; offered to ${offered}` : "", ...requested.map((name) => `; ${name} would like to`)].join("");
+  const time = duration(held_s);
+  if (control === "free") return { level: "unknown", text: `Nobody drives${further}` };
+  const was = is_own ? "You were" : `${holder} was`;
+  if (control === "lost") return { level: "late", text: `✕ ${was} in control: LOST for ${time}${further}` };
+  if (is_own) return { level: "fine", text: `You drive, for ${time}${further}` };
+  return { level: "near", text: `${holder} drives, for ${time}${further}` };
+}
+
+/** 45 s, 12 min, 3 h. @param {number} seconds */
+function duration(seconds) {
+  if (seconds < 60) return `${Math.floor(seconds)} s`;
+  return seconds < 3600 ? `${Math.floor(seconds / 60)} min` : `${Math.floor(seconds / 3600)} h`;
 }
 
 /** @param {Row} row */
@@ -56,7 +73,11 @@ function linkWords({ received, actual_kbps, total_kbps, believed_kbps }) {
 }
 
 /** @param {Row} row */
-export const alarmsOf = ({ summary }) => summary?.alarms ?? [];
+export const alarmsOf = ({ summary, answer }) =>
+  [...(summary?.alarms ?? []), ...(answer ? [`control was not released: ${answer}`] : [])];
+
+/** Whether control can be released here. @param {Row} row */
+export const isHeldHere = ({ summary }) => Boolean(summary?.online && summary.is_own && summary.control === "held");
 
 /**
  * The camera of the small picture: the one that looks ahead, by its name, otherwise the first that is on; null: none is.

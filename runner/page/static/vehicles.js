@@ -1,7 +1,7 @@
 /** The vehicles of this station, each as a card: on the page that lists them, and beside the pictures of one of them. */
 
 import { make, setAttribute, setText } from "./format.js";
-import { alarmsOf, driverOf, figuresOf, pictureOf, stateOf } from "./vehicle_words.js";
+import { alarmsOf, driverOf, figuresOf, isHeldHere, pictureOf, stateOf } from "./vehicle_words.js";
 
 const AGAIN_MS = 1000; // between two attempts to connect
 const SILENT_MS = 3000; // the server sends four lists a second
@@ -16,8 +16,12 @@ const watched = () => new Set(sessionStorage.getItem(WATCHED)?.split(" ").filter
 
 /** One vehicle of the list. */
 class Card {
-  /** @param {string} name  @param {(name: string) => boolean} mayLeave whether another vehicle may be opened now */
-  constructor(name, mayLeave) {
+  /**
+   * @param {string} name
+   * @param {(name: string) => boolean} mayLeave whether another vehicle may be opened now
+   * @param {(name: string) => void} release called to release control of it
+   */
+  constructor(name, mayLeave, release) {
     this.name = name;
     this.camera = ""; // of the small picture, "" while there is none
     const names = ["state", "driver", "speed", "latency", "link"];
@@ -25,6 +29,7 @@ class Card {
     this.alarms = make("ul", { class: "alarms", role: "status", "aria-label": `Alarms of ${name}` });
     this.view = make("div", { class: "view", hidden: true });
     this.watch = make("button", { class: "watch", "aria-pressed": "false", onclick: () => this.toggle() }, "Picture");
+    this.release = make("button", { class: "release", hidden: true, onclick: () => release(name) }, "Release");
     const onclick = (event) => mayLeave(name) || event.preventDefault();
     const open = make("a", { class: "open", href: pageOf(name), onclick }, "Open");
     const { state, driver, speed, latency, link } = this.parts;
@@ -32,7 +37,7 @@ class Card {
       make("div", {}, make("dt", {}, title), make("dd", {}, value))));
     this.element = make("article", { class: "vehicle-card", "aria-label": name },
       make("header", {}, make("h2", {}, name), state), driver, figures, this.alarms, this.view,
-      make("div", { class: "buttons" }, open, this.watch));
+      make("div", { class: "buttons" }, open, this.watch, this.release));
   }
 
   toggle() {
@@ -51,6 +56,7 @@ class Card {
       setAttribute(this.parts[part], "data-level", level);
     }
     for (const [part, text] of Object.entries(figuresOf(row))) setText(this.parts[part], text);
+    this.release.hidden = !isHeldHere(row);
     const alarms = alarmsOf(row);
     if (this.alarms.textContent !== alarms.join("")) this.alarms.replaceChildren(...alarms.map((text) => make("li", {}, text)));
     setAttribute(this.element, "data-alarm", alarms.length > 0 || words.state.level === "late" ? "" : null);
@@ -87,7 +93,7 @@ export function startVehicles(element, { current, mayLeave, onRows = () => {} })
   function show(rows) {
     for (const row of rows) {
       if (!cards.has(row.name)) {
-        cards.set(row.name, new Card(row.name, mayLeave));
+        cards.set(row.name, new Card(row.name, mayLeave, release));
         element.append(cards.get(row.name)?.element ?? "");
       }
       cards.get(row.name)?.show(row, row.name === current);
@@ -95,14 +101,18 @@ export function startVehicles(element, { current, mayLeave, onRows = () => {} })
     onRows(rows);
   }
 
-  follow((rows) => {
+  const release = follow((rows) => {
     setAttribute(element, "data-stale", rows ? null : "");
     if (rows) show(rows);
     else onRows(null);
   });
 }
 
-/** Call a function with each list that the server sends; null: it sends none. @param {(rows: Row[]|null) => void} onList */
+/**
+ * Call a function with each list that the server sends; null: it sends none.
+ * @param {(rows: Row[]|null) => void} onList
+ * @returns {(name: string) => void} releases control of a vehicle
+ */
 function follow(onList) {
   const url = new URL("/list", location.href);
   url.protocol = url.protocol.replace("http", "ws");
@@ -136,4 +146,5 @@ function follow(onList) {
       socket.close();
     }
   }, AGAIN_MS);
+  return (name) => socket.readyState === WebSocket.OPEN && socket.send(name);
 }
