@@ -24,11 +24,11 @@ from pathlib import Path
 from statistics import median
 
 from aiohttp import ClientSession, WSMsgType
+from fleet_rig import NAMES, Programs, await_page, card, leave, live, pids_of
 from playwright.sync_api import sync_playwright
 from table import Row, show, spread
 from usage import processor_s
 
-from fleet_rig import NAMES, Programs, await_page, card, leave, live, pids_of
 from rig import BROWSER, CHROMIUM_FLAGS, free_port, until
 
 CAMERAS, FPS = 3, 10

@@ -30,7 +30,7 @@ ALL = "all"
 NAME = re.compile(r"[A-Za-z0-9_-]+")  # as `name` in schemas/vehicle.schema.json
 LOOK_S = 0.05
 STATION_END_S = signals.END_S + 0.2  # a station ends itself by force before it is killed
-END_S = STATION_END_S + 0.6
+END_S = STATION_END_S + 1.2  # all stations, and the page
 Words = tuple[str, ...]
 MOST = 100  # vehicles that a broker may make this side start stations for
 
@@ -52,7 +52,7 @@ class Fleet:
 
     def add(self, name: str, own: Words) -> None:
         """Add a vehicle with overrides of its own."""
-        socket = self._directory / f"{name}.sock"
+        socket = self._directory / str(len(self._stations))  # short: a socket's name has 107 bytes at most
         words = [*own, *self._arguments.overrides, f"socket={socket}"]
         words += [f"conf={self._arguments.conf}"] if self._arguments.conf else []
         drives = self._arguments.path("drives")
@@ -210,6 +210,10 @@ def _composed(arguments: Arguments, vehicles: Mapping[str, Words] | None) -> Set
     setup = setups[0] if setups else configuration(arguments.overrides, arguments.conf, runnable=False).setup()
     if not setup.page.serve:
         raise ArgumentError("page.serve", "false", "vehicles= is for the page")
+    ports = [each.metrics.operator_port for each in setups if each.metrics.operator_port]
+    if len(set(ports)) < len(ports):
+        rule = "must differ: state one for each vehicle in a file of vehicles"
+        raise ArgumentError("metrics.operator_port", str(ports[0]), rule)
     for each in setups or [setup]:
         viewer_keyring(each)
     return setup
