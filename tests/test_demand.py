@@ -12,6 +12,7 @@ def shown(demand: Demand, t: float, *, holds_control: bool = False) -> tuple[set
 
 def test_nothing_is_received_until_somebody_looks() -> None:
     assert shown(Demand(), 0.0) == (set(), Presence.ABSENT)
+    assert shown(Demand(), 0.0, holds_control=True) == (set(), Presence.ABSENT)  # from an earlier run
 
 
 def test_a_picture_is_watched_and_a_page_drives() -> None:

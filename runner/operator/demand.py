@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass, field
+from math import inf
 
 from runner.operator.station import Presence
 
@@ -17,7 +18,7 @@ class Demand:
     _shown: frozenset[str] = frozenset()
     _is_open: bool = False
     _seen: dict[str, float] = field(default_factory=dict)  # by camera, when it was last asked for
-    _opened: float = float("-inf")  # when a page was last open
+    _opened: float = -inf  # when a page was last open
 
     def ask(self, cameras: Collection[str], *, is_open: bool, now: float) -> None:
         """Windows show these cameras from now on.
@@ -34,9 +35,12 @@ class Demand:
         return frozenset(name for name, seen in self._seen.items() if now - seen < LINGER_S)
 
     def presence(self, now: float, *, holds_control: bool) -> Presence:
-        """How to show it to the vehicle. An operator that holds control does not leave by closing the page."""
+        """How to show it to the vehicle. An operator that holds control does not leave by closing the page.
+
+        Control that is left from an earlier run returns with a page, not by itself.
+        """
         self._note(now)
-        if holds_control or now - self._opened < LINGER_S:
+        if now - self._opened < (inf if holds_control else LINGER_S):
             return Presence.DRIVING
         return Presence.WATCHING if self.cameras(now) else Presence.ABSENT
 

@@ -70,6 +70,7 @@ class LiveOperator:
         self.setup, self.station = setup, station
         self._demand, self._following = demand, threading.Lock()
         self._received = frozenset[str]()  # as the demand was last followed
+        self._holds = False  # whether this operator held control when the vehicle was last heard
         self.on_dropped: Callable[[Collection[str]], None] = lambda cameras: None  # that are no longer received
         self._log, self._build = log, build
         self._side: OperatorSide | None = None
@@ -120,7 +121,9 @@ class LiveOperator:
         with self._following:
             now = time.monotonic()
             cameras = demand.cameras(now)
-            self.station.appear(demand.presence(now, holds_control=holds_control(self.station)))
+            if self.station.state:  # an operator does not leave a vehicle that is silent for a moment
+                self._holds = holds_control(self.station)
+            self.station.appear(demand.presence(now, holds_control=self._holds))
             if self._side is None or cameras == self._received:
                 return
             dropped, self._received = self._received - cameras, cameras

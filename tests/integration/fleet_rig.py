@@ -75,7 +75,7 @@ class Programs:
                 [sys.executable, "-m", "runner", verb, *words],
                 stdout=output,
                 stderr=subprocess.STDOUT,
-                env=environment() | {"PYTHONUNBUFFERED": "1"},
+                env=environment() | {"PYTHONUNBUFFERED": "1", "XDG_STATE_HOME": str(self._log)},
             )
 
     def output(self, name: str) -> str:
