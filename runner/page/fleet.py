@@ -26,7 +26,7 @@ from runner.system.ports import check_port_free
 from runner.system.reports import LimitedReports
 
 LIST_S = 0.25  # between two lists to a browser
-SILENT_S = 2.0  # a station that sends no summary for this long does not respond; it sends four a second
+SILENT_S = 2.0  # a station that sends no summary for this long does not respond; it sends two a second
 NOT_RUNNING = "its station is not running"
 
 
@@ -132,7 +132,7 @@ class FleetServer:
         response: web.Response = await self._page(request)
         return response
 
-    async def _on_live(self, request: web.Request) -> web.WebSocketResponse:
+    async def _on_live(self, request: web.Request) -> web.Response:
         vehicle = self._vehicle(request)
         if vehicle.socket is None:
             raise web.HTTPServiceUnavailable(text=f"{vehicle.fault}\n")

@@ -1,20 +1,22 @@
-"""Passes a browser's WebSocket on to the station of one vehicle, and back."""
+"""Passes a browser's WebSocket on to the station of one vehicle, and back, unread: pings and pictures alike."""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
 from pathlib import Path
+from socket import SO_SNDBUF, SOL_SOCKET
 
-from aiohttp import ClientError, ClientSession, ClientWebSocketResponse, UnixConnector, WSMsgType, web
+from aiohttp import ClientSession, UnixConnector, web
+
+from runner.page.connections import abort
 
 RETRY_S = 0.1  # a station may be starting
 PATIENCE_S = 3.0  # for its start; the page connects again
 ACCESS_S = 1.0  # how soon a relay ends whose browser may no longer see anything
 STATION = "http://station"  # any name: the socket decides
-MAX_BYTES = 16 * 1_048_576  # of a message: an access unit, or the history of all cameras
-
-Peer = web.WebSocketResponse | ClientWebSocketResponse
+HANDSHAKE = ("Upgrade", "Connection", "Sec-WebSocket-Key", "Sec-WebSocket-Version")
+SEND_BUFFER_BYTES = 131_072  # small: the station notices a browser that does not read
 
 
 def station_session(socket: Path) -> ClientSession:
@@ -22,63 +24,80 @@ def station_session(socket: Path) -> ClientSession:
     return ClientSession(connector=UnixConnector(str(socket)))
 
 
-async def relay(request: web.Request, socket: Path, is_granted: Callable[[], bool]) -> web.WebSocketResponse:
-    """Relay until either side ends, or access does. Pings pass, too: each side sees whether the other one is alive."""
-    browser = web.WebSocketResponse(compress=False, max_msg_size=MAX_BYTES, autoping=False)
-    await browser.prepare(request)
-    async with station_session(socket) as session:
-        tasks = [asyncio.create_task(_watch(is_granted)), asyncio.create_task(_join(browser, session, request))]
-        try:
-            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-        finally:
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
-    await browser.close()
-    return browser
+async def relay(request: web.Request, socket: Path, is_granted: Callable[[], bool]) -> web.Response:
+    """Relay until either side ends, or access does.
 
-
-async def _watch(is_granted: Callable[[], bool]) -> None:
-    while is_granted():
-        await asyncio.sleep(ACCESS_S)
-
-
-async def _join(browser: web.WebSocketResponse, session: ClientSession, request: web.Request) -> None:
-    url = f"{STATION}/live?{request.rel_url.raw_query_string}"
-    async with await _connected(session, url) as station:
-        tasks = [asyncio.create_task(_pass(browser, station)), asyncio.create_task(_pass(station, browser))]
-        try:
-            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-        finally:
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
-
-
-async def _connected(session: ClientSession, url: str) -> ClientWebSocketResponse:
-    """Connect, once the station is there: browsers delay the WebSockets of a page that has seen many fail.
-
-    raises  TimeoutError
+    raises  HTTPServiceUnavailable if the station does not run
     """
-    async with asyncio.timeout(PATIENCE_S):
-        while True:
-            try:
-                return await session.ws_connect(url, autoping=False, max_msg_size=MAX_BYTES)
-            except (ClientError, OSError):
-                await asyncio.sleep(RETRY_S)
+    browser = request.transport
+    assert isinstance(browser, asyncio.Transport)
+    to_browser, to_station = _End(), _End(browser.get_protocol())
+    station = await _connected(socket, to_browser, browser)
+    if (connection := browser.get_extra_info("socket")) is not None:
+        connection.setsockopt(SOL_SOCKET, SO_SNDBUF, SEND_BUFFER_BYTES)
+    to_browser.other, to_station.other = browser, station
+    browser.set_protocol(to_station)  # the station answers the handshake
+    station.write(_handshake(request))
+    try:
+        ended = {asyncio.create_task(end.ended.wait()) for end in (to_browser, to_station)}
+        while is_granted() and not (await asyncio.wait(ended, timeout=ACCESS_S, return_when="FIRST_COMPLETED"))[0]:
+            pass
+    finally:
+        for task in ended:
+            task.cancel()
+        station.close()
+        if to_station.ended.is_set() or to_browser.ended.is_set():
+            browser.close()  # with what has been written
+        else:
+            abort(browser)
+    return web.Response()  # which nobody gets
 
 
-async def _pass(source: Peer, sink: Peer) -> None:
-    """Pass messages on as fast as the sink accepts them."""
-    async for message in source:
-        match message.type:
-            case WSMsgType.TEXT:
-                await sink.send_str(message.data)
-            case WSMsgType.BINARY:
-                await sink.send_bytes(message.data)
-            case WSMsgType.PING:
-                await sink.ping(message.data)
-            case WSMsgType.PONG:
-                await sink.pong(message.data)
-            case _:
-                return
+class _End(asyncio.Protocol):
+    """Receives from one side, and passes on to the other one as fast as that accepts.
+
+    before  protocol of the connection until now, which has to learn of its end; None: it is a new one
+    """
+
+    def __init__(self, before: asyncio.BaseProtocol | None = None) -> None:
+        self.other: asyncio.Transport | None = None
+        self.ended = asyncio.Event()
+        self._before = before
+
+    def data_received(self, data: bytes) -> None:
+        assert self.other
+        self.other.write(data)
+
+    def pause_writing(self) -> None:
+        """This side does not accept what the other one sends."""
+        if self.other and not self.other.is_closing():
+            self.other.pause_reading()
+
+    def resume_writing(self) -> None:
+        if self.other and not self.other.is_closing():
+            self.other.resume_reading()
+
+    def connection_lost(self, error: Exception | None) -> None:
+        self.ended.set()
+        if self._before:
+            self._before.connection_lost(error)
+
+
+async def _connected(socket: Path, protocol: _End, browser: asyncio.Transport) -> asyncio.Transport:
+    """Connect to a station, once it is there: browsers delay the WebSockets of a page that has seen many fail."""
+    loop = asyncio.get_running_loop()
+    until = loop.time() + PATIENCE_S
+    while loop.time() < until and not browser.is_closing():
+        try:
+            return (await loop.create_unix_connection(lambda: protocol, str(socket)))[0]
+        except OSError:
+            await asyncio.sleep(RETRY_S)
+    raise web.HTTPServiceUnavailable(text="the station of this vehicle is not running\n")
+
+
+def _handshake(request: web.Request) -> bytes:
+    """The browser's request, as the station gets it."""
+    given = [(name, request.headers[name]) for name in HANDSHAKE if name in request.headers]
+    headers = [("Host", "station"), *given]
+    lines = [f"GET /live?{request.rel_url.raw_query_string} HTTP/1.1", *(f"{name}: {value}" for name, value in headers)]
+    return "\r\n".join([*lines, "", ""]).encode("utf-8", "surrogateescape")

@@ -12,7 +12,7 @@ from runner.operator.station import Station
 from runner.operator.summary import summary
 from runner.records.vehicle import Outcome
 
-EVERY_S = 0.25
+EVERY_S = 0.5
 RELEASE = "release"  # the other side's only message: release control
 
 

@@ -28,7 +28,7 @@ from runner.verbs.screen import forgiving, say
 
 ALL = "all"
 NAME = re.compile(r"[A-Za-z0-9_-]+")  # as `name` in schemas/vehicle.schema.json
-LOOK_S = 0.05
+LOOK_S = 0.2
 STATION_END_S = signals.END_S + 0.2  # a station ends itself by force before it is killed
 END_S = STATION_END_S + 1.2  # all stations, and the page
 Words = tuple[str, ...]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
@@ -124,7 +125,13 @@ def pids_of(programs: Programs) -> dict[str, int]:
 
 
 def await_page(programs: Programs) -> None:
-    until(lambda: "page: http" in programs.output("station"), 60, 0.1)
+    """Wait until the list is served."""
+
+    def is_served() -> bool:
+        with socket.socket() as probe:
+            return probe.connect_ex(("127.0.0.1", programs.page)) == 0
+
+    until(is_served, 60, 0.1)
 
 
 def card(page: Any, name: str) -> Any:
