@@ -16,12 +16,14 @@ from rig import CHECKOUT, WAIT_S, process, until
 
 DOCUMENT = CHECKOUT / "docs" / "deployment.md"
 VEHICLE = "10.0.0.2"  # its address there, also where a recipe gives it another one later
-TWO_MACHINES, FIREWALLS, SRT, WIREGUARD = "From two bare machines to driving", "Firewalls", "SRT", "WireGuard"
+TWO_MACHINES, SERVICE = "From two bare machines to driving", "A broker as a service"
+FIREWALLS, SRT, WIREGUARD = "Firewalls", "SRT", "WireGuard"
 TWO_MODEMS, TWO_UPLINKS = "Two modems", "Two uplinks"
 # There is no systemd here: replacements for its services.
 BROKER = "sudo install -d -o mosquitto /run/mosquitto; sudo mosquitto -d -c /etc/mosquitto/mosquitto.conf"
 SERVICES = {"sudo systemctl restart mosquitto": BROKER}
 SIDES = ("tod-runner operator ", "tod-runner vehicle ")
+INSTALLS = "sudo apt-get install "  # has been done on this machine, which both others share
 # Two small cameras of the paper's eight, from a test picture.
 OTHERS = ("front_left", "front_right", "top_front", "top_left", "top_right", "top_rear")
 SIZES = [f"{name}.{size}" for name in ("front_center", "rear_center") for size in ("width_px=480", "height_px=260")]
@@ -73,7 +75,7 @@ def lines(heading: str) -> list[Line]:
 def files(heading: str) -> list[File]:
     found = []
     for block in _blocks(heading):
-        if named := re.search(r"^# (/\S+) of the (\w+)$", block, flags=re.M):
+        if named := re.search(r"^# ([/~]\S+) of the (\w+)\b", block, flags=re.M):
             found.append(File(named[2], named[1], block.partition("\n")[2]))
     return found
 
@@ -117,7 +119,7 @@ class Site:
     def prepare(self, heading: str) -> dict[str, list[str]]:
         """Follow a recipe until both sides can be started; returns the words of each, shortened."""
         given, starts = files(heading), {}
-        install = [line for line in lines(TWO_MACHINES) if not line.text.startswith("tod-runner ")]
+        install = [line for line in lines(SERVICE) if not line.text.startswith("tod-runner ")]
         for line in lines(heading):
             if line.text.startswith("sudo wg-quick"):
                 for file in given:
@@ -125,9 +127,9 @@ class Site:
             if line.text.startswith(SIDES):
                 _, verb, *words = shlex.split(line.text)
                 starts[verb] = [*(word for word in words if not word.startswith("source=")), *SHORT]
-            else:
+            elif not line.text.startswith(INSTALLS):
                 self.follow(line)
-            if line.text.startswith("tod-runner keys ") and heading != TWO_MACHINES:
+            if line.text.startswith("tod-runner keys ") and heading not in (TWO_MACHINES, SERVICE):
                 for step in install:
                     self.follow(step)
         return starts

@@ -3,13 +3,29 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 import time
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
 
 import pytest
 from machines import AWAY_S, Mobile, Modems, Routers, cable, machines, mobile, two_uplinks
-from recipes import FIREWALLS, SRT, TWO_MACHINES, TWO_MODEMS, TWO_UPLINKS, WIREGUARD, Site, files, watched
+from recipes import (
+    FIREWALLS,
+    SERVICE,
+    SHORT,
+    SRT,
+    TWO_MACHINES,
+    TWO_MODEMS,
+    TWO_UPLINKS,
+    WIREGUARD,
+    Site,
+    files,
+    lines,
+    watched,
+)
 
 from rig import needs_root, process, until
 from runner.drive.read import read_drive
@@ -46,8 +62,57 @@ def listening(machine):
     return child
 
 
-def test_two_bare_machines_drive_behind_their_firewalls(site):
+@contextmanager
+def both_driving(site, vehicle, operator, **options):
+    """Both sides, in the homes of their users, once pictures of every camera and their bitrates have arrived."""
+    homes, sides = site.homes, site.machines
+    started = []
+    with ExitStack() as stack:
+        for verb, words in (("operator", [*operator, "log=drive"]), ("vehicle", vehicle)):
+            env = {"HOME": str(homes[verb])} | options.get("env", {})
+            before = sides[verb].inside(homes[verb])
+            started.append(
+                stack.enter_context(process(verb, *words, before=before, stdout=subprocess.DEVNULL, env=env))
+            )
+        until(lambda: has_arrived(homes["operator"] / "drive"), every_s=0.5)
+        yield started[0]
+
+
+def test_two_bare_machines_drive_after_eight_commands_at_most(site):
+    given = lines(TWO_MACHINES)
+    assert {line.where for line in given} == {"operator", "vehicle"}
+    assert len([part for line in given for part in re.split("&&|;", line.text)]) <= 8
     words = site.prepare(TWO_MACHINES)
+    with both_driving(site, words["vehicle"], words["operator"]) as operator:
+        (broker,) = site.shell("operator", f"pgrep -P {operator.pid} mosquitto").split()
+    until(lambda: not Path(f"/proc/{broker}/exe").exists())
+
+
+def test_site_files_take_the_overrides(site):
+    site.prepare(TWO_MACHINES)
+    for file in files(TWO_MACHINES):
+        path = site.homes[file.where] / file.path.removeprefix("~/")
+        path.parent.mkdir(parents=True)
+        path.write_text(file.text)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("TOD_SITE")
+        with both_driving(site, SHORT, SHORT, env={"XDG_CONFIG_HOME": ""}):
+            pass
+
+
+def test_the_broker_runs_at_the_vehicle_if_that_is_the_one_reached(site):
+    site.shell(
+        "operator", f"tod-runner keys output=keys vehicle=tum_q7 host={VEHICLE} controller=alice broker={VEHICLE}"
+    )
+    site.shell("operator", f"rsync -a --chmod=D700,F600 keys/tum_q7 keys/broker {VEHICLE}:tod-keys/")
+    common = [f"media.host={VEHICLE}", f"control.host={VEHICLE}", "control.port=8883", *SHORT]
+    vehicle = ["keys=tod-keys/tum_q7", "control.broker=embedded", *common]
+    with both_driving(site, vehicle, ["keys=keys/alice", *common]):
+        pass
+
+
+def test_two_machines_with_a_broker_as_a_service_drive_behind_their_firewalls(site):
+    words = site.prepare(SERVICE)
     assert site.shell("operator", "stat -c '%U %a' /etc/mosquitto/tod /etc/mosquitto/tod/own.key").split() == [
         *("mosquitto", "700"),
         *("mosquitto", "600"),

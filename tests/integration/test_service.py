@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 import pytest
-from recipes import TWO_MACHINES, lines
+from recipes import SERVICE, lines
 
 from rig import CHECKOUT, ROBOT, free_port, needs_root, process, until
 from runner.drive.read import read_drive
@@ -85,7 +85,7 @@ def test_the_example_of_a_unit_is_the_command_of_the_document(unit):
     """Apart from the paths of keys, and the vehicle, which is the default one."""
     (example,) = re.findall(r"^#   TOD_OVERRIDES=(.*)$", unit.read_text(), flags=re.MULTILINE)
     verb = unit.stem.removeprefix("tod-")
-    (command,) = (line.text for line in lines(TWO_MACHINES) if line.text.startswith(f"tod-runner {verb} "))
+    (command,) = (line.text for line in lines(SERVICE) if line.text.startswith(f"tod-runner {verb} "))
     given, documented = ({word for word in text.split() if "keys=" not in word} for text in (example, command))
     assert given - {"vehicle=tum_q7"} == documented - {"tod-runner", verb}
     assert "keys=/etc/tod-runner/keys" in example.split()
