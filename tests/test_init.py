@@ -117,7 +117,7 @@ def test_a_full_disk_leaves_nothing_behind(tmp_path: Path, there: bool) -> None:
     [
         ([], "must be one directory: init DIR"),
         (["a", "b"], "a b: must be one directory: init DIR"),
-        (["a", "vehicle=tum_q7"], "vehicle=tum_q7: unknown argument; expected one of files, conf"),
+        (["a", "vehicle=tum_q7"], "vehicle=tum_q7: unknown argument; expected one of files, cameras, source, conf"),
     ],
 )
 def test_one_directory_is_named(
@@ -235,3 +235,87 @@ def test_an_empty_directory_is_filled_and_stays_the_same(tod: Command, tmp_path:
     assert tod("init", ".").status == 0
     assert tod("validate", "conf=.").status == 0
     assert (tmp_path.stat().st_ino, tmp_path.stat().st_mode) == (before.st_ino, before.st_mode)
+
+
+# --- a vehicle --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def courier(tod: Command, tmp_path: Path) -> Path:
+    result = tod("init", str(tmp_path / "courier-1"), "cameras=front,left,rear_top", "source=v4l2")
+    assert (result.status, result.err) == (0, "")
+    return tmp_path / "courier-1"
+
+
+def test_a_new_vehicle_is_valid_and_prints_at_once(tod: Command, courier: Path) -> None:
+    assert tod("validate", f"conf={courier}").err == ""
+    status, out, err = tod("print", f"conf={courier}", "vehicle=courier-1")
+    assert (status, err) == (0, "")
+    assert [line.partition(":")[0] for line in out.splitlines() if " kbit/s: " in line] == [
+        "# front",
+        "# left",
+        "# rear_top",
+    ]
+    assert "v4l2src name=source device=/dev/video4" in out
+    composed = tod("print", f"conf={courier}", "vehicle=courier-1", "pqos=courier-1", "format=yaml").out
+    for origin in ("vehicle", "cameras", "graph", "modes", "pqos"):
+        assert f"# {courier / origin}/courier-1" in composed, origin
+    assert "yaw_deg: 180" in composed
+
+
+@pytest.mark.parametrize("source", ["v4l2", "rtsp", "ros", "appsrc", "synthetic", "test"])
+def test_each_source_of_a_new_vehicle_prints(source: str, tod: Command, tmp_path: Path) -> None:
+    assert tod("init", str(tmp_path / "van"), "cameras=front", f"source={source}").status == 0
+    assert tod("print", f"conf={tmp_path / 'van'}", "vehicle=van").status == 0
+
+
+def test_its_rule_runs_once_it_is_installed(courier: Path) -> None:
+    """As its README says; a directory of metadata stands for `pip install ./rules`."""
+    rules = courier / "rules"
+    text = (rules / "pyproject.toml").read_text()
+    metadata = rules / "courier_1_rules-0.1.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: courier_1_rules\nVersion: 0.1\n")
+    entry = text.strip().splitlines()[-1].replace('"', "")
+    (metadata / "entry_points.txt").write_text(f"[tod_runner.rules]\n{entry}\n")
+    modes = courier / "modes" / "courier-1.yaml"
+    text, first, cap = modes.read_text(), "total_from_prediction: {start_kbps: 3000}", "total_cap: {cap_kbps: 700}"
+    assert first in text
+    environment = {**os.environ, "PYTHONPATH": f"{CHECKOUT}:{rules}"}
+    words = ("print", f"conf={courier}", "vehicle=courier-1", "total_kbps=3000")
+    modes.write_text(text.replace(first, f"{cap}\n  {first}"))
+    assert "total_cap" in process(*words, env=environment).err  # it needs the total, which nothing has given yet
+    modes.write_text(text.replace(f"{first} ", f"{first}\n  {cap} "))
+    result = process(*words, env=environment)
+    assert result.out.startswith("# courier-1, mode automatic, total 700 kbit/s"), result.err
+
+
+@pytest.mark.parametrize(
+    "words, problem",
+    [
+        (["van", "cameras=front,front"], "cameras: front: is named twice"),
+        (["van", "cameras=front,"], "cameras: must be names of letters, digits, _ and -, as in front,rear"),
+        (["1van", "cameras=front"], "NAME: 1van: must begin with a letter, and have letters, digits, _ and - only"),
+        (["van", "source=v4l2"], "cameras: must be given with source=: cameras=front,left,rear"),
+        (
+            ["van", "cameras=front", "source=v4l"],
+            "source: v4l: must be one of v4l2, rtsp, ros, appsrc, synthetic, test, did you mean v4l2?",
+        ),
+        (["van", "cameras=front", "files=schemas"], "files: schemas: must not be given with cameras="),
+    ],
+)
+def test_a_vehicle_that_cannot_be_made(
+    words: list[str], problem: str, tod: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = tod("init", *words)
+    assert result.status == 2
+    assert problem in result.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_vehicle_overwrites_nothing(tod: Command, courier: Path) -> None:
+    before = files(courier)
+    result = tod("init", str(courier), "cameras=front")
+    assert (result.status, files(courier)) == (2, before)
+    assert f"{courier / 'README.md'}: already exists; init overwrites nothing" in result.err

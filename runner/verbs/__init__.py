@@ -55,9 +55,9 @@ VERBS = {
         sited=True,
     ),
     "init": Verb(
-        "create a configuration directory of your own",
+        "create a vehicle, or a configuration directory, of your own",
         "runner.verbs.init",
-        ("files",),
+        ("files", "cameras", "source"),
         "DIR",
         composes=False,
         choices={"files": ("all", "schemas")},

@@ -1,13 +1,20 @@
 """usage: tod-runner init DIR [files=all|schemas]
+       tod-runner init DIR/NAME cameras=NAME[,NAME...] [source=v4l2]
 
-Creates a configuration directory to start from: a vehicle with two cameras, a kind of camera, a modes file, checks for
-GitHub Actions and for pre-commit, and in DIR/.schemas the schemas with which your editor completes, explains and checks
-keys. It passes `validate` unchanged. Existing files are never overwritten: if there are any, nothing is written and
-each is listed. A new directory appears only when it is complete.
+With cameras=, creates the directory of a vehicle: NAME with these cameras, a kind of camera, a graph, the rules of its
+modes, predictions from a map, a rule in Python, checks for GitHub Actions and for pre-commit, and a README that says
+what to do with them. source= is v4l2, rtsp, ros, appsrc, synthetic or test.
+
+Without, creates a configuration directory to start from: a vehicle with two cameras, a kind of camera, a modes file,
+checks for GitHub Actions and for pre-commit, and in DIR/.schemas the schemas with which your editor completes, explains
+and checks keys. Both pass `validate` unchanged. Existing files are never overwritten: if there are any, nothing is
+written and each is listed. A new directory appears only when it is complete.
 
 With files=schemas only the schemas are written: for an existing directory, or, after an update, once you have removed
 DIR/.schemas.
 
+  tod-runner init courier cameras=front,left,rear source=v4l2
+  tod-runner print conf=courier vehicle=courier
   tod-runner init my_vehicles
   tod-runner validate conf=my_vehicles
   tod-runner print conf=my_vehicles vehicle=my_vehicle modes=my_modes
@@ -25,6 +32,7 @@ from pathlib import Path
 from runner.configuration.editors import copies
 from runner.errors import ArgumentError, ConfigError, Problem
 from runner.verbs import Arguments
+from runner.verbs.new_vehicle import vehicle_files
 
 VEHICLE = "my_vehicle"
 TEMPLATES = {  # by path in the directory, the file in static/
@@ -40,13 +48,20 @@ def run(arguments: Arguments) -> int:
     everything = arguments.choice("files") == "all"
     if len(arguments.words) != 1:
         raise ArgumentError("", " ".join(arguments.words) or None, "must be one directory: init DIR")
-    place = Path(arguments.words[0])
-    texts = {**(_templates() if everything else {}), **copies()}
+    place, cameras = Path(arguments.words[0]), arguments.values.get("cameras")
+    if cameras is None and "source" in arguments.values:
+        raise ArgumentError("cameras", None, "must be given with source=: cameras=front,left,rear")
+    if cameras is not None and not everything:
+        raise ArgumentError("files", "schemas", "must not be given with cameras=")
+    own = vehicle_files(place.name, cameras.split(","), arguments.values.get("source", "v4l2")) if cameras else None
+    texts = {**(own or (_templates() if everything else {})), **copies()}
     if problems := list(dict.fromkeys(_problems(place, texts))):
         raise ConfigError(problems, "nothing was written")
     _write(place, texts)
     print("\n".join(str(place / name) for name in texts))
-    if everything:
+    if own:
+        print(f"next: tod-runner print conf={place} vehicle={place.name}; then read {place / 'README.md'}")
+    elif everything:
         print(f"next: tod-runner validate conf={place}; tod-runner print conf={place} vehicle={VEHICLE} modes=my_modes")
     return 0
 
