@@ -441,11 +441,8 @@ def test_a_vehicle_that_signs_off_is_offline_immediately(both):
     assert listener.received[-1] == ("state", None)
 
 
-@pytest.mark.parametrize("width", [80, 150])
-def test_the_table_shows_the_names_of_cameras_on_a_narrow_terminal(width, monkeypatch):
-    names = ("front_center", "top_left")
-    received = Reception(frames=9, width=1920, height=1040, latency_ms=123.4, latency_at=time.monotonic())
-    rows = [CameraRow(name, MeasuredRates(15.0, 1234.0), received, None) for name in names]
+def shown_table(rows, width, monkeypatch):
+    """The lines of the table on a terminal of so many columns."""
     terminal, end = os.openpty()
     monkeypatch.setenv("COLUMNS", str(width))
     with os.fdopen(end, "w") as stdout:
@@ -454,8 +451,25 @@ def test_the_table_shows_the_names_of_cameras_on_a_narrow_terminal(width, monkey
             table.show(rows, "the vehicle is online")
         lines = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", os.read(terminal, 65_536).decode()).splitlines()
     os.close(terminal)
+    return lines
+
+
+@pytest.mark.parametrize("width", [80, 150])
+def test_the_table_shows_the_names_of_cameras_on_a_narrow_terminal(width, monkeypatch):
+    names = ("front_center", "top_left")
+    received = Reception(frames=9, width=1920, height=1040, latency_ms=123.4, latency_at=time.monotonic())
+    rows = [CameraRow(name, MeasuredRates(15.0, 1234.0), received, None) for name in names]
+    lines = shown_table(rows, width, monkeypatch)
     assert [line.split()[0] for line in lines[4:6]] == list(names)
     assert ("demand" in lines[2], "1920x1040" in lines[4]) == (width > 80, True)
+
+
+@pytest.mark.parametrize("width", [80, 160])
+def test_the_table_says_which_pictures_are_refused_and_where_there_is_room_why(width, monkeypatch):
+    rows = [CameraRow("front", MeasuredRates(0.0, 0.0), Reception(), None, "one viewer per camera: media.max_viewers")]
+    line = next(line for line in shown_table(rows, width, monkeypatch) if line.startswith("front"))
+    assert "refused" in line
+    assert ("media.max_viewers" in line) == (width > 80)
 
 
 def test_no_part_of_a_latency_is_negative():
