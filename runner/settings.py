@@ -130,12 +130,14 @@ class PageSettings:
 
     host     address at which it is served
     late_ms  age when drawn above which a picture is marked as late
+    people   file of those who may log in beside the operator; None: nobody
     """
 
     serve: bool
     port: int
     late_ms: float
     host: str = "127.0.0.1"
+    people: str | None = None
 
     @property
     def endpoint(self) -> Endpoint:

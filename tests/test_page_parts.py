@@ -42,6 +42,7 @@ from runner.records.vehicle import Outcome, Position
 from runner.security import keyring
 from runner.security.authority import Authority
 from runner.security.keyring import Keyring
+from runner.security.page_people import PagePerson
 
 UPGRADE = (
     "Connection: Upgrade\r\nUpgrade: websocket\r\n"
@@ -79,6 +80,7 @@ def served(*overrides, layouts=None, login=None, keyring=None, note=print):
         if login:
             patch.setattr("runner.page.server.Access", lambda _none, *rest: Access(login, *rest))
         page = PageServer(setup(f"page.port={port}", *overrides), station, layouts=layouts, keyring=keyring)
+        station.latency, station.page = SimpleNamespace(captured=lambda camera, captured: captured), page
         patch.setattr("runner.page.server.UNRESPONSIVE_S", 60)
         page.start()
         try:
@@ -100,7 +102,7 @@ def test_a_request_that_is_never_finished_is_closed(monkeypatch, begun):
 def test_a_login_whose_body_never_comes_is_closed(monkeypatch):
     """The body is read before anybody has logged in."""
     monkeypatch.setattr("runner.page.connections.REQUEST_S", 0.3)
-    login = PageLogin(lambda: b"token")
+    login = PageLogin(lambda: {"anna": PagePerson(Role.CONTROLLER, b"token")})
     with served(login=login) as (port, _), socket.create_connection(("127.0.0.1", port), timeout=60) as line:
         own = f"Host: localhost:{port}\r\nOrigin: https://localhost:{port}\r\n"
         line.sendall(f"POST /login HTTP/1.1\r\n{own}Content-Length: 100\r\n\r\n".encode())
@@ -131,7 +133,7 @@ class OneSession:
 
     def __init__(self):
         self.token = b"token"
-        self.login = PageLogin(lambda: self.token)
+        self.login = PageLogin(lambda: {"anna": PagePerson(Role.CONTROLLER, self.token)})
         challenge = self.login.challenge(time.monotonic())
         answer = hmac.new(self.token, challenge.encode(), "sha256").hexdigest()
         self.cookie = f"{COOKIE}={self.login.open(challenge, answer, time.monotonic())}"
@@ -167,6 +169,117 @@ def test_messages_are_ignored_once_the_token_is_replaced(monkeypatch):
 
     with served(login=changed.login) as (port, station):
         asyncio.run(drive(port, station))
+
+
+PEOPLE = {
+    "anna": PagePerson(Role.CONTROLLER, b"of anna"),
+    **{name: PagePerson(Role.WATCHER, f"of {name}".encode()) for name in ("bob", "carol")},
+}
+
+
+def pages(*names, login=None):
+    """Drives the pages of these people: a decorator; each is given as a function that asks and returns what answers."""
+
+    def decorate(drive):
+        people = login or PageLogin(lambda: PEOPLE)
+
+        async def run(port, station):
+            async with AsyncExitStack() as stack:
+                opened = [await opened_page(stack, people, port, name) for name in names]
+                await drive(station, *opened)
+
+        with served(login=people) as (port, station):
+            asyncio.run(run(port, station))
+
+    return decorate
+
+
+async def opened_page(stack, login, port, name):
+    challenge, now = login.challenge(time.monotonic()), time.monotonic()
+    answer = hmac.new(f"of {name}".encode(), challenge.encode(), "sha256").hexdigest()
+    headers = {"Cookie": f"{COOKIE}={login.open(challenge, answer, now)}", "Origin": f"https://localhost:{port}"}
+    session = await stack.enter_async_context(aiohttp.ClientSession(headers=headers))
+    return await stack.enter_async_context(session.ws_connect(f"http://localhost:{port}/live?viewer=of-{name}"))
+
+
+async def told(page, kind, wanted=lambda message: True):
+    """The next message of a kind that is as wanted."""
+    while (message := await page.receive_json(timeout=60))["kind"] != kind or not wanted(message):
+        pass
+    return message
+
+
+def test_a_watchers_page_is_told_so_and_can_request_nothing():
+    reason = "bob may only watch"
+
+    @pages("bob", "anna")
+    async def _(station, bob, anna):
+        assert (await told(bob, "hello"))["visitor"] == {"name": "bob", "may_drive": False}
+        assert (await told(anna, "hello"))["visitor"] == {"name": "anna", "may_drive": True}
+        control = await told(anna, "control", lambda message: message["holder"] == "you")  # though bob was first
+        assert control["watching"] == ["bob"]
+        assert "watching" not in await told(bob, "control", lambda message: message["holder"] == "another")
+        requests = (
+            {"take_control": True},
+            {"release_control": True},
+            {"id": "1", "event": "mode_selected", "mode": "single"},
+            {"id": "1", "layout": {}},
+            {"counter": {}},
+        )
+        for request in requests:
+            await bob.send_json(request)
+            reply = await told(bob, "reply")
+            assert (reply["result"], reply["reason"]) == ("refused", reason), request
+        await bob.send_json({"attention": "hidden"})
+        await bob.send_json({"clock": 1})
+        await told(bob, "clock")
+        assert station.attention is not Attention.HIDDEN
+
+
+def test_the_driver_is_told_who_watches_until_they_leave():
+    @pages("anna", "bob", "carol")
+    async def _(_station, anna, bob, carol):
+        await told(anna, "control", lambda message: message["watching"] == ["bob", "carol"])
+        await bob.close()
+        await told(anna, "control", lambda message: message["watching"] == ["carol"])
+
+
+def test_a_watcher_that_reads_nothing_delays_no_picture_of_the_driver_and_fills_no_memory():
+    @pages("anna", "bob")
+    async def _(station, anna, bob):
+        await told(anna, "control", lambda message: message["holder"] == "you")
+        camera, picture = next(iter(station.page._index)), bytes(40_000)
+        for number in range(500):  # 20 MB, which nothing between the two would hold
+            station.page.show(camera, AccessUnit(picture, None, number / 10, key=number % 20 == 0))
+            while not isinstance(message := (await anna.receive(timeout=60)).data, bytes):
+                pass
+            assert HEADER.unpack_from(message)[3] == number + 1
+        slow = next(viewer for viewer in station.page._windows if viewer.visitor.name == "bob")
+        assert len(slow._queues[0].live) + len(slow._queues[0].burst) <= 20 + 30
+        await bob.send_json({"clock": 1})  # it is still there, and up to date once it reads
+        newest = 0
+        while not newest >= 490:
+            message = await bob.receive(timeout=60)
+            newest = HEADER.unpack_from(message.data)[5] / 100 if isinstance(message.data, bytes) else newest
+
+
+def test_a_watcher_opens_no_more_windows_than_a_person_looks_at(monkeypatch):
+    monkeypatch.setattr("runner.page.server.WATCHER_WINDOWS", 1)
+    with pytest.raises(aiohttp.WSServerHandshakeError, match="429"):
+        pages("bob", "anna", "anna", "bob")(None)
+
+
+def test_a_watcher_whose_line_is_removed_is_disconnected_and_the_others_stay():
+    people = dict(PEOPLE)
+
+    @pages("bob", "carol", login=PageLogin(lambda: people))
+    async def _(_station, bob, carol):
+        await told(bob, "control")
+        del people["bob"]
+        while (await bob.receive(timeout=60)).type is not aiohttp.WSMsgType.CLOSE:
+            pass
+        await carol.send_json({"clock": 1})
+        await told(carol, "clock")
 
 
 def test_connections_without_access_replace_each_other_and_close_none_with_access(monkeypatch):
@@ -289,7 +402,7 @@ def test_a_path_outside_the_page_does_not_exist_and_is_reported():
 
 
 def test_wrong_answers_to_the_login_do_not_displace_the_other_notes():
-    notes, login = [], PageLogin(lambda: b"token")
+    notes, login = [], PageLogin(lambda: {"anna": PagePerson(Role.CONTROLLER, b"token")})
     with served(login=login, note=notes.append) as (port, _):
         own = f"Host: localhost:{port}\r\nOrigin: https://localhost:{port}\r\nConnection: close\r\n"
         for _ in range(100):
@@ -716,6 +829,21 @@ def test_a_viewer_that_lags_restarts_and_its_queue_stays_bounded():
         newest[:] = [unit(number)]
         viewer.show(0, newest[0])
     assert sent(viewer) == [(0, KEY | RESTART | CATCH_UP, 0), (0, 0, 200)]
+
+
+def test_a_viewer_that_is_always_behind_still_sees_pictures_and_its_queue_stays_bounded():
+    """It gets a twentieth of what arrives: each burst is out of date before it is sent, but its end is a picture."""
+    newest = [unit(number) for number in range(1, 41)]
+    viewer = PageViewer("me", range(1), lambda camera: [unit(0, key=True), *newest])
+    drawn = 0
+    for number in range(4000):
+        newest[:] = [*newest[1:], unit(number % 256)]
+        viewer.show(0, newest[-1])
+        if number % 20 == 0:
+            drawn += not HEADER.unpack_from(viewer.pop())[1] & CATCH_UP
+        queue = viewer._queues[0]
+        assert len(queue.live) + len(queue.burst) <= 41 + 30
+    assert drawn == 4
 
 
 def test_texts_are_bounded_too():

@@ -11,7 +11,7 @@ from aiohttp import web
 
 from runner.mqtt.messages import read_message
 from runner.page.connections import Connections
-from runner.page.login import COOKIE, PageLogin
+from runner.page.login import COOKIE, OPERATOR, PageLogin, Visitor
 from runner.schema import shortened
 from runner.system.reports import LimitedReports
 
@@ -55,8 +55,9 @@ class Access:
     ) -> None:
         self.login, self._names, self._connections, self._report = login, names, connections, report
 
-    def is_granted(self, request: web.Request) -> bool:
-        return self.login is None or self.login.accepts(request.cookies.get(COOKIE), time.monotonic())
+    def visitor(self, request: web.Request) -> Visitor | None:
+        """Whose request it is; None: this person has no access."""
+        return OPERATOR if self.login is None else self.login.visitor(request.cookies.get(COOKIE), time.monotonic())
 
     @web.middleware
     async def add_headers(self, request: web.Request, handler: Any) -> web.StreamResponse:
@@ -81,7 +82,7 @@ class Access:
         if foreign := self._foreign(request):
             self._report_refusal(request, foreign)
             raise web.HTTPForbidden(text="accepted only from this server's own pages\n")
-        if not self.is_granted(request):
+        if self.visitor(request) is None:
             if request.path.endswith("/"):  # a page, and none of its parts
                 raise web.HTTPSeeOther(f"/login?{request.rel_url.raw_query_string}".rstrip("?"))
             if request.path not in UNPROTECTED:

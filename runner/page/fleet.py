@@ -15,12 +15,12 @@ from aiohttp import ClientError, ClientWebSocketResponse, WSMessage, WSMsgType, 
 from runner.page.access import LOOPBACK, Access
 from runner.page.connections import MAX_BODY, Connections
 from runner.page.documents import Documents, document
-from runner.page.login import PageLogin
+from runner.page.login import PageLogin, people_of
 from runner.page.loop import PageLoop
 from runner.page.relay import RETRY_S, STATION, relay, station_session
 from runner.page.summaries import RELEASE
 from runner.page.tls import PageTls
-from runner.security.keyring import TOKEN, Keyring
+from runner.security.keyring import Keyring
 from runner.settings import Endpoint
 from runner.system.ports import check_port_free
 from runner.system.reports import LimitedReports
@@ -66,7 +66,7 @@ class FleetServer:
         report = LimitedReports(note)
         self._connections = Connections(PageTls(keyring, note) if keyring else None, report)
         self._holder = keyring.watched_holder(note) if keyring else None
-        login = PageLogin(keyring.watched(TOKEN, note).get) if keyring else None
+        login = PageLogin(people_of(keyring, None, note)) if keyring else None
         self._access = Access(login, lambda: self._names, self._connections, report)
         check_port_free(endpoint)
         self._documents, self._page = Documents(), document("index.html")
@@ -136,7 +136,7 @@ class FleetServer:
         vehicle = self._vehicle(request)
         if vehicle.socket is None:
             raise web.HTTPServiceUnavailable(text=f"{vehicle.fault}\n")
-        return await relay(request, vehicle.socket, lambda: self._access.is_granted(request))
+        return await relay(request, vehicle.socket, lambda: self._access.visitor(request) is not None)
 
     def _vehicle(self, request: web.Request) -> Listed:
         name = request.match_info["name"]
@@ -148,7 +148,7 @@ class FleetServer:
         """Send the list whenever it has changed, until the browser leaves or may no longer see it."""
         ws = web.WebSocketResponse(compress=False, heartbeat=1.0)
         await ws.prepare(request)
-        while not ws.closed and self._access.is_granted(request):
+        while not ws.closed and self._access.visitor(request) is not None:
             await ws.send_json({"vehicles": self.rows()})
             with suppress(TimeoutError):
                 await self._on_message(await ws.receive(LIST_S))

@@ -28,7 +28,7 @@ from runner.page.counter import CounterReading, counter_reading
 from runner.page.documents import Documents, document
 from runner.page.history import History
 from runner.page.layouts import Answer, PageLayouts
-from runner.page.login import PageLogin
+from runner.page.login import PageLogin, people_of
 from runner.page.loop import PageLoop
 from runner.page.summaries import summaries
 from runner.page.tls import PageTls
@@ -38,7 +38,7 @@ from runner.records import to_json
 from runner.records.lines import Note
 from runner.records.operator import Sample
 from runner.records.vehicle import Outcome, VehicleState, state_to_json
-from runner.security.keyring import TOKEN, Keyring
+from runner.security.keyring import Keyring
 from runner.settings import Setup
 from runner.system.ports import check_port_free
 from runner.system.reports import LimitedReports
@@ -48,7 +48,11 @@ NOTES = 50  # kept for pages that open later
 REPORTED = tuple(attention.value for attention in Attention if attention is not Attention.ABSENT)  # by pages
 SEND_BUFFER_BYTES = 131_072  # small: a viewer that does not read is noticed here, not megabytes later
 PING_S = 0.5
+WRITE_BUFFER_BYTES = 65_536  # likewise, in front of it
 UNRESPONSIVE_S = 2.0  # a viewer that has not answered a ping for this long is dropped, and reconnects if it is alive
+WATCHER_UNRESPONSIVE_S = 10.0  # likewise of who may only watch, over any link: its pings wait behind its pictures
+WATCHER_WINDOWS = 20  # that one such person may have open
+WATCHER_MESSAGE_S, WATCHER_MESSAGE_BYTES = 0.02, 1024  # between two messages of such a viewer, and of each at most
 CLOSE_TYPES = (WSMsgType.CLOSE, WSMsgType.CLOSING, WSMsgType.CLOSED, WSMsgType.ERROR)
 MAX_MESSAGE_BYTES = 1_048_576  # a longer message closes the connection
 MAY_ASK = (
@@ -89,7 +93,8 @@ class PageServer(Listener):
         report = LimitedReports(station.note)  # of what browsers and others on the network can cause
         self._connections = Connections(PageTls(keyring, station.note) if keyring else None, report)
         self._holder = keyring.watched_holder(station.note) if keyring else None
-        login = PageLogin(keyring.watched(TOKEN, station.note).get) if keyring else None
+        others = setup.page.people
+        login = PageLogin(people_of(keyring, others, station.note)) if keyring and socket is None else None
         self._access = Access(login, lambda: self._names, self._connections, report)
         names = list(vehicle.cameras)
         self._windows = Windows(
@@ -106,6 +111,7 @@ class PageServer(Listener):
         self._recent = [_recent(camera) for camera in vehicle.cameras.values()]
         self._history = History()
         self._notes: deque[Mapping[str, Any]] = deque(maxlen=NOTES)
+        self._turn = asyncio.Lock()
 
     @property
     def url(self) -> str:
@@ -191,22 +197,31 @@ class PageServer(Listener):
         if not 0 < len(token) <= 64 or len(browser) > 64:
             rule = "viewer: must be given, as text of at most 64 characters; browser: at most 64 characters"
             raise web.HTTPBadRequest(text=f"{rule}\n")
+        visitor = self._access.visitor(request)
+        if visitor is None:  # since it was checked
+            raise web.HTTPUnauthorized(text="login required: see /login\n")
+        if not visitor.may_drive and self._windows.count(visitor.name) >= WATCHER_WINDOWS:
+            raise web.HTTPTooManyRequests(text=f"{visitor.name} has {WATCHER_WINDOWS} windows open\n")
         monitor = "show" in request.query
         shown = request.query.get("show", "").split(",")
         cameras = [index for name, index in self._index.items() if name in shown or not monitor]
         connection = request.transport.get_extra_info("socket") if request.transport else None
         if connection is not None:
             connection.setsockopt(SOL_SOCKET, SO_SNDBUF, SEND_BUFFER_BYTES)
-        ws = web.WebSocketResponse(compress=False, max_msg_size=MAX_MESSAGE_BYTES, autoping=False)
+        if isinstance(request.transport, asyncio.WriteTransport):
+            request.transport.set_write_buffer_limits(WRITE_BUFFER_BYTES)
+        most = MAX_MESSAGE_BYTES if visitor.may_drive else WATCHER_MESSAGE_BYTES
+        ws = web.WebSocketResponse(compress=False, max_msg_size=most, autoping=False)
         try:
             await ws.prepare(request)
         except ValueError:  # headers that are not ASCII: the client's fault
             raise web.HTTPBadRequest(text="not a handshake of a WebSocket\n") from None
-        viewer = PageViewer(token, cameras, lambda camera: self._recent[camera].burst(), browser, monitor)
+        viewer = PageViewer(token, cameras, lambda camera: self._recent[camera].burst(), browser, monitor, visitor)
         self._windows.add(viewer)
         self._send_current_state(viewer)
         self._windows.opened(viewer, request.query.get("before"))
-        tasks = [asyncio.create_task(_send(ws, viewer)), asyncio.create_task(_ping(ws, request, self._access))]
+        turn = None if visitor.may_drive else self._turn
+        tasks = [asyncio.create_task(_send(ws, viewer, turn)), asyncio.create_task(_ping(ws, request, self._access))]
         try:
             await self._listen(ws, viewer, request)
         except TimeoutError:
@@ -222,15 +237,20 @@ class PageServer(Listener):
 
         raises  TimeoutError if it makes no progress: pings share the connection with the video and must be answered
         """
-        while (message := await ws.receive(UNRESPONSIVE_S)).type not in CLOSE_TYPES:
+        may_drive = viewer.visitor.may_drive
+        limit_s = UNRESPONSIVE_S if may_drive else WATCHER_UNRESPONSIVE_S
+        while (message := await ws.receive(limit_s)).type not in CLOSE_TYPES:
             if message.type is WSMsgType.PING:
-                await asyncio.wait_for(ws.pong(message.data), UNRESPONSIVE_S)
-            elif message.type in (WSMsgType.TEXT, WSMsgType.BINARY) and self._access.is_granted(request):
+                await asyncio.wait_for(ws.pong(message.data), limit_s)
+            elif message.type in (WSMsgType.TEXT, WSMsgType.BINARY) and self._access.visitor(request):
                 self._on_message(viewer, message.data)
+                if not may_drive:
+                    await asyncio.sleep(WATCHER_MESSAGE_S)
 
     def _send_current_state(self, viewer: PageViewer) -> None:
         introduction = _introduction(self._setup, viewer.cameras)
-        station = {"operator": self._station.identity, "answer_s": self._station.answer_s}
+        who = {"name": viewer.visitor.name, "may_drive": viewer.visitor.may_drive}
+        station = {"operator": self._station.identity, "answer_s": self._station.answer_s, "visitor": who}
         current = {"layout": self._page_layouts.stated(), "selected": viewer.selected or None}
         viewer.post("hello", introduction | station | current)
         viewer.post("link", self._station.link_state._asdict())
@@ -251,13 +271,18 @@ class PageServer(Listener):
                 viewer.post("clock", {"page_ms": page_ms, "server_ms": time.time() * 1000})
             case {"resync": str(name)} if name in self._index:
                 viewer.restart(self._index[name])
+            case {"select": str(name)} if name in self._index:
+                self._windows.select(viewer, name)
+            case {"attention": _} if not viewer.visitor.may_drive:
+                pass  # it counts of drivers only
+            case _ if not viewer.visitor.may_drive:
+                reason = f"{viewer.visitor.name} may only watch"
+                viewer.post("reply", {"id": document.get("id"), "result": "refused", "reason": reason})
             case {"counter": dict(found)} if self._on_counter and (reading := counter_reading(found)):
                 self._on_counter(reading)
             case {"attention": str(word)} if word in REPORTED:
                 viewer.attention, viewer.focused = Attention(word), document.get("focused") is True
                 self._windows.state_control()
-            case {"select": str(name)} if name in self._index:
-                self._windows.select(viewer, name)
             case {"take_control": True} if viewer.monitor:
                 reason = "only a page can take control, not its monitors"
                 viewer.post("reply", {"id": document.get("id"), "result": "refused", "reason": reason})
@@ -311,11 +336,17 @@ def _recent(camera: Camera) -> RecentUnits:
     return RecentUnits(camera.graph.settings.key_interval_s, video_codec(camera.graph))
 
 
-async def _send(ws: web.WebSocketResponse, viewer: PageViewer) -> None:
-    """Send the queued messages, as fast as the viewer accepts them."""
+async def _send(ws: web.WebSocketResponse, viewer: PageViewer, turn: asyncio.Lock | None) -> None:
+    """Send the queued messages, as fast as the viewer accepts them.
+
+    turn  of those who only watch: each pass of the loop encrypts a message for one of them, and does the rest first
+    """
     try:
         while True:
             message = await viewer.next()
+            if turn:
+                async with turn:
+                    await asyncio.sleep(0)
             if isinstance(message, str):
                 await ws.send_str(message)
             else:
@@ -327,7 +358,7 @@ async def _send(ws: web.WebSocketResponse, viewer: PageViewer) -> None:
 async def _ping(ws: web.WebSocketResponse, request: web.Request, access: Access) -> None:
     """Ping a viewer at intervals, as long as it has access; `_listen` notices if it does not answer."""
     try:
-        while access.is_granted(request):
+        while access.visitor(request):
             await asyncio.sleep(PING_S)
             await ws.ping()
         await asyncio.wait_for(ws.close(message=b"log in again"), UNRESPONSIVE_S)

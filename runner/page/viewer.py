@@ -13,11 +13,12 @@ from typing import Any
 
 from runner.core.events import Attention
 from runner.h264.access_unit import AccessUnit
+from runner.page.login import OPERATOR, Visitor
 
 HEADER = struct.Struct("<BBHIdd")  # camera, flags, 0, sequence, captured ms, arrived ms (since 1970)
 KEY, CATCH_UP, RESTART = 1, 2, 4  # flags: a decoder can start here; decode but do not draw; reset the decoder first
 DAMAGED = 8  # flag: the picture shows that packets were lost
-MAX_UNITS = 30  # queued for one camera; a viewer that is further behind restarts from the last IDR
+MAX_UNITS = 30  # queued for one camera; a viewer that is further behind gets a burst in their place
 MAX_TEXTS = 500
 
 Burst = Callable[[int], list[AccessUnit]]  # by camera index: the units that a decoder starting now needs
@@ -31,15 +32,22 @@ class PageViewer:
     burst      returns the units that bring a late decoder up to date; called only when the viewer is ready for them
     browser    random name that all windows of a browser share; "": none given
     monitor    whether it shows some cameras for a page in another window of the same browser
+    visitor    who looks at it
     attention  whether its user can see the pictures; None: not reported yet
     focused    whether its browser's keys reach it
     selected   name of the selected camera; "": none yet
     """
 
     def __init__(
-        self, token: str, cameras: Sequence[int], burst: Burst, browser: str = "", monitor: bool = False
+        self,
+        token: str,
+        cameras: Sequence[int],
+        burst: Burst,
+        browser: str = "",
+        monitor: bool = False,
+        visitor: Visitor = OPERATOR,
     ) -> None:
-        self.token, self.cameras, self.browser, self.monitor = token, cameras, browser, monitor
+        self.token, self.cameras, self.browser, self.monitor, self.visitor = token, cameras, browser, monitor, visitor
         self.attention: Attention | None = None
         self.focused = False
         self.selected = ""
@@ -51,7 +59,11 @@ class PageViewer:
         self._sequence = 0
 
     def post(self, kind: str, message: Mapping[str, Any]) -> None:
-        self._texts.append(json.dumps({"kind": kind, **message}))
+        self.post_text(text_of(kind, message))
+
+    def post_text(self, text: str) -> None:
+        """As `post`, of what `text_of` returns."""
+        self._texts.append(text)
         self._nonempty.set()
 
     def show(self, camera: int, unit: AccessUnit) -> None:
@@ -60,10 +72,13 @@ class PageViewer:
         if queue is None:
             return
         self._nonempty.set()
-        if queue.needs_burst:
-            return  # the burst will include it
+        if queue.needs_burst or queue.is_behind:
+            return  # a burst will include it
         queue.live.append(unit)
-        if len(queue.live) > MAX_UNITS:
+        if len(queue.live) > MAX_UNITS and queue.burst:
+            queue.live.clear()
+            queue.is_behind = True  # it first gets the picture at the end of this burst, or would never see any
+        elif len(queue.live) > MAX_UNITS:
             self.restart(camera)
 
     def restart(self, camera: int) -> None:
@@ -85,6 +100,8 @@ class PageViewer:
             return self._texts.popleft()
         for _ in self.cameras:
             camera, self._next = self.cameras[self._next], (self._next + 1) % len(self.cameras)
+            if self._queues[camera].is_behind and not self._queues[camera].burst:
+                self._queues[camera] = _CameraQueue()
             queue = self._queues[camera]
             if queue.needs_burst:
                 self._catch_up(camera, queue)
@@ -116,10 +133,17 @@ class PageViewer:
 class _CameraQueue:
     """Units of one camera: whether a burst is due, the rest of that burst, and the units received since.
 
+    is_behind  whether units were dropped while the burst is sent: another one follows
     is_mixed  whether the viewer's decoder started too late to show the whole picture, see `AccessUnit.whole`
     """
 
     needs_burst: bool = True
     burst: deque[tuple[int, AccessUnit]] = field(default_factory=deque)
     live: deque[AccessUnit] = field(default_factory=deque)
+    is_behind: bool = False
     is_mixed: bool = False
+
+
+def text_of(kind: str, message: Mapping[str, Any]) -> str:
+    """A message for pages."""
+    return json.dumps({"kind": kind, **message})

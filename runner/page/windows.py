@@ -8,7 +8,7 @@ from typing import Any
 
 from runner.core.events import Attention
 from runner.page.control import Control, combined_attention, page_of
-from runner.page.viewer import PageViewer
+from runner.page.viewer import PageViewer, text_of
 
 
 class Windows:
@@ -27,7 +27,12 @@ class Windows:
         self._on_attention, self._on_shown = on_attention, on_shown
 
     def __iter__(self) -> Iterator[PageViewer]:
-        return iter(self._viewers)
+        """Those that may drive first: nobody who watches delays their pictures."""
+        return iter(sorted(self._viewers, key=lambda viewer: not viewer.visitor.may_drive))
+
+    def count(self, name: str) -> int:
+        """How many a visitor has open."""
+        return sum(viewer.visitor.name == name for viewer in self._viewers)
 
     def add(self, viewer: PageViewer) -> None:
         """A window connects; it does not know its page's selection yet."""
@@ -36,7 +41,7 @@ class Windows:
 
     def opened(self, viewer: PageViewer, before: str | None) -> None:
         """It has been told everything. before: as in `Control.on_opened`."""
-        if not viewer.monitor:
+        if not viewer.monitor and viewer.visitor.may_drive:
             self._control.on_opened(viewer.token, time.monotonic(), before)
         self.state_control()
         self._state_shown()
@@ -49,12 +54,14 @@ class Windows:
         self._state_shown()
 
     def broadcast(self, kind: str, message: Mapping[str, Any]) -> None:
+        text = text_of(kind, message)
         for viewer in self._viewers:
-            viewer.post(kind, message)
+            viewer.post_text(text)
 
     def holder_for(self, viewer: PageViewer) -> str:
         """The holder of control from a window's point of view: see `Control`."""
-        return self._control.holder_for(page_of(viewer, self._viewers, self._control))
+        holder = self._control.holder_for(page_of(viewer, self._viewers, self._control))
+        return "another" if holder == "you" and not viewer.visitor.may_drive else holder
 
     def take_control(self, viewer: PageViewer) -> None:
         self._control.take(viewer.token)
@@ -70,8 +77,10 @@ class Windows:
     def state_control(self) -> None:
         """Send each window the holder of control, and whether another window of its page has the focus or is hidden.
 
+        watching   names of those who only watch, for those who may drive
         abandoned  no page acts for the station because the one that did has closed
         """
+        watching = sorted({viewer.visitor.name for viewer in self._viewers if not viewer.visitor.may_drive})
         for viewer in self._viewers:
             others = self._others(viewer)
             elsewhere = any(other.focused for other in others)
@@ -79,7 +88,7 @@ class Windows:
             holder = self.holder_for(viewer)
             abandoned = holder == "nobody" and self._control.is_held
             message = {"holder": holder, "abandoned": abandoned, "elsewhere": elsewhere, "covered": covered}
-            viewer.post("control", message)
+            viewer.post("control", message | ({"watching": watching} if viewer.visitor.may_drive else {}))
         self._on_attention(self._attention())
 
     def _state_shown(self) -> None:

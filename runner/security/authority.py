@@ -14,7 +14,6 @@ import base64
 import fcntl
 import hashlib
 import os
-import re
 import secrets
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -41,7 +40,6 @@ from runner.security.certificates import (
 )
 from runner.system.files import read_file, unfinished
 
-NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")  # as in MQTT topics; 64 is the longest common name of a certificate
 RESERVED = ("authority", "broker", "requests")
 ISSUED, AUTHORITY_KEY, LOCK = "issued.json", "authority.key", ".lock"
 BROKER_SETTINGS = "mosquitto.conf"
@@ -75,7 +73,7 @@ class Wanted(NamedTuple):
 
     def check(self) -> None:
         """raises UserError for a name or a host that no keys can have"""
-        if not NAME.fullmatch(self.name) or (self.name in RESERVED) is not (self.role is Role.BROKER):
+        if not keyring.NAME.fullmatch(self.name) or (self.name in RESERVED) is not (self.role is Role.BROKER):
             rule = f"must be 1 to 64 letters, digits, _ and -, and none of {', '.join(RESERVED)}"
             raise ArgumentError(self.role, repr(self.name), rule)
         if not all(map(is_host, self.hosts)):

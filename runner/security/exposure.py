@@ -129,9 +129,12 @@ def viewer_keyring(setup: Setup) -> Keyring | None:
 def page_keyring(setup: Setup) -> Keyring | None:
     """The keys with which the page is served to other machines; None: it is served on loopback.
 
-    raises  UserError if it would be served elsewhere without keys
+    raises  UserError if it would be served elsewhere without keys, or others may log in where nobody does
     """
     if is_loopback(setup.page.host):
+        if setup.page.people is not None:
+            rule = f"must be null while page.host is {setup.page.host}: there nobody logs in"
+            raise ArgumentError("page.people", setup.page.people, rule)
         return None
     if setup.keys is None:
         rule = (

@@ -18,6 +18,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import hmac
+import re
 import ssl
 import threading
 import time
@@ -39,6 +40,7 @@ AUTHORITY, CERTIFICATE, KEY, SECRET, HOLDER = "ca.crt", "own.crt", "own.key", "o
 REVOKED, PEOPLE, HOLDERS = "crl.pem", "people.json", "holders.json"
 PASSPHRASE, MEDIA_SECRET, TOKEN = "srt.passphrase", "media.secret", "page.token"
 PUBLIC = (AUTHORITY, CERTIFICATE, HOLDER, REVOKED, HOLDERS)  # others may read these
+NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")  # of a holder: as in MQTT topics, and at most a certificate's common name
 MOST_BYTES = 1_000_000  # of a file
 CHECK_S = 1.0  # between two checks of a file for changes
 

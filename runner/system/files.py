@@ -179,14 +179,17 @@ def read_credentials(path: Path) -> tuple[str, str]:
     return user, password
 
 
-def write_whole(path: Path, content: bytes) -> None:
+def write_whole(path: Path, content: bytes, *, secret: bool = False) -> None:
     """Write a file atomically.
 
+    secret  only its owner may ever read it
     raises  RunError
     """
     with os_errors_as(lambda why: RunError(f"{path}: cannot be written: {why}")):
         path.parent.mkdir(parents=True, exist_ok=True)
         with unfinished(path) as part:
+            if secret:
+                part.touch(0o600, exist_ok=False)
             part.write_bytes(content)
 
 

@@ -44,7 +44,7 @@ SIMULATED = (
 )
 OF_SIMULATED = {"bursts": ("true", "false"), "control": ("true", "false")}
 HOLDERS = ("vehicle", "controller", "supervisor", "watcher", "predictor", "positioner", "broker")
-KEYS = ("output", *HOLDERS, "host", "rotate", "revoke", "ca", "signed", "crl", "rules", "prefix")
+KEYS = ("output", "people", *HOLDERS, "host", "rotate", "revoke", "ca", "signed", "crl", "rules", "prefix")
 VERBS = {
     "print": Verb(
         "print pipelines and decisions without starting them",

@@ -2,6 +2,7 @@
                               [predictor=NAME] [positioner=NAME] [broker=HOST] [host=HOST[,HOST...]]
                               [rotate=NAME] [revoke=NAME]
                               [ca=FILE] [signed=FILE[,FILE...]] [crl=FILE] [rules=true] [prefix=TOPIC]
+       tod-runner keys people=FILE [watcher=NAME] [controller=NAME] [rotate=NAME] [revoke=NAME]
 
 Creates the keys that vehicles, operators and the broker need to communicate over a network: a certificate authority in
 DIR/authority, the broker's files in DIR/broker, and DIR/NAME for everyone else. Copy each directory unchanged to its
@@ -24,11 +25,15 @@ revocation list, if it has one.
 rules=true prints the rules that a broker needs which these keys do not set up, in words and in mosquitto's form;
 prefix=acme/tod is what topics begin with there, as control.prefix of both sides.
 
+people=FILE is for the page of one operator (page.people), and needs no keys: it draws a token for each person who may
+log in there. A watcher only looks, a controller may take control of the page. Each line of FILE is NAME ROLE TOKEN.
+
   tod-runner keys output=keys vehicle=tum_q7 host=10.0.0.2 controller=alice broker=10.0.0.1
   tod-runner keys output=keys watcher=bob
   tod-runner keys output=keys revoke=bob
   tod-runner keys output=keys                      list what was issued
   tod-runner keys output=keys rules=true
+  tod-runner keys people=page.people watcher=carol
 """
 
 from __future__ import annotations
@@ -37,7 +42,7 @@ import re
 from datetime import datetime
 from pathlib import Path
 
-from runner.core.roles import PEOPLE, Role
+from runner.core.roles import PEOPLE, VIEWERS, Role
 from runner.errors import ArgumentError
 from runner.security.authority import Authority, Issued, Wanted
 from runner.security.broker_files import foreign_rules
@@ -50,6 +55,8 @@ PREFIX_FORM = re.compile(r"[A-Za-z0-9._-]+(/[A-Za-z0-9._-]+)*")  # as in schemas
 
 
 def run(arguments: Arguments) -> int:
+    if file := arguments.path("people"):
+        return _change_people(file, arguments)
     output = arguments.given_path("output", "the directory for all keys")
     values = arguments.values
     wanted = _wanted(arguments)
@@ -68,6 +75,21 @@ def run(arguments: Arguments) -> int:
         print(f"copy to their machines: {', '.join(f'{output}/{name}' for name in to_copy)}")
     if asked:
         print(f"to be signed: {', '.join(map(str, asked))}; then give signed=FILE[,FILE...]")
+    return 0
+
+
+def _change_people(file: Path, arguments: Arguments) -> int:
+    """Those who may log in at a page."""
+    from runner.security.page_people import change_people
+
+    values = arguments.values
+    actions = {action: values.get(action) for action in ("rotate", "revoke")}
+    if others := values.keys() - {"people", *VIEWERS, *actions}:
+        raise ArgumentError("people", str(file), f"must come without {', '.join(sorted(others))}: for output=DIR")
+    people = change_people(file, {values[role]: role for role in VIEWERS if role in values}, **actions)
+    for name, person in people.items():
+        print(f"{person.role:11}{name}")
+    print(f"tokens: in {file}; each is for one person")
     return 0
 
 

@@ -25,6 +25,7 @@ from browser import (
     loaded,
     measure,
     opened,
+    send,
     shot,
     sized,
     take_control,
@@ -40,9 +41,11 @@ from runner.core import events
 from runner.core.decision import Believed
 from runner.core.events import parse
 from runner.core.model import plain
+from runner.core.roles import Role
 from runner.core.step import start, step
 from runner.h264.access_unit import read_unit
 from runner.operator.station import LinkState
+from runner.page.login import Visitor
 from runner.page.server import PageServer
 from runner.page.viewer import PageViewer
 from runner.records.decisions import UplinkDecision
@@ -727,6 +730,54 @@ def has_wide_figures(page, view):
         return re.fullmatch(r"1[23]\d\d ± 1\d\d ms", page.inner_text("#worst"))
     captions = page.locator(".caption .form").all_inner_texts()
     return captions and all(re.search(r" 1[23]\d\d ± 1\d\d ms · 12345 lost", each) for each in captions)
+
+
+NO_PLACE = "one viewer per camera: media.max_viewers; anna watches"
+
+
+def test_refused_pictures_say_why_and_are_no_failure(chromium, picture):
+    """The station of an operator who does not drive gets none of the vehicle's uplink."""
+    with served(picture, None) as (server, station), opened(chromium, server.url) as page:
+        controlling(page)
+        server.on_state(replace(station.state, operator="bert"))  # who drives
+        server.silent.update(CAMERAS)
+        sample = wide(station.state.cameras)
+        refused = {name: replace(camera, refused=NO_PLACE) for name, camera in sample.cameras.items()}
+        server.sample = replace(sample, cameras=refused)
+        for view in ("configure", "drive"):
+            viewing(page, view)
+            until(lambda: page.locator(".tile[data-status=refused]").count() == len(CAMERAS))
+            assert {text.strip() for text in page.locator(".tile .refused").all_inner_texts()} == {NO_PLACE}
+            assert page.locator(".tile .refused:visible").count() == len(CAMERAS)
+            assert "REFUSED" not in page.inner_text("#alarms")
+            assert boxes(page)[1] == FITS, view
+            shot(page, f"refused-{view}")
+
+
+def test_a_watchers_page_requests_nothing_and_the_drivers_page_says_who_watches(chromium, picture, monkeypatch):
+    with served(picture, None) as (server, station), opened(chromium, server.url) as driver:
+        controlling(driver)
+        monkeypatch.setattr("runner.page.access.OPERATOR", Visitor("carol_from_the_control_room", Role.WATCHER))
+        with opened(chromium, server.url) as page:
+            all_live(page)
+            assert page.inner_text("#watching") == "Watching as carol_from_the_control_room"
+            assert not page.locator("#take-control").is_visible()
+            page.keyboard.press("t")
+            until(lambda: "you may only watch" in page.inner_text("#toasts"))
+            assert send(page, event="mode_selected", mode="single") == {
+                "result": "refused",
+                "reason": "carol_from_the_control_room may only watch",
+            }
+            for view in ("configure", "drive"):
+                viewing(page, view)
+                assert not page.locator("#drive-control").is_visible()
+                assert boxes(page)[1] == FITS, view
+                shot(page, f"watcher-{view}")
+            until(lambda: driver.inner_text("#watching") == "1 watching")
+            assert driver.get_attribute("#watching", "title") == "carol_from_the_control_room"
+            shot(driver, "watched")
+        until(lambda: not driver.locator("#watching").is_visible())
+        assert station.requests == []
 
 
 def test_eight_lost_pictures_are_named_in_full(chromium, picture):

@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { beforeEach, test } from "node:test";
 
-import { alertStatus, camera, decisionOf, dropOldSample, enlarge, inControl, listen, mode, note, onStationMessage, remind, select, store } from "../../runner/page/static/store.js";
+import { alertStatus, camera, decisionOf, dropOldSample, enlarge, inControl, listen, mode, note, onlyWatches, onStationMessage, remind, select, store } from "../../runner/page/static/store.js";
 
 const HELLO = { kind: "hello", vehicle: "robot", cameras: [{ name: "front" }, { name: "rear" }] };
 const STATE = { kind: "state", online: true, mode: "single", cameras: { front: { kbps: 500 } } };
@@ -80,6 +80,24 @@ test("a pause alerts the driver unless nobody drives, or the camera has no weigh
   onStationMessage(state("single"));
   assert.deepEqual(alerts(), ["paused", "paused"]);
   assert.equal(alertStatus("front", "lost"), "lost");
+});
+
+test("refused pictures alert whoever has control of the vehicle, and nobody else", () => {
+  onStationMessage({ ...HELLO, operator: "anna", visitor: { name: "anna", may_drive: true } });
+  onStationMessage({ ...STATE, operator: "anna" });
+  assert.equal(alertStatus("front", "refused"), "off"); // this page has no control
+  store.connected = true;
+  onStationMessage({ kind: "control", holder: "you" });
+  assert.equal(alertStatus("front", "refused"), "refused");
+  onStationMessage({ ...STATE, operator: "bob" });
+  assert.equal(alertStatus("front", "refused"), "off");
+});
+
+test("a visitor who may only watch is known by the hello", () => {
+  onStationMessage({ ...HELLO, visitor: { name: "bob", may_drive: false } });
+  assert.ok(onlyWatches());
+  onStationMessage({ ...HELLO, visitor: { name: "", may_drive: true } });
+  assert.ok(!onlyWatches());
 });
 
 test("a driver is reminded until something is settled, or control is gone; others are not", () => {

@@ -174,7 +174,7 @@ function refreshHead(now) {
   on.disabled = Boolean(whyNot());
   on.title = whyNot() ?? withKey("switch this camera on or off", "switch");
   setText(on, requested ? (requested.event.on ? "on…" : "off…") : now?.on ? "on" : now ? "off" : "–");
-  setText(reason, [EXPLAINED.includes(word) ? store.refused[name()] : "", now?.reason || "–"].filter(Boolean).join(" "));
+  setText(reason, [EXPLAINED.includes(word) ? store.refused[name()] : "", now?.reason || "–"].filter(Boolean).join(" · "));
 }
 
 function refreshSettings(info, now) {

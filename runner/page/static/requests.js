@@ -3,7 +3,7 @@
  * of a request; a control is shown as pending until its request is answered.
  */
 
-import { inControl, listen, note, publish, store, who } from "./store.js";
+import { inControl, listen, note, onlyWatches, publish, store, who } from "./store.js";
 import { withKey } from "./hints.js";
 import { send } from "./link.js";
 
@@ -48,6 +48,7 @@ export function pending(control) {
 /** Why this page's person cannot change what is sent, and what they can do. */
 export function whyNoControl() {
   if (!store.connected) return store.hung ? "the page's worker does not respond" : "no connection to the station";
+  if (onlyWatches()) return "you may only watch";
   const [holder, ask] = [store.driving?.holder, withKey("request control", "control")];
   switch (who()) {
     case "another":

@@ -34,9 +34,9 @@ let sampledAt = -Infinity; // page time of the last sample
  * @property {number} b_full_kbps
  * @typedef {{vehicle: string, cameras: Camera[], layout: Layout, selected: string|null,
  *   dimensions: import("./guides.js").Dimensions|null, inputs: Inputs, operator: string, answer_s: number,
- *   late_ms: number}} Hello
- * selected: in another window of this page; operator: this station's; answer_s: the station
- *   answers a request within this time; late_ms: a picture older than this is late
+ *   late_ms: number, visitor: {name: string, may_drive: boolean}}} Hello
+ * visitor: who has logged in, "" on the station's own machine; selected: in another window of this page; operator: this
+ *   station's; answer_s: the station answers a request within this time; late_ms: a picture older than this is late
  * @typedef {{keys: Record<string, string|null>, buttons: Record<string, number|string|null>}} Inputs by action
  * @typedef {{places: Places, own: Places, drive: import("./placing.js").Places|null, problem: string|null}} Layout of the Configure
  *   view: places in force, and the vehicle's own; saved places of the Drive view; and why a layout cannot be saved
@@ -62,6 +62,7 @@ let sampledAt = -Infinity; // page time of the last sample
  * @property {Sample|null} sample null: none yet, or none for a second
  * @property {Link} link
  * @property {string} holder which of the station's pages acts for it: you, another or nobody; unknown: not told since it connected
+ * @property {string[]} watching
  * @property {boolean} abandoned
  * @property {boolean} elsewhere
  * @property {boolean} covered
@@ -88,6 +89,7 @@ export const store = {
   sample: null,
   link: { fault: null, expiring: [] },
   holder: "unknown",
+  watching: [], // names of those who only watch, on a page that may drive
   abandoned: false, // whether no page acts for the station because the one that did has closed
   elsewhere: false, // whether another window of this page has the keyboard focus
   covered: false, // whether another window of this page is hidden
@@ -144,8 +146,8 @@ export function onStationMessage(message) {
   if (store.selected !== selected) publish("selected", store.selected); // by a hello: another window has selected it meanwhile
 }
 
-function onControl({ holder, abandoned, elsewhere, covered }) {
-  Object.assign(store, { holder, abandoned, elsewhere, covered });
+function onControl({ holder, abandoned, elsewhere, covered, watching = [] }) {
+  Object.assign(store, { holder, abandoned, elsewhere, covered, watching });
   forgetReminders();
 }
 
@@ -203,6 +205,8 @@ export function whyUndecided(name) {
   return decisionOf(name) ? "" : `The vehicle has no camera ${name}.`;
 }
 export const mode = () => (store.state?.online ? store.state.mode : null);
+/** Whether this page's visitor may only watch. */
+export const onlyWatches = () => store.hello?.visitor.may_drive === false;
 
 /** What this page knows of who drives. @returns {import("./driving.js").View} */
 export function driverView() {
