@@ -16,7 +16,7 @@ function sample(time, more = {}) {
 }
 
 beforeEach(() => {
-  Object.assign(store, { hello: null, state: null, sample: null, selected: null, enlarged: null, connected: true, holder: "nobody" });
+  Object.assign(store, { hello: null, state: null, driving: null, sample: null, selected: null, enlarged: null, connected: true, holder: "nobody" });
   onStationMessage(HELLO);
   published.length = 0;
 });

@@ -224,7 +224,7 @@ export const inControl = () => who() === "you";
  * @param {string} name  @param {string|undefined} status of its picture
  */
 export function alertStatus(name, status = store.status[name]) {
-  if (status === "refused") return inControl() && !otherOperator() ? status : "off";
+  if (status === "refused") return inControl() ? status : "off";
   const isUnshared = mode() !== "single" && decisionOf(name)?.weight === 0;
   return status === "paused" && (UNDRIVEN.includes(who()) || isUnshared) ? "off" : status;
 }
