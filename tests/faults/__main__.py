@@ -100,6 +100,7 @@ FAULTS = [
         "missing = [view for view in dict.fromkeys(views) if True or not",
         "test_synthetic",
     ),
+    Fault("page/server.py", "case _ if not viewer.visitor.may_drive:", "case _ if False:", "test_page_parts"),
     Fault("page/viewer.py", "if len(queue.live) > MAX_UNITS:", "if False:", "test_page_parts"),
     Fault(
         "page/control.py",
