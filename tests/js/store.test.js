@@ -104,6 +104,7 @@ test("a driver is reminded until something is settled, or control is gone; other
   const reminded = () => [...store.reminders.values()];
   remind("gamepad", "gone");
   assert.deepEqual(reminded(), []);
+  onStationMessage(STATE);
   onStationMessage({ kind: "control", holder: "you" });
   for (const key of ["gamepad", "monitor"]) remind(key, `${key} gone`);
   remind("gamepad", null);
@@ -113,6 +114,7 @@ test("a driver is reminded until something is settled, or control is gone; other
 });
 
 test("control requires a connection", () => {
+  onStationMessage(STATE);
   onStationMessage({ kind: "control", holder: "you" });
   assert.equal(inControl(), true);
   store.connected = false;
