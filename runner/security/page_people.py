@@ -11,13 +11,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from runner.core.roles import VIEWERS, Role
+from runner.core.roles import Role
 from runner.errors import ArgumentError, UserError
 from runner.security.keyring import NAME
 from runner.system.files import exposure, read_file, write_whole
 
 MOST_BYTES = 100_000
 LEAST_TOKEN = 32  # characters; what `tod-runner keys` draws has 43
+ROLES = (Role.CONTROLLER, Role.WATCHER)
 HEAD = "# who may log in at the page: name, role, token"
 RULE = "must be 1 to 64 letters, digits, _ and -"
 
@@ -72,7 +73,7 @@ def _problem(words: list[str], before: Mapping[str, PagePerson]) -> str | None:
     rules = (
         (not NAME.fullmatch(name), f"the name {RULE}"),
         (name in before, f"{name} has a line already"),
-        (role not in VIEWERS, f"the role of {name} must be {' or '.join(VIEWERS)}"),
+        (role not in ROLES, f"the role of {name} must be {' or '.join(ROLES)}"),
         (len(token) < LEAST_TOKEN, f"the token of {name} must have at least {LEAST_TOKEN} characters"),
         (token.encode() in {other.token for other in before.values()}, f"the token of {name} is another one's, too"),
     )
