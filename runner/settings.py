@@ -309,13 +309,27 @@ class Dimensions:
             raise ModelError("track_m", f"{self.track_m:g}", rule, "width_m")
 
 
+@dataclass(frozen=True, slots=True)
+class LogSettings:
+    """What is logged of a drive, and which drives stay.
+
+    video      whether that holds the video of every camera
+    keep_gb    what the drives of `drives=DIR` may take, 10^9 bytes; None: any size
+    keep_days  age from which they are removed; None: none
+    """
+
+    video: bool = False
+    keep_gb: float | None = None
+    keep_days: float | None = None
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Setup:
     """A vehicle, and the settings of its run.
 
     recording   how `record` stores the frames of every camera
     expires_s   age from which the vehicle drops a request, in addition to the round trip
-    log_video   whether the log of a drive holds the video of every camera
+    log         what is logged, and which drives stay
     latency     limit of the speed by latency
     keys        directory made for this side by `tod-runner keys`; None: nothing is encrypted or authenticated
     insecure    whether that is intended although video or control leave this machine
@@ -334,7 +348,7 @@ class Setup:
     page: PageSettings
     recording: Recording
     expires_s: float
-    log_video: bool = False
+    log: LogSettings = LogSettings()
     latency: LatencyLimit = LatencyLimit()
     keys: str | None = None
     insecure: bool = False

@@ -22,6 +22,7 @@ Rate = Annotated[Kbps, Limits(0)]
 Latitude = Annotated[float, Limits(-90, 90)]
 Longitude = Annotated[float, Limits(-180, 180)]
 Steering = Annotated[float, Limits(-1.5, 1.5)]
+BACK_S = 60.0  # of a marked moment that does not state how long ago it began
 CameraName = Annotated[str, Limits(1), "name of a camera of the vehicle"]
 Asker = Annotated[str, Limits(1), "its id; the vehicle takes it from the topic of the request"]
 
@@ -119,6 +120,13 @@ class WeightsSet(_Event):
     """
 
     weights: Annotated[Mapping[str, Annotated[Fraction, Limits(0)]], Limits(1)]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MomentMarked(_Event):
+    """Somebody marks what has just happened: the drive is to be kept. It changes nothing else."""
+
+    back_s: Annotated[NonNegative, "how long ago it began, s"] = BACK_S
 
 
 class LinkState(StrEnum):
@@ -321,6 +329,7 @@ Event = (
     | RoiSet
     | CameraConfigured
     | WeightsSet
+    | MomentMarked
     | LinkMeasured
     | CopiesCounted
     | SourceReported

@@ -19,7 +19,7 @@ class Role(StrEnum):
 
 PRESENCE = frozenset({"operator_connected", "operator_disconnected"})
 DRIVER_EVENTS = frozenset(
-    {"mode_selected", "total_set", "camera_switched", "roi_set", "camera_configured", "weights_set"}
+    {"mode_selected", "total_set", "camera_switched", "roi_set", "camera_configured", "weights_set", "moment_marked"}
 )
 CONTROL_EVENTS = frozenset({"control_requested", "control_offered", "control_accepted", "control_released"})
 MAY_REQUEST: dict[Role, frozenset[str]] = {

@@ -165,6 +165,8 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
             return _driving(state, event)
         case ev.ControlAccepted():
             return _driving(state, event, {name for name, setting in in_force.settings.items() if setting.sending})
+        case ev.MomentMarked():
+            return {}
         case _:
             assert_never(event)
 

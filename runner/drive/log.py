@@ -19,7 +19,7 @@ from typing import Any
 
 from msgspec import UNSET, UnsetType
 
-from runner.core.events import Event, describe, to_json
+from runner.core.events import Event, MomentMarked, describe, to_json
 from runner.core.step import Run
 from runner.errors import ArgumentError, RunError, UserError, reason
 from runner.records import Json
@@ -43,6 +43,7 @@ from runner.redact import redacted
 FORMAT = 2
 WITHOUT_LOG = "the drive continues without its log"
 FILES = {"vehicle": "drive.jsonl", "operator": "operator.jsonl", "link": "link.jsonl"}  # by side
+PROTECTED = "protected"  # file in the directory of a drive that is not to be removed, with the reasons
 QUEUED_LINES = 10_000  # more than two minutes of a vehicle with eight cameras
 QUEUED_BYTES = 64_000_000  # reports of others are logged, too, each up to 64 kB long
 # Records of numbers and the rules' own texts; redacting a decision takes twenty times as long as making it.
@@ -129,8 +130,45 @@ class Log:
     def on_step(self, before: Run, event: Event, after: Run) -> None:
         """Write an event, and the decision if it changed; raises as `event`."""
         self.event(event)
+        if isinstance(event, MomentMarked):
+            self.protect_soon(event.t, event.back_s)
         if after.commands or after.decision != before.decision:
             self.record(DecisionMade.of(after.state.t, describe(event), after.decision, after.commands))
+
+    def protect_soon(self, t: float, back_s: float) -> None:
+        """Protect this drive since a moment was marked, in a thread of its own: a slow disk blocks nobody."""
+
+        def protect() -> None:
+            said = f"{t:.1f} s: the last {back_s:g} s were marked"
+            why = self.protect(said)
+            self._on_report(
+                f"{said}, but the drive is not protected: {why}" if why else f"{said}, the drive is protected"
+            )
+
+        if self._file and self._past is None:
+            threading.Thread(target=protect, name="protect", daemon=True).start()
+
+    def protect(self, why: str) -> str | None:
+        """Keep this drive from being removed; `why` is a line in its directory.
+
+        returns  why it cannot be protected; None: it is, with what its files hold on the disk
+        """
+        with self._lock:
+            file = self._file if self._began is not None else None
+        if file is None:
+            return "this side logs no drive"
+        try:
+            descriptor = os.open(
+                file.path.with_name(PROTECTED), os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o666
+            )
+            try:
+                os.write(descriptor, f"{why}\n".encode())
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
+        except OSError as error:
+            return reason(error)
+        return file.sync()
 
     def note(self, text: str) -> None:
         """Write a note for the user, with the current time."""

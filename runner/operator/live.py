@@ -293,7 +293,7 @@ def live_operator(
     drive = Log(log, "operator", document if log else {}, versions, station.note)
     if log:
         station.listeners.append(DriveLog(station, drive))
-    video = apply.VideoFiles(log, drive.video, drive.video_shift) if log and setup.log_video else None
+    video = apply.VideoFiles(log, drive.video, drive.video_shift) if log and setup.log.video else None
 
     def publish(camera: str, captured: float | None, width: int, height: int, data: bytes) -> None:
         assert pictures

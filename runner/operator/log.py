@@ -28,6 +28,9 @@ class DriveLog(Listener):
     def on_note(self, note: Note) -> None:
         self._log.note(note.text)
 
+    def on_marked(self, back_s: float) -> None:
+        self._log.protect_soon(self._log.now(), back_s)
+
     def _with_arrivals(self, name: str, camera: CameraSample) -> CameraSample:
         arrivals = tuple(self._arrival(name, *arrival) for arrival in self._station.samples[name].arrivals)
         return replace(camera, arrivals=arrivals)

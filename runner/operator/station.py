@@ -12,7 +12,7 @@ from msgspec import UNSET, UnsetType
 
 from runner.configuration import agreement
 from runner.core.decision import NOTHING
-from runner.core.events import Attention
+from runner.core.events import BACK_S, NAMES, Attention, MomentMarked
 from runner.mqtt.copies import Newest
 from runner.mqtt.link import ControlLink, login_of
 from runner.mqtt.messages import (
@@ -84,6 +84,9 @@ class Listener:
 
     def on_note(self, note: Note) -> None:
         """A message for the operator."""
+
+    def on_marked(self, back_s: float) -> None:
+        """This operator marks the last seconds, whether or not the vehicle hears of it."""
 
     def on_link(self, link: LinkState) -> None:
         """The control link of this side, whenever what there is to say about it changes."""
@@ -206,6 +209,9 @@ class Station:
 
         on_reply  called with its outcome: applied (read back from the elements), refused, expired or timed out
         """
+        if event.get("event") == NAMES[MomentMarked]:
+            for listener in self.listeners:
+                listener.on_marked(float(event.get("back_s", BACK_S)))
         if self.state is None:
             self._requests.refuse(on_reply, self.link.fault or "the vehicle is offline")
         else:

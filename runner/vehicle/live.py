@@ -452,7 +452,7 @@ def live_vehicle(
 
         for found in (*rates, *missing):
             report(found)
-        video = apply.VideoFiles(log, drive.video, drive.video_shift) if log and setup.log_video else None
+        video = apply.VideoFiles(log, drive.video, drive.video_shift) if log and setup.log.video else None
         side = apply.VehicleSide(
             plans,
             setup.media,

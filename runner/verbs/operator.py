@@ -14,6 +14,7 @@ only while somebody looks at them. With drives=DIR those of each vehicle go to D
 
   tod-runner operator                      everything from the vehicle at media.host
   tod-runner operator keys=keys/alice media.host=192.0.2.7 control.host=192.0.2.1 control.port=8883
+  tod-runner operator control.broker=embedded   with a broker of its own, for as long as it runs
   tod-runner operator page.serve=false     the table only
   tod-runner operator vehicles=all         one page for all vehicles
   tod-runner operator ros.pictures=true    with decoded pictures as ROS topics, see docs/ros.md
@@ -52,6 +53,8 @@ def run(arguments: Arguments) -> int:
     streaming()
     if socket := arguments.path("socket"):
         return _run_behind(socket, arguments)
+    from runner.drive.keeping import keeping_room
+
     duration = arguments.number("duration_s")
     sys.setswitchinterval(SWITCH_S)
     with (
@@ -60,7 +63,8 @@ def run(arguments: Arguments) -> int:
     ):
         station = operator.station
         station.listeners.append(table)
-        with _served(operator, arguments.conf) as page:
+        room = keeping_room(arguments.path("drives"), operator.setup.log, station.note)
+        with room, _served(operator, arguments.conf) as page:
             operator.start(page.show if page else None, duration)
             freeze_loaded()
             with stopping(action=operator.end) as stop:
@@ -81,10 +85,15 @@ class _Notes(Listener):
 
 def _run_behind(socket: Path, arguments: Arguments) -> int:
     """Run one of several stations behind the page of a list, see `runner.verbs.fleet`; ends with that process."""
+    from runner.drive.keeping import keeping_room
+
     sys.setswitchinterval(SWITCH_S)
-    with live_operator(arguments.overrides, arguments.conf, log=arguments.drive(), on_demand=True) as operator:
+    with live_operator(
+        arguments.overrides, arguments.conf, log=arguments.drive(), site=arguments.site, on_demand=True
+    ) as operator:
         operator.station.listeners.append(_Notes())
-        with _served(operator, arguments.conf, socket) as page:
+        room = keeping_room(arguments.path("drives"), operator.setup.log, operator.station.note)
+        with room, _served(operator, arguments.conf, socket) as page:
             assert page
             operator.on_dropped = page.forget
             operator.start(page.show)

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import sys
 
+from runner.drive.keeping import keeping_room
 from runner.system.kept import state_directory
 from runner.system.memory import freeze_loaded
 from runner.system.signals import stopping
@@ -42,6 +43,7 @@ def run(arguments: Arguments) -> int:
             progress=progress,
             site=arguments.site,
         ) as vehicle,
+        keeping_room(arguments.path("drives"), vehicle.loop.setup.log, vehicle.loop.on_report),
         stopping(action=vehicle.loop.stop) as stop,
     ):
         if vehicle.loop.track is not None:

@@ -13,7 +13,7 @@ import { toggleStraight } from "./straighten.js";
 import { toggleSound } from "./sound.js";
 import { toggleDrawer, toggleFullScreen, toggleTab, toggleView } from "./views.js";
 import { listMonitors } from "./monitors.js";
-import { showProblem, whyNoControl } from "./requests.js";
+import { request, showProblem, whyNoControl } from "./requests.js";
 import { isEditing } from "./edit.js";
 
 /**
@@ -61,6 +61,7 @@ export const ACTIONS = {
   full_screen: { description: "full screen", run: toggleFullScreen },
   monitors: { description: "pictures in additional windows, for other monitors", run: listMonitors },
   switch: { description: "switch the selected camera on or off", run: () => store.selected && switchCamera(store.selected) },
+  keep: { description: "keep the last 60 s: mark them, and protect the drive that is logged", run: keepMoment },
   full_image: { description: "full image of the selected camera (mode S)", run: sendFull },
   control: { description: "take, request, offer, accept or release control: the first of its buttons", run: toggleControl },
   theme: { description: "night or day theme", run: toggleTheme },
@@ -69,8 +70,14 @@ export const ACTIONS = {
 
 // Only the page shows what these change, so a monitor passes them on to it.
 const OF_PAGE = ["camera_left", "camera_front", "camera_right", "camera_rear", "reverse", "view", "birdseye", "drawer",
-  "map", "monitors", "sound", "full_image", "total_lower", "total_raise"];
+  "map", "monitors", "sound", "full_image", "total_lower", "total_raise", "keep"];
 const channel = new BroadcastChannel(`tod-actions ${location.pathname}`);
+
+const KEPT_S = 60;
+
+function keepMoment() {
+  request("keep", { event: "moment_marked", back_s: KEPT_S }, `keep the last ${KEPT_S} s`);
+}
 
 export function startActions() {
   for (const name of OF_PAGE) passOn(name, () => false);
