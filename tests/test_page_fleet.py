@@ -115,9 +115,11 @@ def test_a_window_waits_for_a_station_that_is_starting(tmp_path: Path) -> None:
 
     async def use(server: FleetServer, session: ClientSession, url: str) -> None:
         server.add("courier", station.socket)
-        ws = await session.ws_connect(f"{url}/vehicle/courier/live?viewer=me")
+        connecting = asyncio.create_task(session.ws_connect(f"{url}/vehicle/courier/live?viewer=me"))
+        await asyncio.sleep(0.3)
+        assert not connecting.done()
         async with station.running():
-            assert await ws.receive_str() == "viewer=me"
+            assert await (await connecting).receive_str() == "viewer=me"
 
     served(use)
 

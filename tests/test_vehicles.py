@@ -80,7 +80,7 @@ def test_what_is_wrong_with_the_vehicles_is_said(tmp_path: Path, text: str, prob
         (["vehicles=a", "vehicle=b"], "vehicles: a: states what vehicle=b does: give one of them"),
         (["vehicles=a", "log=x"], "log: x: is for one vehicle: give drives=DIR"),
         (["vehicles=delivery_robot", "page.serve=false"], "page.serve: false: vehicles= is for the page"),
-        (["vehicles=robbot"], "did you mean"),
+        (["vehicles=robot"], "vehicle: robot: no such file in conf/vehicle/; expected one of delivery_robot"),
     ],
 )
 def test_what_does_not_go_with_several_vehicles_is_refused(words: list[str], problem: str) -> None:
