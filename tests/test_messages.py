@@ -133,3 +133,10 @@ def test_only_utf_8_is_json(payload: bytes) -> None:
 
 def test_pairs_are_one_character() -> None:
     assert read_message(b'{"a": "\\ud83d\\ude00 \xf0\x9f\x98\x80"}') == {"a": "\U0001f600 \U0001f600"}
+
+
+@pytest.mark.parametrize(("key", "value"), [("operator", "alice"), ("role", "supervisor"), ("departure", "signed off")])
+def test_nobody_says_in_a_request_who_it_is(key: str, value: str) -> None:
+    document = {"id": "1", "as_of": 1.0, "event": "control_requested", key: value}
+    request = read_request(MqttMessage("tod/car/request/bob", json.dumps(document).encode(), False))
+    assert request.problem == f"{key}: must not be given, the vehicle takes it from the topic"

@@ -39,6 +39,7 @@ FAULTS = [
         "bisect_right(model.b_min, bitrate)",
         "test_scaling",
     ),
+    Fault("core/driving.py", "or not is_supervisor):", "and not is_supervisor):", "test_driving"),
     Fault("core/evidence.py", "- _gap_s(memory) - held_up_s", "- _gap_s(memory)", "test_sending"),
     Fault("core/follow_link.py", "state.t - link.t < START_S", "True", "test_rules"),
     Fault("core/learned.py", "- self.bias", "", "test_belief"),
