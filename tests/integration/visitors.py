@@ -199,17 +199,24 @@ def page(keys: Path, people: Path, words: Sequence[str]) -> Iterator[Page]:
 
 @contextmanager
 def driver(at: Page, take: Take = lambda captured, arrived: None) -> Iterator[Watcher]:
-    """The page of whoever drives: it has control, and receives every camera. take: as in `Watcher`."""
+    """The page of whoever drives: it has control, and receives every camera. take: as in `Watcher`.
+
+    Like a browser's, it connects again if it was dropped, as on a busy machine.
+    """
     watcher, stopped, loop = Watcher(take), asyncio.Event(), asyncio.new_event_loop()
 
+    async def drive() -> None:
+        while True:
+            async with logged_in(at.url, at.ca, at.token, "driver") as connection:
+                await connection.send_json({"take_control": True})
+                await watcher.receive(connection)
+
     async def look() -> None:
-        async with logged_in(at.url, at.ca, at.token, "driver") as connection:
-            await connection.send_json({"take_control": True})
-            receiving = asyncio.create_task(watcher.receive(connection))
-            await stopped.wait()
-            receiving.cancel()
-            with suppress(asyncio.CancelledError):
-                await receiving
+        driving = asyncio.create_task(drive())
+        await stopped.wait()
+        driving.cancel()
+        with suppress(asyncio.CancelledError):
+            await driving
 
     thread = threading.Thread(target=lambda: loop.run_until_complete(look()))
     thread.start()
