@@ -29,7 +29,6 @@ EXAMPLES: list[dict[str, Any]] = [
     {"t": 0.6, "event": "camera_configured", "camera": "front_left", "kbps": 800, "scaling": 0.25},
     {"t": 0.6, "event": "camera_configured", "camera": "front_left", "scaling": 0.25},
     {"t": 0.7, "event": "weights_set", "weights": {"front_left": 2.5}},
-    {"t": 0.7, "event": "moment_marked"},
     {"t": 0.7, "event": "moment_marked", "back_s": 10},
     {"t": 0.8, **LINK},
     {"t": 0.8, "event": "copies_counted", "copies": {"front_left": 2}},
