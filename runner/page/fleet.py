@@ -18,7 +18,7 @@ from runner.page.documents import Documents, document
 from runner.page.login import PageLogin, people_of
 from runner.page.loop import PageLoop
 from runner.page.relay import RETRY_S, STATION, relay, station_session
-from runner.page.summaries import RELEASE
+from runner.page.summaries import CLOSE_S, RELEASE
 from runner.page.tls import PageTls
 from runner.security.keyring import Keyring
 from runner.settings import Endpoint
@@ -71,6 +71,7 @@ class FleetServer:
         check_port_free(endpoint)
         self._documents, self._page = Documents(), document("index.html")
         self._vehicles: dict[str, Listed] = {}
+        self._lists, self._relayed = set[web.WebSocketResponse](), set[asyncio.Transport]()  # that are open
         self._loop = PageLoop()
 
     @property
@@ -117,6 +118,10 @@ class FleetServer:
         for vehicle in self._vehicles.values():
             if vehicle.task:
                 vehicle.task.cancel()
+        for transport in list(self._relayed):
+            transport.abort()
+        for ws in list(self._lists):
+            await ws.close()
         await self._connections.close()
 
     def _add(self, vehicle: Listed) -> None:
@@ -136,7 +141,13 @@ class FleetServer:
         vehicle = self._vehicle(request)
         if vehicle.socket is None:
             raise web.HTTPServiceUnavailable(text=f"{vehicle.fault}\n")
-        return await relay(request, vehicle.socket, lambda: self._access.visitor(request) is not None)
+        transport = request.transport
+        assert isinstance(transport, asyncio.Transport)
+        self._relayed.add(transport)
+        try:
+            return await relay(request, vehicle.socket, lambda: self._access.visitor(request) is not None)
+        finally:
+            self._relayed.discard(transport)
 
     def _vehicle(self, request: web.Request) -> Listed:
         name = request.match_info["name"]
@@ -146,13 +157,17 @@ class FleetServer:
 
     async def _on_list(self, request: web.Request) -> web.WebSocketResponse:
         """Send the list whenever it has changed, until the browser leaves or may no longer see it."""
-        ws = web.WebSocketResponse(compress=False, heartbeat=1.0)
+        ws = web.WebSocketResponse(compress=False, heartbeat=1.0, timeout=CLOSE_S)
         await ws.prepare(request)
-        while not ws.closed and self._access.visitor(request) is not None:
-            await ws.send_json({"vehicles": self.rows()})
-            with suppress(TimeoutError):
-                await self._on_message(await ws.receive(LIST_S))
-        await ws.close()
+        self._lists.add(ws)
+        try:
+            while not ws.closed and self._access.visitor(request) is not None:
+                await ws.send_json({"vehicles": self.rows()})
+                with suppress(TimeoutError):
+                    await self._on_message(await ws.receive(LIST_S))
+            await ws.close()
+        finally:
+            self._lists.discard(ws)
         return ws
 
     async def _on_message(self, message: WSMessage) -> None:

@@ -30,7 +30,7 @@ from runner.page.history import History
 from runner.page.layouts import Answer, PageLayouts
 from runner.page.login import PageLogin, people_of
 from runner.page.loop import PageLoop
-from runner.page.summaries import summaries
+from runner.page.summaries import Summaries
 from runner.page.tls import PageTls
 from runner.page.viewer import PageViewer
 from runner.page.windows import Windows
@@ -164,7 +164,9 @@ class PageServer(Listener):
         app = web.Application(middlewares=middlewares, client_max_size=MAX_BODY)
         app.router.add_get("/live", self._on_viewer)
         if self._socket:
-            app.router.add_get("/summary", summaries(self._station))
+            summaries = Summaries(self._station)
+            app.router.add_get("/summary", summaries.serve)
+            app.on_shutdown.append(summaries.close)
             return await self._connections.serve(app, self._socket)
         app.router.add_get("/", document("index.html"))
         app.router.add_get("/counter", document("counter.html"))

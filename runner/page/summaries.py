@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable
 from dataclasses import asdict
 
 from aiohttp import WSMsgType, web
@@ -13,22 +12,38 @@ from runner.operator.summary import summary
 from runner.records.vehicle import Outcome
 
 EVERY_S = 0.5
+CLOSE_S = 0.1  # how long the other side may take to answer that it is closed
 RELEASE = "release"  # the other side's only message: release control
 
 
-def summaries(station: Station) -> Callable[[web.Request], Awaitable[web.WebSocketResponse]]:
-    """A handler of WebSockets that sends summaries, and why control was not released, until the other side closes."""
+class Summaries:
+    """Sends summaries, and why control was not released, to each WebSocket until the other side or the page closes."""
 
-    async def serve(request: web.Request) -> web.WebSocketResponse:
-        ws, loop = web.WebSocketResponse(compress=False, heartbeat=1.0), asyncio.get_running_loop()
-        answers = asyncio.Queue[Outcome]()
+    def __init__(self, station: Station) -> None:
+        self._station, self._open = station, set[web.WebSocketResponse]()
+
+    async def serve(self, request: web.Request) -> web.WebSocketResponse:
+        ws = web.WebSocketResponse(compress=False, heartbeat=1.0, timeout=CLOSE_S)
+        await ws.prepare(request)
+        self._open.add(ws)
+        try:
+            await self._talk(ws)
+        finally:
+            self._open.discard(ws)
+        return ws
+
+    async def close(self, _app: web.Application) -> None:
+        for ws in list(self._open):
+            await ws.close()
+
+    async def _talk(self, ws: web.WebSocketResponse) -> None:
+        loop, answers = asyncio.get_running_loop(), asyncio.Queue[Outcome]()
 
         def on_reply(outcome: Outcome) -> None:
             loop.call_soon_threadsafe(answers.put_nowait, outcome)
 
-        await ws.prepare(request)
         while not ws.closed:
-            await ws.send_json(asdict(summary(station)))
+            await ws.send_json(asdict(summary(self._station)))
             while not answers.empty():
                 await ws.send_json({"answer": answers.get_nowait().reason})
             try:
@@ -36,7 +51,4 @@ def summaries(station: Station) -> Callable[[web.Request], Awaitable[web.WebSock
             except TimeoutError:
                 continue
             if message.type is WSMsgType.TEXT and message.data == RELEASE:
-                station.ask({"event": "control_released"}, on_reply)
-        return ws
-
-    return serve
+                self._station.ask({"event": "control_released"}, on_reply)

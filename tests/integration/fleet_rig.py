@@ -139,9 +139,15 @@ def card(page: Any, name: str) -> Any:
     return page.locator(f"article[aria-label={name}]")
 
 
-def live(page: Any) -> int:
-    """How many pictures of the vehicle that is open are live."""
-    return int(page.locator(".tile[data-status=live]").count())
+def live(page: Any, *further: str) -> int:
+    """How many pictures of the vehicle that is open are live, or have a further status."""
+    statuses = ", ".join(f"[data-status={status}]" for status in ("live", *further))
+    return int(page.locator(f".tile:is({statuses})").count())
+
+
+def moving(page: Any) -> int:
+    """Likewise, also those that a busy machine makes late."""
+    return live(page, "late", "damaged")
 
 
 def leave(page: Any, name: str) -> None:

@@ -8,7 +8,7 @@ import signal
 from contextlib import ExitStack
 
 import pytest
-from fleet_rig import NAMES, Programs, await_page, card, leave, live, pids_of, three
+from fleet_rig import NAMES, Programs, await_page, card, leave, moving, pids_of, three
 
 from browser import shot, visit
 from rig import needs_browser, until
@@ -82,7 +82,7 @@ def test_a_picture_on_demand_is_of_one_camera_and_gives_no_control(fleet, page):
     button = card(page, "courier-2").locator("button.watch")
     button.click()
     picture = page.frame_locator("iframe")
-    until(lambda: picture.locator(".tile[data-status=live]").count() == 1, every_s=0.1)
+    until(lambda: picture.locator(".tile:is([data-status=live], [data-status=late])").count() == 1, every_s=0.1)
     until(lambda: heard.encoding("courier-2") == {"front"})
     assert heard.driver("courier-2") is None
     assert picture.locator("body").evaluate("() => document.title") == "front · courier-2 · tod-runner"
@@ -95,16 +95,19 @@ def test_a_picture_on_demand_is_of_one_camera_and_gives_no_control(fleet, page):
 def test_opening_a_vehicle_drives_it_and_switching_ends_its_pictures(fleet, page):
     _, heard = fleet
     card(page, "courier-1").locator("a.open").click()
-    until(lambda: live(page) == 3, every_s=0.1)
+    until(lambda: moving(page) == 3, every_s=0.1)
     until(lambda: heard.driver("courier-1"))
     assert page.title() == "courier-1 · tod-runner"
     assert page.inner_text("#vehicle") == "courier-1"
     card(page, "courier-3").locator("button.watch").click()
-    until(lambda: page.frame_locator("iframe").locator(".tile[data-status=live]").count() == 1, every_s=0.1)
+    until(
+        lambda: page.frame_locator("iframe").locator(".tile:is([data-status=live], [data-status=late])").count() == 1,
+        every_s=0.1,
+    )
     page.keyboard.press("v")
     shot(page, "fleet_drive")
     leave(page, "courier-2")
-    until(lambda: live(page) == 3, every_s=0.1)
+    until(lambda: moving(page) == 3, every_s=0.1)
     until(lambda: heard.encoding("courier-1") == set())
     until(lambda: heard.encoding("courier-3") == {"front"})
     left = card(page, "courier-1")
@@ -119,11 +122,11 @@ def test_opening_a_vehicle_drives_it_and_switching_ends_its_pictures(fleet, page
 def test_a_station_that_crashes_is_started_again(fleet, page):
     programs, _ = fleet
     card(page, "courier-3").locator("a.open").click()
-    until(lambda: live(page) == 3, every_s=0.1)
+    until(lambda: moving(page) == 3, every_s=0.1)
     before = pids_of(programs)
     os.kill(before["courier-3"], signal.SIGKILL)
-    until(lambda: live(page) == 0, every_s=0.05)
-    until(lambda: live(page) == 3, every_s=0.1)
+    until(lambda: moving(page) == 0, every_s=0.05)
+    until(lambda: moving(page) == 3, every_s=0.1)
     after = pids_of(programs)
     assert after["courier-3"] != before["courier-3"]
     assert [after[name] for name in NAMES[:2]] == [before[name] for name in NAMES[:2]]
