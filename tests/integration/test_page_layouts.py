@@ -507,6 +507,22 @@ def test_a_driver_is_warned_if_the_vehicle_has_another_operator_in_control(chrom
         until(lambda: "No measurements from the station" in page.inner_text("#warning"))
 
 
+def test_control_is_offered_to_an_operator_who_has_not_asked(chromium, picture):
+    with served(picture, None) as (server, station), opened(chromium, server.url) as page:
+        controlling(page)
+        assert page.locator("#control button").all_inner_texts() == ["Release"], "nobody else is here"
+        for name, role in (("bob", "controller"), ("eve", "watcher")):
+            station.happens(event="operator_connected", operator=name, role=role)
+        page.click("#control button >> text=Offer …")
+        shot(page, "offer-to")
+        assert page.locator("#takers button").all_inner_texts() == ["bob"], "a watcher may not drive"
+        page.click("#takers button")
+        until(lambda: page.inner_text("#hand-over-words") == "You offer control to bob; you drive until bob accepts")
+        page.keyboard.press("t")
+        until(page.locator("#hand-over").is_hidden)
+        assert [each["to"] for each in station.requests] == ["bob", ""]
+
+
 def test_a_driver_is_alerted_to_a_picture_lost_in_a_monitor_only(chromium, picture, monkeypatch):
     withheld, show = set(), PageViewer.show
 

@@ -184,14 +184,14 @@ function showButtons(group, choices, keyed, id) {
     return make("button", {
       id: i === 0 && id, class: isMain(choice) && "strong", title: why ?? (choice === keyed ? withKey(text, "control") : text),
       "aria-disabled": why && "true", "data-pending": requested === text.toLowerCase(), onclick: () => choose(choice),
-    }, text);
+    }, choice === keyed && choice.isAnswer ? withKey(text, "control") : text);
   });
   byId(group).replaceChildren(...buttons);
   buttons[focused]?.focus({ preventScroll: true });
 }
 
 /** Whether a button is what its person most likely wants next. @param {Choice} choice */
-const isMain = ({ text, takers, from }) => !["Release", "Decline"].includes(text) && !takers && from !== "operator";
+const isMain = ({ text, why, takers, from }) => !why && !["Release", "Decline"].includes(text) && !takers && from !== "operator";
 
 export function startControl() {
   confirmed.addEventListener("close", onConfirmed);

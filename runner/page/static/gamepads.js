@@ -8,7 +8,7 @@ import { reportProblem } from "./requests.js";
 
 const POLL_MS = 15;
 /** @type {Record<string, string[]>} by dialog, the actions whose buttons close it; the list of keys shows which button is pressed */
-const CLOSING = { help: ["help"], confirm: ["back", "control"], monitors: ["back", "monitors"] };
+const CLOSING = { help: ["help"], confirm: ["back", "control"], "offer-to": ["back", "control"], monitors: ["back", "monitors"] };
 const EFFECTS = {
   lost: { duration: 600, strongMagnitude: 1, weakMagnitude: 1 },
   late: { duration: 200, strongMagnitude: 0.3, weakMagnitude: 0.6 },

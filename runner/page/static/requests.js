@@ -3,7 +3,7 @@
  * of a request; a control is shown as pending until its request is answered.
  */
 
-import { inControl, listen, note, onlyWatches, publish, store, who } from "./store.js";
+import { driverView, inControl, listen, note, onlyWatches, publish, store, who } from "./store.js";
 import { withKey } from "./hints.js";
 import { send } from "./link.js";
 
@@ -49,14 +49,14 @@ export function pending(control) {
 export function whyNoControl() {
   if (!store.connected) return store.hung ? "the page's worker does not respond" : "no connection to the station";
   if (onlyWatches()) return "you may only watch";
-  const [holder, ask] = [store.driving?.holder, withKey("request control", "control")];
+  const { driving } = store;
   switch (who()) {
     case "another":
       return "another page holds control";
     case "operator":
-      return `operator ${holder} is in control; ${ask}`;
+      return `operator ${driving?.holder} is in control; ${whatToDo()}`;
     case "lost":
-      return `operator ${holder} was in control and is lost; ${ask}`;
+      return `operator ${driving?.holder} was in control and is lost; ${whatToDo()}`;
     case "unheard":
       return "the vehicle receives nothing from this station";
     case "unknown":
@@ -64,6 +64,13 @@ export function whyNoControl() {
     default:
       return store.view === "monitor" ? "the page of this monitor does not hold control" : withKey("take control first", "control");
   }
+}
+
+/** How this page's operator gets control from another one. */
+function whatToDo() {
+  const { driving, own } = driverView();
+  if (driving?.offered === own) return withKey("accept control", "control");
+  return driving?.requested.includes(own) ? "you have asked for control" : withKey("request control", "control");
 }
 
 /** Show a problem in a toast. */

@@ -20,7 +20,7 @@ const buttons = ["sound", "sound-configure"].map((id) => byId(id));
 /** @type {AudioContext|null} */
 let context = null;
 let wasBlocked = true; // whether the browser blocked sound when the last press began
-let isDriving = false; // whether this page has control; kept while the connection is lost, when tones matter most
+let isDriving = false; // whether this page has control; kept while a connection is lost, when tones matter most
 
 const isMuted = () => localStorage.getItem(KEY) === "yes";
 
@@ -80,7 +80,7 @@ function onStatus(picture, camera, status) {
 
 function onControl() {
   const before = isDriving;
-  isDriving = who() === "you" || (isDriving && who() === "unknown");
+  isDriving = who() === "you" || (isDriving && ["unknown", "unheard"].includes(who()));
   unlock();
   if (isDriving && !before) soundCurrent();
   refresh();
