@@ -241,6 +241,7 @@ EXAMPLES: tuple[dict[str, Any], ...] = (
     {"event": "roi_set", "camera": "front", "x": 0, "y": 0, "width": 320, "height": 240},
     {"event": "camera_configured", "camera": "front", "kbps": 800},
     {"event": "weights_set", "weights": {"front": 2.5}},
+    {"event": "moment_marked", "back_s": 10},
     {"event": "link_measured", "kbps": 780},
     {"event": "copies_counted", "copies": {"front": 2}},
     {"event": "source_reported", "camera": "front", "works": False, "reason": "no such device"},

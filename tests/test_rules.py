@@ -351,6 +351,7 @@ EVENTS: dict[str, dict[str, st.SearchStrategy[Any]]] = {
         **dict.fromkeys(("width", "height"), st.sampled_from([16, 240])),
     },
     "camera_configured": {**FRONT_LEFT, **KBPS, "scaling": st.sampled_from([0.125, 0.5])},
+    "moment_marked": {"back_s": st.sampled_from([0, 60])},
     "weights_set": {"weights": st.dictionaries(st.sampled_from(list(TUM.cameras)), st.sampled_from([0, 0.5, 3]))},
     "link_measured": {
         **KBPS,
