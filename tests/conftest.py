@@ -7,7 +7,7 @@ import os
 import tempfile
 import uuid
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -48,10 +48,18 @@ def pytest_warning_recorded(warning_message: warnings.WarningMessage) -> None:
         warning_message.message = RuntimeWarning(f"GLib: {warning_message.message}")
 
 
+@pytest.fixture(scope="session", autouse=True)
+def nothing_of_this_user(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """For what several tests share, too."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TOD_SITE", "")
+        patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+        yield
+
+
 @pytest.fixture(autouse=True)
 def clean_environment(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> None:
     monkeypatch.delenv("TOD_CONF", raising=False)
-    monkeypatch.setenv("TOD_SITE", "")
     monkeypatch.setenv("XDG_CACHE_HOME", str(shared_cache(tmp_path_factory)))
     monkeypatch.setenv("GST_REGISTRY", str(REGISTRY))
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path_factory.getbasetemp() / f"state-{uuid.uuid4().hex}"))

@@ -18,6 +18,8 @@ from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from msgspec import UNSET
+
 from runner.configuration import agreement
 from runner.configuration.config import configuration
 from runner.core.evidence import REPORT_S
@@ -80,7 +82,7 @@ class LiveOperator:
         self._requests = deque(requests)
         self._failure: RunError | None = None
         self._sampled = time.monotonic()
-        self._in_control: object = None  # the operator, as of the last sample
+        self._drivers: Sequence[str] = ()  # whom the vehicle sends pictures first, as of the last sample
         self._late = LateCheck(2.5 * REPORT_S)
         self._thread = threading.Thread(target=self._run, name="sampling", daemon=True)
         self._reporting = threading.Thread(target=self._report, name="reporting", daemon=True)
@@ -207,9 +209,10 @@ class LiveOperator:
             self._follow(self._demand)
         if addresses := self.station.addresses:
             side.admit(addresses)
-        state = self.station.state
-        before, self._in_control = self._in_control, state.operator if state else None
-        samples = side.sample(self.station.sending(), anew=self._in_control != before)
+        state = self.station.state  # another thread may replace it
+        driving = state.driving if state else UNSET
+        before, self._drivers = self._drivers, () if driving is UNSET else driving.drivers
+        samples = side.sample(self.station.sending(), anew=self._drivers != before)
         self.station.take(samples, side.received())
         self._sampled = time.monotonic()
         notify("WATCHDOG=1")

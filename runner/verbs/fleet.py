@@ -15,6 +15,7 @@ from typing import Any
 from runner.configuration.config import configuration
 from runner.configuration.yaml_file import label, load_file
 from runner.errors import ArgumentError, ConfigError, Problem
+from runner.mqtt.embedded import embedded_broker
 from runner.mqtt.link import ControlLink, login_of
 from runner.mqtt.messages import MqttMessage, is_online, topic
 from runner.page.fleet import FleetServer
@@ -53,7 +54,8 @@ class Fleet:
     def add(self, name: str, own: Words) -> None:
         """Add a vehicle with overrides of its own."""
         socket = self._directory / str(len(self._stations))  # short: a socket's name has 107 bytes at most
-        words = [*own, *self._arguments.overrides, f"socket={socket}"]
+        # All share a broker that this side starts.
+        words = [*own, *self._arguments.overrides, "control.broker=null", f"socket={socket}"]
         words += [f"conf={self._arguments.conf}"] if self._arguments.conf else []
         drives = self._arguments.path("drives")
         words += [f"drives={drives / name}"] if drives else []
@@ -111,6 +113,8 @@ def run(arguments: Arguments) -> int:
         page = FleetServer(setup.page.endpoint, page_keyring(setup), say)
         page.start()
         stack.callback(page.stop)
+        if setup.control.embedded:
+            stack.enter_context(embedded_broker(setup, say))
         fleet = Fleet(arguments, page, directory)
         stack.enter_context(fleet.running())
         for name, words in (given or {}).items():
@@ -207,7 +211,7 @@ def _composed(arguments: Arguments, vehicles: Mapping[str, Words] | None) -> Set
             problems += [problem for problem in error.problems if problem not in problems]
     if problems:
         raise ConfigError(problems)
-    setup = setups[0] if setups else configuration(arguments.overrides, arguments.conf, runnable=False).setup()
+    setup = setups[0] if setups else _composed_of(arguments, ())
     if not setup.page.serve:
         raise ArgumentError("page.serve", "false", "vehicles= is for the page")
     ports = [each.metrics.operator_port for each in setups if each.metrics.operator_port]
@@ -224,11 +228,16 @@ def setup_of(arguments: Arguments, name: str, words: Words) -> Setup:
 
     raises  ConfigError, also if its file describes a vehicle of another name
     """
-    setup = configuration([*words, *arguments.overrides], arguments.conf, runnable=False).setup()
+    setup = _composed_of(arguments, words)
     if setup.vehicle.name != name:
         rule = f"must be {name}, as its file is named: the page and the broker know the vehicle by it"
         raise ConfigError([Problem(f"vehicle={name}", "name", repr(setup.vehicle.name), rule)])
     return setup
+
+
+def _composed_of(arguments: Arguments, own: Words) -> Setup:
+    words = (*own, *arguments.overrides)
+    return configuration(words, arguments.conf, runnable=False, site=arguments.site).setup()
 
 
 def _add(fleet: Fleet, arguments: Arguments, name: str) -> None:
