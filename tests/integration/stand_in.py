@@ -100,7 +100,7 @@ class RecordingOperator:
     def __init__(self, plans: Sequence[Plan], *_: Any, **__: Any) -> None:
         self._received = {plan.camera.name: Reception() for plan in plans}
 
-    def sample(self, sending: Mapping[str, bool]) -> dict[str, Reception]:
+    def sample(self, sending: Mapping[str, bool], anew: bool = False) -> dict[str, Reception]:
         for name, received in self._received.items():
             frames = received.frames + (FRAMES if sending.get(name) else 0)
             size = (640, 480) if frames else (0, 0)

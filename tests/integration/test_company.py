@@ -130,8 +130,8 @@ def test_a_company_s_broker_and_authority_carry_a_drive_and_nobody_acts_for_anot
             alice.station.ask({"event": "operator_connected"}, answers.append)
             assert until(lambda: answers[1:])[0].result == "applied"
             assert alice.station.state.mode == "collective"
-            until(lambda: alice.station._telemetry.refused > 1)
-            assert alice.station._telemetry.refused == 2  # bob's own: those in alice's name have not come
+            until(lambda: alice.station.telemetry.refused > 1)
+            assert alice.station.telemetry.refused == 2  # bob's own: those in alice's name have not come
 
 
 def test_other_certificates_of_the_company_bring_no_pictures(company, keys, tmp_path):

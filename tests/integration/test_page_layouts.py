@@ -584,14 +584,14 @@ def test_a_driver_is_alerted_to_a_monitor_that_crashed(chromium, picture):
 
 
 def test_keys_act_on_the_cameras_after_a_button_was_clicked(chromium, picture):
-    remapped = ("inputs.keys.view=x", "inputs.keys.theme=null", "inputs.keys.camera_3=k")
+    remapped = ("inputs.keys.view=x", "inputs.keys.theme=null", "inputs.keys.camera_3=j")
     with served(picture, None, *remapped) as (server, _), opened(chromium, server.url) as page:
         all_live(page)
         controlling(page)
         assert page.inner_text("#offer-drive") == "Drive view (x)"
         titles = [page.get_attribute(f"#{name}", "title") for name in ("to-drive", "theme", "take-control")]
         assert titles == ["Drive view: pictures first (x)", "Day or night", "Release (t)"]
-        for key, camera in (("k", "mast"), ("ArrowDown", "rear"), ("1", "front"), ("3", "front")):
+        for key, camera in (("j", "mast"), ("ArrowDown", "rear"), ("1", "front"), ("3", "front")):
             page.keyboard.press(key)
             assert page.evaluate("tod.selected") == camera, key
         page.dblclick("[data-camera=mast] .picture")
@@ -755,7 +755,8 @@ def test_refused_pictures_say_why_and_are_no_failure(chromium, picture):
     """The station of an operator who does not drive gets none of the vehicle's uplink."""
     with served(picture, None) as (server, station), opened(chromium, server.url) as page:
         controlling(page)
-        server.on_state(replace(station.state, operator="bert"))  # who drives
+        driving = replace(station.state.driving, holder="bert")
+        server.on_state(replace(station.state, operator="bert", driving=driving))
         server.silent.update(CAMERAS)
         sample = wide(station.state.cameras)
         refused = {name: replace(camera, refused=NO_PLACE) for name, camera in sample.cameras.items()}

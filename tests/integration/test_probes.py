@@ -208,7 +208,7 @@ def made(monkeypatch):
 def test_attempts_to_reach_a_vehicle_that_is_away_make_no_callback(stored, made, monkeypatch, tmp_path):
     starts = Counter()
     monkeypatch.setattr(supervised, "RETRY_S", 0.05)
-    monkeypatch.setattr(SupervisedPipeline, "start", counting(starts, "start", SupervisedPipeline.start))
+    monkeypatch.setattr(SupervisedPipeline, "_build", counting(starts, "start", SupervisedPipeline._build))
     words = [*SMALL_ROBOT, f"media.port={free_port()}", f"log.video={str(stored).lower()}"]
     setup = configuration(words, runnable=False).setup()
     files = VideoFiles(tmp_path, lambda *_: None, lambda *_: None) if stored else None

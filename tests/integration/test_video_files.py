@@ -182,8 +182,8 @@ def test_an_existing_file_is_never_overwritten(sides, tmp_path):
 
 
 def test_an_operator_without_a_vehicle_leaves_no_files(tmp_path, monkeypatch):
-    starts, start = Counter(), SupervisedPipeline.start
-    monkeypatch.setattr(SupervisedPipeline, "start", lambda self: (starts.update([self]), start(self)))
+    starts, build = Counter(), SupervisedPipeline._build
+    monkeypatch.setattr(SupervisedPipeline, "_build", lambda self: (starts.update([self]), build(self)))
     sides = Sides(tmp_path)
     sides.stop()
     with sides.receiving():

@@ -1,6 +1,6 @@
 /** Who drives, and the buttons by which operators pass control on. */
 
-import { decisionOf, driverView, inControl, listen, publish, store, who } from "./store.js";
+import { decisionOf, driverView, inControl, listen, onlyWatches, publish, store, who } from "./store.js";
 import { pending, reportProblem, showProblem, submit, whyNoControl } from "./requests.js";
 import { send } from "./link.js";
 import { withKey } from "./hints.js";
@@ -89,6 +89,7 @@ export function controlWarning() {
 /** The first button, by its key. */
 export function toggleControl() {
   if (!store.connected) return;
+  if (onlyWatches()) return showProblem(whyNoControl());
   if (store.view === "monitor") return showProblem("only the page can take or release control, not its monitors");
   const [first] = choicesOf(view());
   choose(first);
