@@ -72,14 +72,9 @@ def drive(tmp_path_factory):
             running.wait(timeout=20)
 
     with (
-        ExitStack() as ending,
         private_broker(broker, keys / "broker"),
-        process(
-            "vehicle",
-            *words,
-            f"keys={keys / 'delivery_robot'}",
-            stdout=subprocess.DEVNULL,
-        ),
+        process("vehicle", *words, f"keys={keys / 'delivery_robot'}", stdout=subprocess.DEVNULL),
+        ExitStack() as ending,
     ):
         positioner = Positioner(Operator(broker, keys=keys / "gps"))
         ending.callback(positioner.close)
