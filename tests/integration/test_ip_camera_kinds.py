@@ -280,7 +280,16 @@ def chosen_decoder(after, behind="identity"):
     """
     from runner.gst import Gst
 
+    def always(name, direction, caps):
+        return Gst.PadTemplate.new(name, direction, Gst.PadPresence.ALWAYS, Gst.Caps.from_string(caps))
+
     class Decoder(Gst.Bin):
+        __gstmetadata__ = ("Vendor's decoder", "Codec/Decoder/Video", "Decodes H.264", "Vendor")
+        __gsttemplates__ = (
+            always("sink", Gst.PadDirection.SINK, "video/x-h264,stream-format=avc,alignment=au"),
+            always("src", Gst.PadDirection.SRC, "video/x-raw(ANY)"),
+        )
+
         def __init__(self):
             super().__init__()
             self.passed = 0
@@ -294,13 +303,6 @@ def chosen_decoder(after, behind="identity"):
             self.passed += 1
             return Gst.PadProbeReturn.OK if self.passed <= after else Gst.PadProbeReturn.DROP
 
-    Decoder.set_metadata("Vendor's decoder", "Codec/Decoder/Video", "Decodes H.264", "Vendor")
-    for name, direction, caps in (
-        ("sink", Gst.PadDirection.SINK, "video/x-h264,stream-format=avc,alignment=au"),
-        ("src", Gst.PadDirection.SRC, "video/x-raw(ANY)"),
-    ):
-        template = Gst.PadTemplate.new(name, direction, Gst.PadPresence.ALWAYS, Gst.Caps.from_string(caps))
-        Decoder.add_pad_template(template)
     assert Gst.Element.register(None, "vendordec", Gst.Rank.NONE, Decoder)
     factory = Gst.ElementFactory.find("vendordec")
     factory.set_rank(Gst.Rank.PRIMARY + 1000)  # an element that is registered again keeps its rank
