@@ -14,17 +14,18 @@ LOOK_S = 0.02
 CAPS = "video/x-raw,format=I420,width=16,height=16,framerate={}"
 
 
-def passed(pictures: Iterable[tuple[float, float]], fps: str = "10/1") -> list[float]:
+def passed(pictures: Iterable[tuple[float, float]], fps: str = "10/1", above: str = "videoscale") -> list[float]:
     """When pictures pass a videorate that holds a rate, looked at 50 times a second.
 
     pictures  when each arrives, and its own time, s
+    above     the element in front of it
     """
     from runner.gst import Gst
     from runner.gst.rate_limit import RateLimits
 
     caps = CAPS.format("40/1")
     line = (
-        f"( appsrc name=source format=time caps={caps} ! videoscale ! videorate drop-only=true skip-to-first=true"
+        f"( appsrc name=source format=time caps={caps} ! {above} ! videorate drop-only=true skip-to-first=true"
         f" ! {CAPS.format(fps)} ! appsink name=sink sync=false )"
     )
     pipeline = Gst.parse_launch(line)
@@ -73,9 +74,10 @@ GAPS = {
 }
 
 
+@pytest.mark.parametrize("above", ["videoscale", "decodebin"])  # the latter is linked once it has a pad
 @pytest.mark.parametrize("pictures", GAPS.values(), ids=GAPS)
-def test_after_a_gap_no_second_has_more_pictures_than_the_rate(pictures):
-    came = passed(pictures)
+def test_after_a_gap_no_second_has_more_pictures_than_the_rate(pictures, above):
+    came = passed(pictures, above=above)
     busiest = max(sum(begin <= at < begin + 1 for at in came) for begin in came)
     assert busiest <= 12, came
     last = pictures[-1][0]

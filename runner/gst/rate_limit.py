@@ -26,8 +26,7 @@ class RateLimit:
 
     def __init__(self, rate: Gst.Element, fps: float) -> None:
         self._rate, self._fps = rate, fps
-        self._above = rate.get_static_pad("sink").get_peer()
-        self._above.add_probe(Gst.PadProbeType.EVENT_DOWNSTREAM, _on_event)
+        rate.get_static_pad("sink").add_probe(Gst.PadProbeType.EVENT_DOWNSTREAM, _on_event)
         self._passed, self._passed_at = 0, 0.0
         self._allowance = Allowance()
 
@@ -43,7 +42,9 @@ class RateLimit:
             self._passed_at = now
 
     def _begin_anew(self) -> None:
-        self._above.set_offset(self._above.get_offset() ^ 1)
+        above = self._rate.get_static_pad("sink").get_peer()
+        if above:
+            above.set_offset(above.get_offset() ^ 1)
 
 
 class RateLimits:
@@ -66,8 +67,8 @@ class RateLimits:
 
 def _on_event(pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
     event = info.get_event()
-    if event.type == Gst.EventType.SEGMENT:
-        later = event.parse_segment().copy()
+    if event.type == Gst.EventType.SEGMENT and (segment := event.parse_segment()).base != LATER:
+        later = segment.copy()
         later.base = LATER
-        pad.get_peer().send_event(Gst.Event.new_segment(later))
+        pad.send_event(Gst.Event.new_segment(later))
     return Gst.PadProbeReturn.OK
