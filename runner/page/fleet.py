@@ -12,18 +12,14 @@ from typing import Any
 
 from aiohttp import ClientError, ClientWebSocketResponse, WSMessage, WSMsgType, web
 
-from runner.page.access import LOOPBACK, Access
-from runner.page.connections import MAX_BODY, Connections
 from runner.page.documents import Documents, document
-from runner.page.login import PageLogin, people_of
+from runner.page.front import Front
 from runner.page.loop import PageLoop
 from runner.page.relay import RETRY_S, STATION, relay, station_session
 from runner.page.summaries import CLOSE_S, RELEASE
-from runner.page.tls import PageTls
 from runner.security.keyring import Keyring
 from runner.settings import Endpoint
 from runner.system.ports import check_port_free
-from runner.system.reports import LimitedReports
 
 LIST_S = 0.25  # between two lists to a browser
 SILENT_S = 2.0  # a station that sends no summary for this long does not respond; it sends two a second
@@ -62,12 +58,7 @@ class FleetServer:
     """
 
     def __init__(self, endpoint: Endpoint, keyring: Keyring | None, note: Callable[[str], None]) -> None:
-        self._endpoint = endpoint
-        report = LimitedReports(note)
-        self._connections = Connections(PageTls(keyring, note) if keyring else None, report)
-        self._holder = keyring.watched_holder(note) if keyring else None
-        login = PageLogin(people_of(keyring, None, note)) if keyring else None
-        self._access = Access(login, lambda: self._names, self._connections, report)
+        self._endpoint, self._front = endpoint, Front(endpoint, keyring, None, note)
         check_port_free(endpoint)
         self._documents, self._page = Documents(), document("index.html")
         self._vehicles: dict[str, Listed] = {}
@@ -76,13 +67,7 @@ class FleetServer:
 
     @property
     def url(self) -> str:
-        if self._holder is None:
-            return f"http://{self._endpoint}/"
-        return f"https://{Endpoint(next(iter(self._names), self._endpoint.host), self._endpoint.port)}/"
-
-    @property
-    def _names(self) -> tuple[str, ...]:
-        return self._holder.get().hosts if self._holder else (*LOOPBACK, self._endpoint.host)
+        return self._front.url
 
     def start(self) -> None:
         self._loop.start(self._start())
@@ -105,14 +90,13 @@ class FleetServer:
     # --- in the page's thread -----------------------------------------------------------------------------------------
 
     async def _start(self) -> None:
-        middlewares = [self._connections.on_request_complete, self._access.add_headers, self._access.check]
-        app = web.Application(middlewares=middlewares, client_max_size=MAX_BODY)
+        app = self._front.application()
         app.router.add_get("/", document("fleet.html"))
         app.router.add_get("/list", self._on_list)
         app.router.add_get("/vehicle/{name}/", self._on_page)
         app.router.add_get("/vehicle/{name}/live", self._on_live)
-        self._documents.add_to(app, self._access)
-        await self._connections.serve(app, self._endpoint)
+        self._documents.add_to(app, self._front.access)
+        await self._front.connections.serve(app, self._endpoint)
 
     async def _stop(self) -> None:
         for vehicle in self._vehicles.values():
@@ -122,7 +106,7 @@ class FleetServer:
             transport.abort()
         for ws in list(self._lists):
             await ws.close()
-        await self._connections.close()
+        await self._front.connections.close()
 
     def _add(self, vehicle: Listed) -> None:
         self._vehicles[vehicle.name] = vehicle
@@ -145,7 +129,7 @@ class FleetServer:
         assert isinstance(transport, asyncio.Transport)
         self._relayed.add(transport)
         try:
-            return await relay(request, vehicle.socket, lambda: self._access.visitor(request) is not None)
+            return await relay(request, vehicle.socket, lambda: self._front.access.visitor(request) is not None)
         finally:
             self._relayed.discard(transport)
 
@@ -161,7 +145,7 @@ class FleetServer:
         await ws.prepare(request)
         self._lists.add(ws)
         try:
-            while not ws.closed and self._access.visitor(request) is not None:
+            while not ws.closed and self._front.access.visitor(request) is not None:
                 await ws.send_json({"vehicles": self.rows()})
                 with suppress(TimeoutError):
                     await self._on_message(await ws.receive(LIST_S))

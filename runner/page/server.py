@@ -6,7 +6,7 @@ import asyncio
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from socket import SO_SNDBUF, SOL_SOCKET
 from typing import Any
@@ -22,16 +22,15 @@ from runner.graph import video_codec
 from runner.h264.access_unit import AccessUnit, RecentUnits
 from runner.mqtt.messages import read_message
 from runner.operator.station import LinkState, Listener, Station
-from runner.page.access import LOOPBACK, Access
-from runner.page.connections import MAX_BODY, Connections, abort
+from runner.page.access import Access
+from runner.page.connections import abort
 from runner.page.counter import CounterReading, counter_reading
 from runner.page.documents import Documents, document
+from runner.page.front import Front
 from runner.page.history import History
 from runner.page.layouts import Answer, PageLayouts
-from runner.page.login import PageLogin, people_of
 from runner.page.loop import PageLoop
 from runner.page.summaries import Summaries
-from runner.page.tls import PageTls
 from runner.page.viewer import PageViewer
 from runner.page.windows import Windows
 from runner.records import to_json
@@ -41,7 +40,6 @@ from runner.records.vehicle import Outcome, VehicleState, state_to_json
 from runner.security.keyring import Keyring
 from runner.settings import Setup
 from runner.system.ports import check_port_free
-from runner.system.reports import LimitedReports
 
 FROZEN_MS = 120  # a picture that is frozen for this long is marked within 150 ms
 NOTES = 50  # kept for pages that open later
@@ -90,12 +88,7 @@ class PageServer(Listener):
         self._vehicle = vehicle = setup.vehicle
         self._loop = PageLoop()
         self._call_soon = self._loop.call_soon
-        report = LimitedReports(station.note)  # of what browsers and others on the network can cause
-        self._connections = Connections(PageTls(keyring, station.note) if keyring else None, report)
-        self._holder = keyring.watched_holder(station.note) if keyring else None
-        others = setup.page.people
-        login = PageLogin(people_of(keyring, others, station.note)) if keyring and socket is None else None
-        self._access = Access(login, lambda: self._names, self._connections, report)
+        self._front = Front(setup.page.endpoint, keyring, setup.page.people, station.note)
         names = list(vehicle.cameras)
         self._windows = Windows(
             self._on_attention, lambda shown, is_open: on_shown([names[index] for index in shown], is_open)
@@ -115,15 +108,7 @@ class PageServer(Listener):
 
     @property
     def url(self) -> str:
-        endpoint = self._setup.page.endpoint
-        if self._holder is None:
-            return f"http://{endpoint}/"
-        return f"https://{replace(endpoint, host=next(iter(self._names), endpoint.host))}/"
-
-    @property
-    def _names(self) -> tuple[str, ...]:
-        """Addresses and names at which browsers reach the page."""
-        return self._holder.get().hosts if self._holder else (*LOOPBACK, self._setup.page.host)
+        return self._front.url
 
     def start(self) -> None:
         self._loop.start(self._start())
@@ -131,7 +116,7 @@ class PageServer(Listener):
             self._station.note(note)
 
     def stop(self) -> None:
-        self._loop.stop(self._connections.close())
+        self._loop.stop(self._front.connections.close())
 
     def on_state(self, state: VehicleState | None) -> None:
         self._call_soon(self._windows.broadcast, "state", _stated(state, self._station))
@@ -159,19 +144,17 @@ class PageServer(Listener):
     # --- in the page's thread -----------------------------------------------------------------------------------------
 
     async def _start(self) -> None:
-        check = self._connections.grant_all if self._socket else self._access.check
-        middlewares = [self._connections.on_request_complete, self._access.add_headers, check]
-        app = web.Application(middlewares=middlewares, client_max_size=MAX_BODY)
+        app = self._front.application(self._front.connections.grant_all if self._socket else None)
         app.router.add_get("/live", self._on_viewer)
         if self._socket:
             summaries = Summaries(self._station)
             app.router.add_get("/summary", summaries.serve)
             app.on_shutdown.append(summaries.close)
-            return await self._connections.serve(app, self._socket)
+            return await self._front.connections.serve(app, self._socket)
         app.router.add_get("/", document("index.html"))
         app.router.add_get("/counter", document("counter.html"))
-        self._documents.add_to(app, self._access)
-        return await self._connections.serve(app, self._setup.page.endpoint)
+        self._documents.add_to(app, self._front.access)
+        return await self._front.connections.serve(app, self._setup.page.endpoint)
 
     def _on_attention(self, attention: Attention | None) -> None:
         self._station.attention = attention
@@ -199,7 +182,7 @@ class PageServer(Listener):
         if not 0 < len(token) <= 64 or len(browser) > 64:
             rule = "viewer: must be given, as text of at most 64 characters; browser: at most 64 characters"
             raise web.HTTPBadRequest(text=f"{rule}\n")
-        visitor = self._access.visitor(request)
+        visitor = self._front.access.visitor(request)
         if visitor is None:  # since it was checked
             raise web.HTTPUnauthorized(text="login required: see /login\n")
         if not visitor.may_drive and self._windows.count(visitor.name) >= WATCHER_WINDOWS:
@@ -223,7 +206,10 @@ class PageServer(Listener):
         self._send_current_state(viewer)
         self._windows.opened(viewer, request.query.get("before"))
         turn = None if visitor.may_drive else self._turn
-        tasks = [asyncio.create_task(_send(ws, viewer, turn)), asyncio.create_task(_ping(ws, request, self._access))]
+        tasks = [
+            asyncio.create_task(_send(ws, viewer, turn)),
+            asyncio.create_task(_ping(ws, request, self._front.access)),
+        ]
         try:
             await self._listen(ws, viewer, request)
         except TimeoutError:
@@ -244,7 +230,7 @@ class PageServer(Listener):
         while (message := await ws.receive(limit_s)).type not in CLOSE_TYPES:
             if message.type is WSMsgType.PING:
                 await asyncio.wait_for(ws.pong(message.data), limit_s)
-            elif message.type in (WSMsgType.TEXT, WSMsgType.BINARY) and self._access.visitor(request):
+            elif message.type in (WSMsgType.TEXT, WSMsgType.BINARY) and self._front.access.visitor(request):
                 self._on_message(viewer, message.data)
                 if not may_drive:
                     await asyncio.sleep(WATCHER_MESSAGE_S)
