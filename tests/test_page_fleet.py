@@ -165,7 +165,7 @@ def test_pages_of_vehicles_that_are_listed(path: str, status: int) -> None:
 )
 def test_nothing_is_shown_before_login(monkeypatch: pytest.MonkeyPatch, path: str, status: int) -> None:
     login = PageLogin(lambda: b"token")
-    monkeypatch.setattr("runner.page.fleet.Access", lambda _none, *rest: Access(login, *rest))
+    monkeypatch.setattr("runner.page.front.Access", lambda _none, *rest: Access(login, *rest))
 
     async def use(server: FleetServer, session: ClientSession, url: str) -> None:
         async with session.get(url + path, allow_redirects=False) as answer:

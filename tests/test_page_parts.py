@@ -78,7 +78,7 @@ def served(*overrides, layouts=None, login=None, keyring=None, note=print):
     station = SimpleNamespace(state=None, note=note, **told)
     with pytest.MonkeyPatch.context() as patch:
         if login:
-            patch.setattr("runner.page.server.Access", lambda _none, *rest: Access(login, *rest))
+            patch.setattr("runner.page.front.Access", lambda _none, *rest: Access(login, *rest))
         page = PageServer(setup(f"page.port={port}", *overrides), station, layouts=layouts, keyring=keyring)
         station.latency, station.page = SimpleNamespace(captured=lambda camera, captured: captured), page
         patch.setattr("runner.page.server.UNRESPONSIVE_S", 60)
