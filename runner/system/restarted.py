@@ -14,6 +14,7 @@ from runner.system.children import VerbProcess, ending
 
 BACKOFF_S = (0.5, 30.0)  # between two starts, at first and at most
 STEADY_S = 10.0  # one that has run for so long is started again at once
+LAST_S = 0.5  # how long its last lines may take to arrive after it has ended; a child of its own may hold the pipe
 
 
 class RestartedProcess:
@@ -29,6 +30,7 @@ class RestartedProcess:
         self._failures = 0
         self._due = self._started = float("-inf")
         self._last = deque[str](maxlen=2)  # lines of its output: why it failed
+        self._reading = threading.Thread()
         self.fault: str | None = None  # how it ended, until it runs again
 
     def look(self, now: float) -> None:
@@ -44,6 +46,7 @@ class RestartedProcess:
             return
         self._process.request_end()
         self._process = None
+        self._reading.join(LAST_S)
         pause = pause_s(self._failures, *BACKOFF_S)
         self._failures, self._due = self._failures + 1, now + pause
         why = f": {'; '.join(self._last)}" if status > 0 and self._last else ""
@@ -68,7 +71,8 @@ class RestartedProcess:
             self._process = VerbProcess(self.name, self._verb, self._words, stderr=stderr)
         self._started, self.fault = now, None
         self._last.clear()
-        threading.Thread(target=self._read, args=(read,), name=f"output of {self.name}", daemon=True).start()
+        self._reading = threading.Thread(target=self._read, args=(read,), name=f"output of {self.name}", daemon=True)
+        self._reading.start()
 
     def _read(self, descriptor: int) -> None:
         with suppress(OSError), os.fdopen(descriptor, errors="replace") as lines:
