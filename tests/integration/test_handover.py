@@ -210,7 +210,8 @@ def test_a_station_that_dies_in_the_middle_leaves_control_with_the_other(site: S
 
         again = site.operator("bob")
         until(lambda: again.name in alice.of("driving")[-1]["present"])
-        assert alice.ask("control_offered", to=again.name) == ("applied", "")
+        # On a busy machine a station that starts may be silent for a second once more.
+        until(lambda: alice.ask("control_offered", to=again.name) == ("applied", ""))
         until(again.sees)
         alice.kill()
         until(lambda: again.driving() == f"lost by {alice.name}, offered to {again.name}")
