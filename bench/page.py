@@ -85,7 +85,7 @@ def measure(
     browser: Browser, what: str, count: int, video: tuple[int, int, int], kbps: int, seconds: float
 ) -> Iterator[Row]:
     """Drive a vehicle of equal cameras and measure its page."""
-    with _vehicle(count, video, kbps) as words:
+    with vehicle(count, video, kbps) as words:
         rounds = [_round(browser, words, seconds / ROUNDS) for _ in range(ROUNDS)]
     cameras = [frames for one in rounds for frames in one.frames]
     for number, stage in enumerate(STAGES):
@@ -103,7 +103,7 @@ def measure(
 
 def skipped(browser: Browser, count: int, seconds: float) -> Row:
     """Of the pictures that reached the page, the share that was not drawn."""
-    with _vehicle(count, (640, 360, 30), 1500 * count) as words:
+    with vehicle(count, (640, 360, 30), 1500 * count) as words:
         one = _round(browser, words, seconds)
     note = f"drawn, slowest camera {min(one.rates):.1f} Hz"
     return Row(f"640x360 at 30 Hz, cameras: {count}: skipped", 100 * one.skipped, "%", note=note)
@@ -123,7 +123,7 @@ def overlays(
         return (page.text_content("#guides") or "").startswith("Guides on")
 
     names = [f"camera_{number}" for number in range(count)]
-    with _vehicle(count, video, kbps) as words:
+    with vehicle(count, video, kbps) as words:
         blocks = _alternating(browser, words, names, show, are_shown, seconds, pairs)
     yield _added(f"{what}: overlays add", blocks, most=None if what == EIGHT[0] else 1)
 
@@ -143,7 +143,7 @@ def birdseye(
         return bool(page.locator("#birdseye").is_visible())
 
     beside = [f"camera_{number}" for number in range(count - TOP_VIEWS)]
-    with _vehicle(count, video, kbps, TOP_VIEWS) as words:
+    with vehicle(count, video, kbps, TOP_VIEWS) as words:
         blocks = _alternating(browser, words, beside, show, is_shown, seconds, pairs)
     yield _added(f"{what}: bird's-eye view in place of {TOP_VIEWS} pictures adds to the others", blocks)
     for with_it in (True, False):
@@ -179,7 +179,7 @@ def _alternating(
 ) -> list[Block]:
     """Measure cameras in the Drive view with something and without it, alternating in one drive."""
     with (
-        _station(words) as (url, _, broker),
+        station(words) as (url, _, broker),
         browser.new_context(viewport={"width": 1280, "height": 800}) as context,
     ):
         page = context.new_page()
@@ -247,7 +247,7 @@ def _round(browser: Browser, words: Sequence[str], seconds: float) -> Round:
 
     The phase between cameras and screen is constant during a drive, so one drive alone says little.
     """
-    with _station(words) as (url, operator, _), browser.new_context(viewport={"width": 1280, "height": 800}) as context:
+    with station(words) as (url, operator, _), browser.new_context(viewport={"width": 1280, "height": 800}) as context:
         page = context.new_page()
         time.sleep(SETTLE_S)
         page.goto(url)
@@ -271,7 +271,7 @@ def _since(frames: list[list[float]], began_ms: float) -> list[list[float]]:
 
 
 @contextmanager
-def _vehicle(count: int, video: tuple[int, int, int], kbps: int, top_views: int = 0) -> Iterator[list[str]]:
+def vehicle(count: int, video: tuple[int, int, int], kbps: int, top_views: int = 0) -> Iterator[list[str]]:
     """A vehicle of equal cameras, whose pictures are rendered; the last ones look down. Yields its words."""
     with tempfile.TemporaryDirectory() as directory:
         words = _configuration(Path(directory), count, top_views, *video, kbps)
@@ -306,7 +306,7 @@ def _configuration(
 
 
 @contextmanager
-def _station(words: Sequence[str]) -> Iterator[tuple[str, int, Endpoint]]:
+def station(words: Sequence[str]) -> Iterator[tuple[str, int, Endpoint]]:
     """Both sides as processes, as the demo runs them. Yields the page's address, the operator's process, the broker."""
     media, control, page = (free_port() for _ in range(3))
     own = [*words, f"media.port={media}", f"control.port={control}", f"page.port={page}"]
