@@ -30,11 +30,11 @@ class Drive:
     tick_s  between two reports of speed and clock, s
     """
 
-    def __init__(self, former: str = "", tick_s: float = 0.1) -> None:
+    def __init__(self, former: str = "", tick_s: float = 0.1, stop: str | None = None) -> None:
         self.run, self.t, self.events, self.tick_s = start(VEHICLE), 0.0, list[dict[str, Any]](), tick_s
         self.speed: float | None = None  # as it is reported with every tick; None: not at all
-        if former:
-            self.take("control_restored", operator=former)
+        if former or stop:
+            self.take("control_restored", operator=former, **({"stop": stop} if stop else {}))
 
     @property
     def driving(self) -> Driving:
@@ -74,6 +74,8 @@ class Drive:
                 return self.take("control_accepted", operator=name, live=CAMERAS)
             case [name, "accepts", "blind"]:
                 return self.take("control_accepted", operator=name, live=CAMERAS[1:])
+            case [name, ("stops" | "lifts") as what]:
+                return self.take({"stops": "stop_requested", "lifts": "stop_lifted"}[what], operator=name)
             case [name, ("asks" | "releases" | "takes") as what]:
                 event = {"asks": "requested", "releases": "released", "takes": "taken"}[what]
                 return self.take(f"control_{event}", operator=name)
@@ -82,11 +84,12 @@ class Drive:
         return None
 
     def words(self) -> str:
-        """The state: `held by ann, offered to bob, requested by sue`."""
+        """The state: `held by ann, offered to bob, requested by sue, stop by eve`."""
         now = self.driving
         parts = [f"{now.state} by {now.holder}" if now.holder else str(now.state)]
         parts += [f"offered to {now.offered}"] if now.offered else []
-        return ", ".join(parts + ([f"requested by {' '.join(now.requested)}"] if now.requested else []))
+        parts += [f"requested by {' '.join(now.requested)}"] if now.requested else []
+        return ", ".join(parts + ([f"stop by {now.stop}"] if now.stop else []))
 
 
 @pytest.mark.parametrize(
@@ -171,11 +174,28 @@ class Drive:
         ("ann connects; moves; ann silent; sue connects; sue takes; ann connects", "held by sue"),
         ("ann connects; bob connects; sue connects; moves; ann offers bob; sue takes", "held by sue"),
         ("ann connects; bob connects; sue connects; moves; sue takes; sue offers bob; bob accepts", "held by bob"),
+        # a request to stop
+        ("ann connects; eve connects; moves; eve stops", "held by ann, stop by eve"),
+        ("ann connects; eve connects; bob connects; eve stops; bob stops; ann stops", "held by ann, stop by eve"),
+        ("ann connects; ann stops", "held by ann, stop by ann"),
+        ("eve connects; eve stops", "free, stop by eve"),
+        ("ann connects; eve connects; eve stops; ann lifts", "held by ann"),
+        ("ann connects; eve connects; sue connects; eve stops; sue lifts", "held by ann"),
+        ("ann connects; eve connects; eve stops; ann lifts; eve stops", "held by ann, stop by eve"),
+        ("ann connects; eve connects; eve stops; eve silent; 60 s", "held by ann, stop by eve"),
+        ("ann connects; eve connects; moves; eve stops; ann silent; ann connects", "held by ann, stop by eve"),
+        ("ann connects; eve connects; stands; eve stops; ann releases; 9 s", "free, stop by eve"),
+        ("ann connects; bob connects; bob stops; ann offers bob; bob accepts", "held by bob, stop by bob"),
+        ("ann connects; sue connects; moves; sue stops; sue takes", "held by sue, stop by sue"),
+        ("@ann stop eve", "lost by ann, stop by eve"),
+        ("@ann stop eve; ann connects; ann lifts", "held by ann"),
+        ("@ stop eve; ann connects", "held by ann, stop by eve"),
     ],
 )  # fmt: skip
 def test_control_passes_only_as_it_may(story: str, ends: str) -> None:
     first, *words = story.split("; ")
-    drive = Drive(first.removeprefix("@")) if first.startswith("@") else Drive()
+    former, _, stop = first.removeprefix("@").partition("stop ")
+    drive = Drive(former.strip(), stop=stop or None) if first.startswith("@") else Drive()
     for each in words if first.startswith("@") else (first, *words):
         assert drive.does(each) is None, each
     assert drive.words() == ends
@@ -206,6 +226,11 @@ BOTH = "ann connects; bob connects; eve connects; sue connects"
         (f"{BOTH}; moves; ann silent", "sue releases", "it moves at 8.0 m/s; or offer control"),
         (f"{BOTH}; moves; stands; moves; ann silent; bob asks", "bob offers ann", "may offer it: ann is lost"),
         ("eve connects; ann connects; stands; ann releases", "ann offers eve", "may offer it: nobody is in control"),
+        ("ann connects", "eve stops", "eve is not connected"),
+        (f"{BOTH}; eve stops", "eve lifts", "a watcher may not request stop_lifted; only controller or supervisor may"),
+        (f"{BOTH}; bob stops", "bob lifts", "only the operator in control or a supervisor may lift it: ann"),
+        (f"{BOTH}; ann stops; ann silent", "bob lifts", "or a supervisor may lift it: ann is lost"),
+        (BOTH, "ann lifts", "nobody has asked the vehicle to stop"),
     ],
 )  # fmt: skip
 def test_a_request_that_may_not_be_is_refused_with_the_reason(story: str, request_: str, why: str) -> None:
@@ -272,7 +297,7 @@ def test_an_offer_states_when_it_ends() -> None:
 
 SEQUENCES, LENGTH, PARTS = 10_000, 24, 4
 NAMES = tuple(ROLES)
-DEEDS = (*["connects"] * 4, "silent", "quits", "expelled", "asks", "releases", "takes", "withdraws")
+DEEDS = (*["connects"] * 4, "silent", "quits", "expelled", "asks", "releases", "takes", "withdraws", *["stops"] * 2)
 
 
 def replayed(drive: Drive) -> Run:
@@ -288,6 +313,8 @@ def happens(drive: Drive, chance: random.Random) -> tuple[str, str | None]:
     kind, name = chance.random(), chance.choice(NAMES)
     if kind < 0.15:
         words = chance.choice(("0.5 s", "1 s", "3 s"))
+    elif kind < 0.2 and drive.driving.stop:
+        words = f"{chance.choice((name, drive.driving.in_control or name))} lifts"
     elif kind < 0.3:
         drive.speed = chance.choice((0.0, 0.1, 8.0, None))
         words = "0.5 s"
@@ -302,7 +329,7 @@ def happens(drive: Drive, chance: random.Random) -> tuple[str, str | None]:
 
 def restarted(drive: Drive) -> Drive:
     """The vehicle's next process: everybody has to connect again."""
-    anew = Drive(drive.driving.holder or "", drive.tick_s)
+    anew = Drive(drive.driving.holder or "", drive.tick_s, drive.driving.stop)
     anew.speed = drive.speed
     return anew
 
@@ -310,15 +337,20 @@ def restarted(drive: Drive) -> Drive:
 @pytest.mark.slow
 @pytest.mark.parametrize("part", range(PARTS))
 def test_random_sequences_keep_the_rules(part: int) -> None:
-    """One holder; never made free while moving, but for a supervisor's word; every request answered; replays equal."""
-    held, lost, freed, accepted = 0, 0, 0, 0
+    """One holder; never made free while moving, but for a supervisor's word; every request answered; replays equal.
+
+    A stop stands until its holder or a supervisor lifts it.
+    """
+    held, lost, freed, accepted, lifted = 0, 0, 0, 0, 0
     for seed in range(part, SEQUENCES, PARTS):
         chance = random.Random(seed)
         drive = Drive(chance.choice(("", "", "ann")), tick_s=0.5)
         for _ in range(LENGTH):
             if chance.random() < 0.03:
                 assert replayed(drive) == drive.run
+                stop = drive.driving.stop
                 drive = restarted(drive)
+                assert drive.driving.stop == stop
                 continue
             before = drive.driving
             words, refused = happens(drive, chance)
@@ -327,8 +359,9 @@ def test_random_sequences_keep_the_rules(part: int) -> None:
             held, lost = held + (now.state is Control.HELD), lost + (now.state is Control.LOST)
             freed += before.state is not Control.FREE and now.state is Control.FREE
             accepted += words.endswith("accepts") and refused is None
+            lifted += words.endswith("lifts") and refused is None
         assert replayed(drive) == drive.run, seed
-    assert min(held, lost, freed, accepted) > 100, "the sequences reach every state"
+    assert min(held, lost, freed, accepted, lifted) > 100, "the sequences reach every state"
 
 
 def check(before: Driving, drive: Drive, words: str, refused: str | None) -> None:
@@ -343,6 +376,11 @@ def check(before: Driving, drive: Drive, words: str, refused: str | None) -> Non
     assert now.in_control not in now.requested and len(set(now.requested)) == len(now.requested), words
     assert (now.offered is None) == (now.offer_ends is None) and now.offered not in ("", now.in_control), words
     assert {now.offered, *now.requested} - {None} <= now.present.keys(), words
+    assert (now.stop is None) == (now.stop_since is None), words
+    if now.stop != before.stop:
+        assert deed == ("stops" if before.stop is None else "lifts") and now.stop in (None, name), words
+    if now.stop != before.stop and now.stop is None:
+        assert name == before.in_control or now.present[name] is Role.SUPERVISOR, words
     changed = (now.state, now.holder) != (before.state, before.holder)
     if now.state is Control.FREE and before.state is not Control.FREE:
         vouches = deed == "releases" and now.present.get(name) is Role.SUPERVISOR and not motion.is_known(t)

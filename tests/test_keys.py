@@ -467,7 +467,7 @@ DRIVEN = {*EVENTS} - {*OWN, "clock_advanced", "bitrate_predicted", "position_rep
 ALLOWED = {
     Role.CONTROLLER: DRIVEN - {"control_taken"},
     Role.SUPERVISOR: DRIVEN,
-    Role.WATCHER: {*PRESENCE},
+    Role.WATCHER: {*PRESENCE, "stop_requested"},
     Role.PREDICTOR: {"bitrate_predicted"},
     Role.POSITIONER: {"position_reported", "steering_reported"},
     Role.VEHICLE: set(),

@@ -29,6 +29,7 @@ from runner.security import keyring
 from runner.security.keyring import Person
 from runner.system.reports import MOST_OF_PEER
 from runner.vehicle.access import Access
+from runner.vehicle.holder import Held
 from runner.vehicle.inbox import QueuedReport, Request
 from runner.vehicle.loop import ControlLoop
 from runner.vehicle.operators import SILENT_S
@@ -251,6 +252,8 @@ EXAMPLES: tuple[dict[str, Any], ...] = (
     {"event": "control_accepted", "live": []},
     {"event": "control_released"},
     {"event": "control_taken"},
+    {"event": "stop_requested"},
+    {"event": "stop_lifted"},
     {"event": "control_restored", "operator": "a-watcher"},
     {"event": "attention_changed", "attention": "hidden"},
     {"event": "operator_connected"},
@@ -423,7 +426,7 @@ def test_control_passes_with_pictures_and_everybody_learns_of_it(monkeypatch: py
 
 def test_the_former_holder_counts_as_lost_until_it_returns() -> None:
     watched = Watched()
-    watched.loop.former = "ann"
+    watched.loop.former = Held("ann")
 
     def driving() -> Any:
         return next((state.driving for state in reversed(watched.of(VehicleState))), None)
@@ -563,6 +566,37 @@ def test_no_speed_is_advised_while_nobody_sees_the_pictures() -> None:
         assert advised() == {0.5}
         for attention, factor in (("watching", 0.5), ("hidden", 0), ("slow", 0.5), ("absent", 0), ("unfocused", 0.5)):
             assert advised(attention=attention) == {factor}, attention
+
+
+def test_a_request_to_stop_advises_speed_0_however_old_it_is_and_whatever_limits_the_speed() -> None:
+    watched = Watched("latency.fixed_ms=null")
+    outcomes: list[Outcome] = []
+
+    def asks(name: str, event: str, as_of: float | None = None) -> Outcome:
+        outcomes.clear()
+        watched.loop.take(Request(name, {"event": event}, outcomes.append, as_of=as_of))
+        until(lambda: outcomes)
+        return outcomes[0]
+
+    def stop() -> Any:
+        return watched.of(VehicleState)[-1].driving.stop
+
+    with watched.running():
+        for name in ("ann", "eve"):
+            watched.loop.take(Request(name, {"event": "operator_connected"}))
+        assert asks("ann", "stop_requested", as_of=-60).result == "applied"
+        until(lambda: stop() == "ann" and watched.of(SpeedAdvice))
+        assert {advice.speed_factor for advice in watched.of(SpeedAdvice)} == {0.0}
+        assert asks("ann", "stop_lifted", as_of=-60).result == "expired"
+        assert asks("ann", "stop_lifted").result == "applied"
+        until(lambda: stop() is None)
+        advised = len(watched.of(SpeedAdvice))
+        time.sleep(0.3)
+        assert len(watched.of(SpeedAdvice)) <= advised + 1
+    assert [line for line in watched.reports if "stop" in line] == [
+        "ann asks the vehicle to stop",
+        "ann has lifted the stop that ann asked for",
+    ]
 
 
 def test_a_second_process_of_the_driver_neither_ends_control_nor_advises_a_speed() -> None:

@@ -365,6 +365,7 @@ EVENTS: dict[str, dict[str, st.SearchStrategy[Any]]] = {
     "source_reported": {**FRONT_LEFT, "works": st.booleans(), "reason": st.just("no such device")},
     "control_passed": {"operator": st.sampled_from(["a", "b", ""])},
     **{f"control_{kind}": {"operator": st.just("a")} for kind in ("requested", "released", "taken", "restored")},
+    **{f"stop_{kind}": {"operator": st.just("a")} for kind in ("requested", "lifted")},
     "control_offered": {"operator": st.just("a"), "to": st.sampled_from(["b", ""])},
     "control_accepted": {"operator": st.just("b"), "live": st.just([])},
     "attention_changed": {"attention": st.sampled_from(list(map(str, Attention)))},

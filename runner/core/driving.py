@@ -7,6 +7,9 @@
 
 Control of a vehicle that moves passes only by an offer that is accepted, or to a supervisor that takes it. A vehicle
 moves unless its speed was reported below SLOW_MPS for SLOW_S, last less than KNOWN_S ago.
+
+Whoever is connected may ask the vehicle to stop. That stands until the holder or a supervisor lifts it, whoever comes,
+goes or drives meanwhile.
 """
 
 from __future__ import annotations
@@ -32,6 +35,8 @@ from runner.core.events import (
     OperatorDisconnected,
     PositionReported,
     Refused,
+    StopLifted,
+    StopRequested,
 )
 from runner.core.limits import NonNegative
 from runner.core.roles import DRIVERS, Role, denial
@@ -62,6 +67,8 @@ class Driving:
         default_factory=dict
     )
     released: Annotated[str | None, "who has released control, and does not get it again without asking"] = None
+    stop: Annotated[str | None, "id of the operator that has asked the vehicle to stop; None: nobody has"] = None
+    stop_since: Annotated[float | None, "t from which that stands, s; None: nobody has asked"] = None
     standing: Annotated[bool, "whether the vehicle is known to stand, so that control may be released"] = False
     why: Annotated[str, "the last change, in words"] = "nobody has driven yet"
 
@@ -127,8 +134,9 @@ def _changed(driving: Driving, motion: Motion, event: Event, sent: Set[str]) -> 
             return _arrived(driving, name, event.role or Role.WATCHER, event.t)
         case OperatorDisconnected(operator=str(name)):
             return _left(driving, motion, name, event.departure or Departure.SILENT, event.t)
-        case ControlRestored(operator=name):
-            return _lost(driving, name, event.t, f"the vehicle has restarted while {name} was in control")
+        case ControlRestored(operator=name, stop=stop):
+            now = driving if stop is None else replace(driving, stop=stop, stop_since=event.t)
+            return _lost(now, name, event.t, f"the vehicle has restarted while {name} was in control") if name else now
         case ControlRequested(operator=name):
             _may(driving, name, event)
             return _asked(driving, name, event.t)
@@ -145,6 +153,12 @@ def _changed(driving: Driving, motion: Motion, event: Event, sent: Set[str]) -> 
             _may(driving, name, event)
             former = f" from {driving.holder}" if driving.holder else ""
             return _held(driving, name, event.t, f"{name} has taken control{former}, as a supervisor")
+        case StopRequested(operator=name):
+            _may(driving, name, event)
+            return _stopped(driving, name, event.t)
+        case StopLifted(operator=name):
+            _may(driving, name, event)
+            return _lifted(driving, name)
         case _:
             return driving
 
@@ -244,6 +258,20 @@ def _released(driving: Driving, motion: Motion, name: str, t: float) -> Driving:
     if name == driving.offered:
         return replace(_without_offer(driving, f"{name} has declined control"), requested=asking)
     return replace(driving, requested=asking, why=f"{name} no longer asks for control")
+
+
+def _stopped(driving: Driving, name: str, t: float) -> Driving:
+    if driving.stop is not None:
+        return driving
+    return replace(driving, stop=name, stop_since=t, why=f"{name} asks the vehicle to stop")
+
+
+def _lifted(driving: Driving, name: str) -> Driving:
+    if driving.in_control != name and driving.present[name] is not Role.SUPERVISOR:
+        raise Refused(f"only the operator in control or a supervisor may lift it: {_who(driving)}")
+    if driving.stop is None:
+        raise Refused("nobody has asked the vehicle to stop")
+    return replace(driving, stop=None, stop_since=None, why=f"{name} has lifted the stop that {driving.stop} asked for")
 
 
 def _held(driving: Driving, name: str, t: float, why: str) -> Driving:

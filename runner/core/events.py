@@ -255,10 +255,28 @@ class ControlTaken(_Event):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ControlRestored(_Event):
-    """The vehicle has restarted; the operator that was in control before counts as lost until it returns."""
+class StopRequested(_Event):
+    """An operator, also one that only watches, asks the vehicle to stop: the advised speed is 0 until it is lifted."""
 
-    operator: Annotated[str, Limits(1), "its id"]
+    operator: Asker
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StopLifted(_Event):
+    """The operator in control, or a supervisor, lifts what was asked: the vehicle may go on."""
+
+    operator: Asker
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ControlRestored(_Event):
+    """The vehicle has restarted; the operator that was in control before counts as lost until it returns.
+
+    stop  id of the operator that asked to stop, which still stands; None: nobody did
+    """
+
+    operator: Annotated[str, 'its id; "": nobody was in control']
+    stop: str | None = None
 
 
 class Attention(StrEnum):
@@ -339,6 +357,8 @@ Event = (
     | ControlAccepted
     | ControlReleased
     | ControlTaken
+    | StopRequested
+    | StopLifted
     | ControlRestored
     | AttentionChanged
     | OperatorConnected

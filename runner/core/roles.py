@@ -21,11 +21,14 @@ PRESENCE = frozenset({"operator_connected", "operator_disconnected"})
 DRIVER_EVENTS = frozenset(
     {"mode_selected", "total_set", "camera_switched", "roi_set", "camera_configured", "weights_set", "moment_marked"}
 )
-CONTROL_EVENTS = frozenset({"control_requested", "control_offered", "control_accepted", "control_released"})
+STOP_REQUESTED = "stop_requested"  # by whoever sees what happens
+CONTROL_EVENTS = frozenset(
+    {"control_requested", "control_offered", "control_accepted", "control_released", STOP_REQUESTED, "stop_lifted"}
+)
 MAY_REQUEST: dict[Role, frozenset[str]] = {
     Role.CONTROLLER: PRESENCE | DRIVER_EVENTS | CONTROL_EVENTS,
     Role.SUPERVISOR: PRESENCE | DRIVER_EVENTS | CONTROL_EVENTS | {"control_taken"},
-    Role.WATCHER: PRESENCE,
+    Role.WATCHER: PRESENCE | {STOP_REQUESTED},
     Role.PREDICTOR: frozenset({"bitrate_predicted"}),
     Role.POSITIONER: frozenset({"position_reported", "steering_reported"}),
     Role.VEHICLE: frozenset(),

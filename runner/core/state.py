@@ -159,6 +159,8 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
             | ev.ControlOffered()
             | ev.ControlReleased()
             | ev.ControlTaken()
+            | ev.StopRequested()
+            | ev.StopLifted()
             | ev.ControlRestored()
             | ev.ClockAdvanced()
         ):

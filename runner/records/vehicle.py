@@ -184,6 +184,8 @@ class Telemetry:
 class SpeedAdvice:
     """Share of full speed that the latency of the operator's pictures allows, ten times a second.
 
+    0 while somebody asks to stop, and only then without `latency.fixed_ms`.
+
     The driving function must assume 0 once `expires_s` have passed without a newer one.
     """
 

@@ -1,4 +1,4 @@
-"""Keeps who holds control in a file, so that a vehicle that restarts does not give control to somebody else."""
+"""Keeps who holds control and who asks to stop in a file: a vehicle that restarts gives neither up."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import json
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 from runner.errors import RunError
 from runner.mqtt.messages import OPERATOR
@@ -14,7 +15,17 @@ from runner.system.reports import RepeatedReports
 
 MOST_BYTES = 1000
 END_S = 2.0  # how long the last write may take
-SOMEBODY = "?"  # the holder by a file that cannot be read: nobody of that name can return
+SOMEBODY = "?"  # by a file that cannot be read: nobody of that name can return
+
+
+class Held(NamedTuple):
+    """Ids of operators, "" for nobody: the holder, and the one that has asked the vehicle to stop."""
+
+    holder: str = ""
+    stop: str = ""
+
+
+NOBODY = Held()
 
 
 class KeptHolder:
@@ -23,7 +34,7 @@ class KeptHolder:
     path       of the file; None: nothing is kept
     on_report  called with why it cannot be read or written
 
-    former  who held control when it was last written, "" for nobody
+    former  as it was last written
     """
 
     def __init__(self, path: Path | None, on_report: Callable[[str], None]) -> None:
@@ -33,10 +44,10 @@ class KeptHolder:
         self._thread = threading.Thread(target=self._write, name="holder", daemon=True)
         self._thread.start()
 
-    def keep(self, holder: str) -> None:
-        """Let the next process know who holds control, "" for nobody. Returns immediately."""
+    def keep(self, held: Held) -> None:
+        """Let the next process know. Returns immediately."""
         with self._changed:
-            self._wanted = holder
+            self._wanted = held
             self._changed.notify()
 
     def close(self) -> None:
@@ -45,18 +56,20 @@ class KeptHolder:
             self._changed.notify()
         self._thread.join(END_S)
 
-    def _read(self) -> str:
+    def _read(self) -> Held:
         if not self._path or not self._path.exists():
-            return ""
+            return NOBODY
         try:
-            holder = json.loads(read_file(self._path, MOST_BYTES))["holder"]
-            if holder and not OPERATOR.fullmatch(holder):
-                raise ValueError(f"holder: {holder!r} is no operator's id")
+            document = json.loads(read_file(self._path, MOST_BYTES))
+            held = Held(document["holder"], document.get("stop", ""))  # an earlier version had no stop
+            for key, name in held._asdict().items():
+                if name and not OPERATOR.fullmatch(name):
+                    raise ValueError(f"{key}: {name!r} is no operator's id")
         except (ValueError, KeyError, TypeError) as error:
-            rule = "somebody counts as in control and lost; remove the file if the vehicle stands"
+            rule = "somebody counts as lost in control, and as asking to stop; remove the file if the vehicle stands"
             self._report(f"{self._path}: who was in control cannot be read ({error}): {rule}")
-            return SOMEBODY
-        return str(holder)
+            return Held(SOMEBODY, SOMEBODY)
+        return held
 
     def _write(self) -> None:
         while True:
@@ -68,6 +81,6 @@ class KeptHolder:
                 self._written = wanted  # also if it fails: the next change is tried again
             if self._path:
                 try:
-                    write_whole(self._path, json.dumps({"holder": wanted}).encode())
+                    write_whole(self._path, json.dumps(wanted._asdict()).encode())
                 except RunError as error:
                     self._report(f"{error}: after a restart of the vehicle anybody may get control")

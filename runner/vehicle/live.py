@@ -54,7 +54,7 @@ from runner.system.interfaces import number_of
 from runner.system.kernel_clock import clock_error_s, wall_ahead_s
 from runner.system.service import notify
 from runner.vehicle.access import Access
-from runner.vehicle.holder import KeptHolder
+from runner.vehicle.holder import Held, KeptHolder
 from runner.vehicle.inbox import QueuedReport, Request
 from runner.vehicle.loop import ControlLoop
 
@@ -102,7 +102,7 @@ class LiveVehicle:
 
     def _follow(self, driving: Driving) -> None:
         self.driving = driving
-        self._holder.keep(driving.holder or "")
+        self._holder.keep(Held(driving.holder or "", driving.stop or ""))
         self._on_driving(driving)
 
     def start(self) -> None:

@@ -29,7 +29,7 @@ from runner.core.events import (
     describe,
     parse,
 )
-from runner.core.roles import CONTROL_EVENTS
+from runner.core.roles import CONTROL_EVENTS, STOP_REQUESTED
 from runner.core.step import Run, start, step
 from runner.pqos import Predictions
 from runner.records.reception import ReceptionReport, ReceptionReported, SentFrame, UplinkSent
@@ -41,6 +41,7 @@ from runner.system.interfaces import addresses_by
 from runner.system.reports import RepeatedReports
 from runner.vehicle.access import Access
 from runner.vehicle.attention import StatedAttention
+from runner.vehicle.holder import NOBODY, Held
 from runner.vehicle.inbox import MAX_QUEUED, Answer, Inbox, Item, QueuedReport, Request
 from runner.vehicle.noticed import copies_events, presence_events, source_events
 from runner.vehicle.operators import SILENT_S, Operators
@@ -88,7 +89,7 @@ class ControlLoop:
                  second; returns False for a record that has to wait because the control link is behind
     on_report    called with one line per event and its result
     access       who may request what
-    former       the operator that was in control when this vehicle's last process ended, "" for none
+    former       who was in control, and who had asked to stop, when this vehicle's last process ended
     on_driving   called, in the loop's thread, with who drives whenever that changes
 
     An exception in the loop is reported and counted in `errors`; the loop continues. `beat` is when the loop last
@@ -103,7 +104,7 @@ class ControlLoop:
     publish: Publish
     on_report: Callable[[str], None]
     access: Access
-    former: str = ""
+    former: Held = NOBODY
     on_driving: Callable[[Driving], None] = lambda driving: None
     errors: int = 0
     beat: float = 0.0
@@ -167,8 +168,9 @@ class ControlLoop:
         self._guarded("cameras", self._read)
         self._guarded("sources", lambda: self._notice(source_events(self._run.state, self._cameras, 0.0)))
         self._guarded("start", lambda: self._take(ClockAdvanced(t=0.0)))
-        if self.former:
-            self._guarded("control", lambda: self._take(ControlRestored(t=0.0, operator=self.former)))
+        if any(self.former):
+            holder, stop = self.former
+            self._guarded("control", lambda: self._take(ControlRestored(t=0.0, operator=holder, stop=stop or None)))
         next_tick, late = TICK_S, LateCheck(2 * TICK_S)
         late.is_excused(0)
         while not self._stopped and (duration_s is None or self._now() < duration_s):
@@ -257,7 +259,7 @@ class ControlLoop:
             self.refusals.deny(request, name, denied)
         elif request.sender and isinstance(event, OWN):
             self.refusals.refuse(request, f"{NAMES[type(event)]}: only the vehicle itself makes this event")
-        elif request.as_of is not None and (expired := self._operators.expired(request.sender, t, request.as_of)):
+        elif expired := self._expired(request, name, t):
             self.refusals.count += 1
             request.reply(Outcome(t, "expired", expired))
         elif isinstance(event, OperatorConnected | OperatorDisconnected):
@@ -267,6 +269,12 @@ class ControlLoop:
             self._take(replace(event, live=tuple(name for name in event.live if name in seen)), request.answer)
         else:
             self._take(event, request.answer)
+
+    def _expired(self, request: Request, name: str, t: float) -> str | None:
+        """Why a request is too old to be carried out; one to stop never is."""
+        if request.as_of is None or name == STOP_REQUESTED:
+            return None
+        return self._operators.expired(request.sender, t, request.as_of)
 
     def _take_report(self, item: QueuedReport) -> None:
         t = self._now()

@@ -126,7 +126,10 @@ class Publisher:
             self.publish(SteeringAngle(round(time.time() - (now - event.t), 4), event.rad))
 
     def advise(self, run: Run, t: float) -> None:
-        """Publish the speed that the latency of the operator's pictures allows; 0 without a recent report or driver."""
+        """Publish the speed that the latency of the operator's pictures allows.
+
+        0 without a recent report or driver, and while somebody asks to stop, even if no latency limits the speed.
+        """
         if (factor := self._speed_factor(run, t)) is not None:
             _, measured_ms = self.latency
             total_ms = (
@@ -135,6 +138,8 @@ class Publisher:
             self.publish(SpeedAdvice(t, factor, total_ms, ADVICE_S))
 
     def _speed_factor(self, run: Run, t: float) -> float | None:
+        if run.state.driving.stop is not None:
+            return 0.0
         at, measured_ms = self.latency
         is_driven = bool(run.state.driving.in_control) and run.state.attention not in UNSEEN
         is_seen = is_driven and t - at <= ADVICE_S

@@ -65,6 +65,10 @@ export interface Driving {
   present: Record<string, "vehicle" | "broker" | "controller" | "supervisor" | "watcher" | "predictor" | "positioner">;
   /** who has released control, and does not get it again without asking */
   released: string | null;
+  /** id of the operator that has asked the vehicle to stop; null: nobody has */
+  stop: string | null;
+  /** t from which that stands, s; null: nobody has asked */
+  stop_since: number | null;
   /** whether the vehicle is known to stand, so that control may be released */
   standing: boolean;
   /** the last change, in words */
