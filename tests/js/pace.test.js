@@ -48,3 +48,10 @@ test("a page that stops drawing is detected within two seconds, and recovers wit
   after(2, 30, 30, pace, 11.75);
   assert.equal(pace.isSlow, false);
 });
+
+test("a stream that starts is not slow: what was not drawn before it had its first second does not count", () => {
+  const pace = after(3, 30, 3);
+  assert.equal(pace.isSlow, true);
+  pace.restart();
+  assert.equal(after(1.75, 30, 3, pace, 3).isSlow, false);
+});

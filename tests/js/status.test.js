@@ -8,7 +8,7 @@ import { alarmText, judge, slowText } from "../../runner/page/static/status.js";
 const NOW = 100_000;
 const LIMITS = { frozen_ms: 120 };
 const LIVE = {
-  connected: true, online: true, on: true, sending: true, refused: "", drawn: true, stood_since: null, wave_s: 1.5, damaged: false, faulty: false,
+  connected: true, online: true, on: true, sending: true, refused: "", drawn: true, stood_since: null, wave_s: 1.5, begins: false, damaged: false, faulty: false,
   arrived: NOW - 20, decoded: NOW - 10, late_until: 0, fps: 40,
 };
 const judged = (more) => judge({ ...LIVE, ...more }, LIMITS, NOW);
@@ -25,6 +25,8 @@ const CASES = [
   ["lost", { connected: false, on: false }], // the state of an unreachable camera is unknown
   ["lost", { arrived: NOW - 1001 }],
   ["frozen", { arrived: NOW - 1000 }],
+  ["frozen", { begins: true, arrived: NOW - 3000 }], // a stream that starts may take longer to its first unit
+  ["lost", { begins: true, arrived: NOW - 3001 }],
   ["refused", { declined: true, arrived: NOW - 5000 }], // by the vehicle, which says why: not lost
   ["lost", { declined: true, online: false }],
   ["off", { declined: true, on: false }],
@@ -62,6 +64,8 @@ test("a slow camera freezes after 1.3 frame intervals, not after the limit of fa
 
 test("alarms state how long and how late", () => {
   assert.equal(alarmText("frozen", 450, NaN), "FROZEN 0.4 s");
+  for (const [since, text] of [[120, "0.1"], [217, "0.2"], [299, "0.2"], [300, "0.3"], [1049, "1.0"]])
+    assert.equal(alarmText("frozen", since, NaN), `FROZEN ${text} s`);
   assert.equal(alarmText("late", 0, 313), "LATE 310 ms");
   assert.equal(alarmText("lost", 3999, NaN), "LOST 3 s");
   assert.equal(alarmText("lost", 1e9, NaN), "LOST");

@@ -22,6 +22,7 @@ function slowStream({ display, ...more }, decoded_ms = 20) {
   Object.assign(stream, { composed_at: now() - 250, composed_fps: SLOW, ...more });
   Object.assign(stream.canvas, { display });
   const newest = now() - decoded_ms;
+  stream.live.beginning.isOver = true;
   Object.assign(stream.live, { on: true, sending: true, drawn: true, arrived: newest, decoded: now() - 230, ready_at: newest });
   return stream;
 }

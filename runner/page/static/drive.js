@@ -17,7 +17,8 @@ import { byId, displayName, latency, setAttribute, setText, whole } from "./form
 
 const MODES = { single: "Single", automatic: "Automatic", collective: "Collective" };
 const WORDS = { unsupported: "NO PICTURE" };
-const NOT_LIVE = Object.keys(ALARMS).filter((status) => ALARMS[status] === "lost");
+const WORST_FIRST = Object.keys(ALARMS);
+const NOT_LIVE = WORST_FIRST.filter((status) => ALARMS[status] === "lost");
 const KMH = 3.6; // of 1 m/s
 const GUIDES = "tod-guides";
 const RETURNED_MS = 1000; // a press within this time belongs to the return
@@ -55,7 +56,8 @@ function refresh() {
 function refreshLatency() {
   const { camera, age_ms, bound_ms, level } = worstOf([...ownPictures(), ...inMonitors()], store.hello?.late_ms ?? 0);
   const notLive = names().filter(isNotLive);
-  const from = camera === null ? "no moving picture" : `${level === "unknown" ? "unknown" : "worst"}: ${displayName(camera)}`;
+  const none = Object.values(store.status).includes("synchronising") ? "synchronising" : "no moving picture";
+  const from = camera === null ? none : `${level === "unknown" ? "unknown" : "worst"}: ${displayName(camera)}`;
   setAttribute(byId("latency"), "data-level", notLive.length ? "late" : level);
   setText(byId("worst"), latency(age_ms, bound_ms));
   setText(byId("worst-of"), notLive.length ? `${notLive.length} of ${names().length} pictures not live` : from);
@@ -104,7 +106,7 @@ function refreshAlarms() {
 
 /** Show pictures by status, FROZEN front left, rear (monitor), and further words. Returns whether there are any pictures. */
 function showAlarms(element, cameras, further = []) {
-  const all = Object.keys(ALARMS).map((status) => ({ status, pictures: picturesOf(status, cameras) }));
+  const all = WORST_FIRST.map((status) => ({ status, pictures: picturesOf(status, cameras) }));
   const found = all.filter(({ pictures }) => pictures.length);
   const texts = found.map(({ status, pictures }) => `${SHAPES[status]} ${WORDS[status] ?? status.toUpperCase()} ${pictures.join(", ")}`);
   setText(element, [...texts, ...further].join("  "));
@@ -112,12 +114,16 @@ function showAlarms(element, cameras, further = []) {
   return found.length > 0;
 }
 
-/** The pictures of a status: the page's of these cameras, and those in monitors of cameras whose picture on the page has another one. */
+/** The pictures of a status: the page's of these cameras, and those in monitors that are worse than the page's of the same camera. */
 function picturesOf(status, cameras) {
   const own = cameras.filter((name) => alertStatus(name) === status);
-  const others = monitored().filter((other) => alertStatus(other.camera, other.status) === status && store.status[other.camera] !== status);
+  const isListed = (other) => alertStatus(other.camera, other.status) === status && isWorse(status, alertStatus(other.camera));
+  const others = monitored().filter(isListed);
   return [...own.map(displayName), ...new Set(others.map(({ camera }) => inMonitor(camera)))];
 }
+
+/** @param {string} status  @param {string|undefined} than */
+const isWorse = (status, than) => !(than && than in ALARMS) || WORST_FIRST.indexOf(status) < WORST_FIRST.indexOf(than);
 
 /** Make the text of a part smaller where it would be cut off. @param {HTMLElement} part */
 function fit(part) {

@@ -1,8 +1,9 @@
 /** Whether the pictures of one camera are live: the times that `judge` needs, the status, and the words of an alarm. */
 
+import { Beginning } from "./beginning.js";
 import { now } from "./clock.js";
 import { DAMAGED } from "./decoding.js";
-import { alarmText, INTERVALS, judge, MOVING, slowText } from "./status.js";
+import { alarmText, frozenAfter, INTERVALS, judge, MOVING, slowText } from "./status.js";
 
 const LATE_HOLD_MS = 500; // how long one late picture is indicated, at least until it counts as frozen
 const WAITING = ["synchronising", "frozen"];
@@ -30,6 +31,8 @@ export class Liveness {
   /** @type {number|null} */
   failed_at = null; // when the source failed: it may repeat old pictures as new
   status = "synchronising";
+  beginning = new Beginning();
+  frozen_ms = 0; // limit in force
 
   /** @param {{fps: number, wave_s: number|null}} camera  @param {any} station see `Stream` */
   constructor(camera, station) {
@@ -49,6 +52,7 @@ export class Liveness {
   onDecision(decision) {
     const { on = null, sending = null, scaling, fault, slow_fps = null } = decision ?? {};
     const begins = on && sending && (this.on === false || this.sending === false);
+    if (begins && !this.unopened) this.beginning = new Beginning();
     Object.assign(this, { on, sending, slow_fps, unopened: on === true && scaling === null });
     this.failed_at = fault ? (this.failed_at ?? now()) : null;
     return begins;
@@ -90,11 +94,16 @@ export class Liveness {
     const known = { connected, online, on, sending, unopened, refused, stood_since, waits_since, wave_s, damaged };
     const faulty = this.failed_at !== null;
     const least = Math.min(this.slow_fps ?? this.camera.fps, fps);
-    return { ...known, faulty, arrived, decoded, late_until, drawn: this.drawn && drawn, fps: least, declined: this.declined !== "" };
+    const begins = !this.beginning.isOver;
+    const stands = { begins, faulty, declined: this.declined !== "" };
+    return { ...known, ...stands, arrived, decoded, late_until, drawn: this.drawn && drawn, fps: least };
   }
 
   judge(more, time) {
-    this.status = judge(this.times(more), this.station.limits, time);
+    const times = this.times(more);
+    const { limits } = this.station;
+    this.frozen_ms = frozenAfter(limits, times.fps);
+    this.status = this.beginning.shown(judge(times, limits, time), this.hasDrawn, time);
   }
 
   /** To be called by a timer, after `judge`. */
@@ -102,12 +111,26 @@ export class Liveness {
     if (!WAITING.includes(this.status)) this.waits_since = time;
   }
 
+  /** Whether a picture was drawn since the stream started. */
+  get hasDrawn() {
+    return this.drawn || this.stood_since !== null;
+  }
+
+  /** Whether the picture is in its first second. */
+  get isNew() {
+    return this.status === "synchronising" && this.hasDrawn;
+  }
+
   get moves() {
     return MOVING.includes(this.status);
   }
 
-  /** That a moving picture has fewer frames than the camera should deliver: nothing is wrong with the stream. */
-  slowText() {
+  /**
+   * What is no alarm: that a picture is in its first second, or that a moving one has fewer frames than the camera should
+   * deliver, although nothing is wrong with the stream.
+   */
+  noteText() {
+    if (this.isNew) return alarmText(this.status, 0, NaN);
     return this.slow_fps && this.moves ? slowText(this.slow_fps, this.camera.fps) : "";
   }
 
@@ -117,7 +140,8 @@ export class Liveness {
     // Units may still arrive.
     const stood = this.status === "frozen" ? (this.drawn ? this.decoded : (stood_since ?? waits_since)) : Infinity;
     const since = Math.min(this.arrived, stood, this.failed_at ?? Infinity);
-    return alarmText(this.status, time - since, this.late_age) + late;
+    // A source that repeats its picture has done so for a while when it is found out.
+    return alarmText(this.status, Math.max(time - since, this.frozen_ms), this.late_age) + late;
   }
 
   /** Whether a damaged picture is late as well. */

@@ -14,6 +14,11 @@ export class Pace {
     this.fps = fps;
   }
 
+  /** Count from now on. */
+  restart() {
+    this.counts = [];
+  }
+
   /** @param {number} time  @param {number} due  @param {number} drawn so far  @param {boolean} moves whether the picture moves now */
   add(time, due, drawn, moves) {
     this.counts.push({ time, due, drawn, moves });

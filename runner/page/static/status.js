@@ -1,5 +1,7 @@
 /** The status of a tile's stream, judged from times alone so that it can be tested without video. */
 
+import { AT_MOST_MS } from "./beginning.js";
+
 export const MOVING = ["live", "late", "damaged"];
 export const STALLED = ["frozen", "lost"]; // no new pictures although they are due
 
@@ -24,6 +26,7 @@ export const INTERVALS = 1.3; // this many frame intervals without a picture are
  * @property {number|null} stood_since page time of the last picture before the decoder restarted in the middle of the
  *   stream; null: it did not
  * @property {boolean} faulty whether the source has a fault: it may repeat old pictures
+ * @property {boolean} begins whether it has not had its first second yet, see `Beginning`
  * @property {boolean} damaged whether the picture shows that packets were lost
  * @property {number} arrived page time of the newest unit, or of the start of the stream
  * @property {number} decoded likewise
@@ -40,7 +43,7 @@ export function judge(s, limits, now) {
   if (reachable && s.on === false) return "off";
   if (reachable && s.sending === false) return s.unopened ? "lost" : "paused";
   if (reachable && s.declined) return "refused";
-  if (!reachable || now - s.arrived > LOST_MS) return "lost";
+  if (!reachable || now - s.arrived > (s.begins ? AT_MOST_MS : LOST_MS)) return "lost";
   if (s.refused) return "unsupported";
   if (!s.drawn && s.stood_since === null) return now - (s.waits_since ?? now) > synchronisedAfter(s.wave_s) ? "frozen" : "synchronising";
   const limit = frozenAfter(limits, s.fps);
@@ -65,7 +68,7 @@ export const slowText = (slow_fps, fps) => `${slow_fps} of ${Math.round(100 * fp
  * @param {number} age_ms of the last late picture
  */
 export function alarmText(status, since_ms, age_ms) {
-  if (status === "frozen") return `FROZEN ${(Math.floor(since_ms / 200) / 5).toFixed(1)} s`;
+  if (status === "frozen") return `FROZEN ${(Math.floor(since_ms / 100) / 10).toFixed(1)} s`;
   if (status === "late") return `LATE ${Math.round(age_ms / 10) * 10} ms`;
   if (status === "lost") return since_ms < 1e8 ? `LOST ${Math.floor(since_ms / 1000)} s` : "LOST";
   if (status === "unsupported") return "NO PICTURE";

@@ -189,7 +189,7 @@ export class Stream {
     const picture = this.live.moves && region ? (shown?.picture ?? null) : null;
     const fill = picture ? FILLS.picture : STALLED.includes(status) ? FILLS.alarm : FILLS.none;
     const { captured = NaN } = (picture && shown?.meta) ?? {};
-    const label = this.overlayText(now()) || (region ? "" : NEW_REGION);
+    const label = this.overlayText(now()) || (this.live.isNew ? this.live.noteText() : region ? "" : NEW_REGION);
     return { picture, fill, captured, newest: shown, region: this.region.region ?? this.full, status, label };
   }
 
@@ -257,8 +257,9 @@ export class Stream {
     };
   }
 
-  /** Whether too few pictures are drawn; to be called a few times a second. */
+  /** Whether too few pictures are drawn, not counting those of a stream that starts; to be called a few times a second. */
   isSlow() {
+    if (this.status === "synchronising") this.pace.restart();
     this.pace.add(now(), this.counts.due, this.counts.drawn, this.live.moves);
     return this.pace.isSlow;
   }
@@ -268,7 +269,7 @@ export class Stream {
     const time = now();
     this.live.judge(this.drawing(), time);
     this.live.noteWaiting(time);
-    if (this.canvas.isOutdated(this.overlayText(time), this.live.slowText())) this.paint(time);
+    if (this.canvas.isOutdated(this.overlayText(time), this.live.noteText())) this.paint(time);
     this.why = this.live.declined || this.decoding.refused;
     const reported = `${this.status} ${this.why}`;
     const changed = reported !== this.reported;
@@ -282,6 +283,7 @@ export class Stream {
   }
 
   overlayText(time) {
+    if (this.live.isNew) return ""; // its note says so
     if (this.status === "live") return this.straight && !this.shown?.image ? NEW_REGION : "";
     return this.live.alarmText(time);
   }
@@ -291,7 +293,7 @@ export class Stream {
     const { shown, status } = this;
     const region = this.live.moves && this.canvas.isShown ? this.drawnRegion() : null;
     const steered = shown && region && { region, rad: this.station.steering.angleAt(shown.meta.captured) };
-    const [isStraight, text, note] = [this.straight !== null, this.overlayText(time), this.live.slowText()];
+    const [isStraight, text, note] = [this.straight !== null, this.overlayText(time), this.live.noteText()];
     if (!this.canvas.paint({ shown, isStraight, status, text, note, steered })) return;
     const mark = this.live.isLateToo(time) ? "damaged late" : status;
     if (mark !== this.mark) this.station.onMark(this.name, mark);
@@ -312,7 +314,7 @@ export class Stream {
     const picture = this.shown?.picture;
     return {
       status: this.status,
-      note: this.live.slowText(),
+      note: this.live.noteText(),
       ...this.counts,
       ...this.decoding.counts,
       error: this.decoding.error,

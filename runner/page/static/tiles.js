@@ -311,7 +311,8 @@ function refreshCaption(name, { rates, form, reason }) {
   const wire = `${whole(sample?.lost)} packets lost, receiver rebuilt ${whole(sample?.rebuilt)} times`;
   const why = `received size · scaling factor · latency from capture to drawing ± error bound; ${wire}${repair}`;
   caption(form, region, `${shape} · ${latency(age_ms, bound_ms)}${lost}`, why);
-  setAttribute(form, "data-uncertain", (bound_ms ?? 0) > UNCERTAIN_MS ? "" : null);
+  const isUncertain = (bound_ms ?? 0) > UNCERTAIN_MS && store.status[name] !== "synchronising"; // clocks agree soon
+  setAttribute(form, "data-uncertain", isUncertain ? "" : null);
   setText(reason, now?.reason ?? "");
 }
 

@@ -17,6 +17,7 @@ import { canStraighten } from "./straight.js";
 import { Stream } from "./stream.js";
 import { drawInTurn } from "./turns.js";
 // Used only by other modules, but imported here so that all modules are fetched in parallel.
+import "./beginning.js";
 import "./codec.js";
 import "./counter.js";
 import "./decoding.js";
