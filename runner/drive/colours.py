@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-DAY = ("#0b6fae", "#6c2c00", "#10372c", "#8d744d", "#45154f", "#c24100", "#6106af", "#676d7f")
-NIGHT = ("#56b4e9", "#ecac00", "#53f3c5", "#fff269", "#b46b99", "#ff7847", "#828af9", "#c4def9")
+DAY = ("#1034c9", "#7f8502", "#ff0b7a", "#18530b", "#bf46fe", "#7d5f56", "#2c918b", "#880f5c")
+NIGHT = ("#8d6bfb", "#f3f123", "#ff078c", "#74901e", "#d2d3fd", "#e6ad83", "#139695", "#94fede")
 
-# By day, as style.css has them; late values have the colour of the sixth camera.
+# By day, as style.css of the page and report.css have them.
 NAMED = {
     "predicted": "#a86a00",
     "allocated": "#0b6fae",
     "actual": "#10161c",
     "link": "#b3bec8",
-    "late": DAY[5],
+    "late": "#c24100",
     "text": "#10161c",
 }

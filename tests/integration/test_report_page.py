@@ -13,6 +13,7 @@ from drives import write_drive, write_models
 
 from rig import needs_browser
 from runner.configuration.compose import compose
+from runner.drive.colours import DAY, NIGHT
 from runner.verbs.report import report
 
 pytestmark = needs_browser
@@ -115,9 +116,9 @@ def test_the_theme_follows_the_system_and_is_chosen_by_a_button(chromium: Any, s
     with opened(chromium, single, scheme="light") as page:
         theme = "document.documentElement.dataset.theme"
         colour = "document.querySelector('.quality').data[0].line.color"
-        assert (page.evaluate(theme), page.evaluate(colour)) == ("day", "#0b6fae")
+        assert (page.evaluate(theme), page.evaluate(colour)) == ("day", DAY[0])
         page.locator("#theme").click()
-        page.wait_for_function(f"{colour} === '#56b4e9'")
+        page.wait_for_function(f"{colour} === '{NIGHT[0]}'")
         assert page.evaluate(theme) == "night"
 
 

@@ -5,8 +5,12 @@ import { readFileSync } from "node:fs";
 import { test } from "node:test";
 
 import { PALETTES } from "../../runner/page/static/colours.js";
+import { AMBER, RED } from "../../runner/page/static/overlay.js";
 
-const APART = 20; // CIE 1976 colour difference; 2.3 is just noticeable
+// Least CIEDE2000 differences: about 1 is just noticeable side by side; small swatches far apart need many times that.
+const APART = { all: 24, "all but red": 15, "all but green": 15, "all but blue": 15 };
+const UNLIKE_ALARMS = 15;
+const LIGHTNESS = { night: [50, 95], day: [30, 60] }; // L*: darker by day, all look black in a small swatch
 const TEXT = 4.5; // WCAG 2.1, 1.4.3
 const GRAPHIC = 3; // 1.4.11
 // Of linear RGB, by dichromacy: Machado, Oliveira and Fernandes, IEEE TVCG 15 (2009), severity 1.
@@ -28,19 +32,65 @@ function lab(rgb) {
   return [116 * y - 16, 500 * (x - y), 200 * (y - z)];
 }
 
+/** Sharma, Wu and Dalal: The CIEDE2000 color-difference formula, Color Research and Application 30 (2005). */
+function difference([L1, a1, b1], [L2, a2, b2]) {
+  const { cos, sin, sqrt, hypot, exp, abs, atan2, PI } = Math;
+  const radians = PI / 180;
+  const share = (chroma) => sqrt(chroma ** 7 / (chroma ** 7 + 25 ** 7));
+  const stretch = 1.5 - 0.5 * share((hypot(a1, b1) + hypot(a2, b2)) / 2);
+  const [C1, C2] = [hypot(stretch * a1, b1), hypot(stretch * a2, b2)];
+  const [h1, h2] = [[a1, b1], [a2, b2]].map(([a, b]) => (atan2(b, stretch * a) / radians + 360) % 360);
+  const isGrey = C1 * C2 === 0;
+  const turn = isGrey ? 0 : ((h2 - h1 + 540) % 360) - 180;
+  const [L, C, h] = [(L1 + L2) / 2, (C1 + C2) / 2, isGrey ? h1 + h2 : h1 + turn / 2];
+  const wave = (amplitude, waves, shift) => amplitude * cos((waves * h + shift) * radians);
+  const T = 1 + wave(-0.17, 1, -30) + wave(0.24, 2, 0) + wave(0.32, 3, 6) + wave(-0.2, 4, -63);
+  const away = abs((((h - 275) % 360) + 540) % 360 - 180);
+  const rotation = -2 * share(C) * sin(60 * exp(-((away / 25) ** 2)) * radians);
+  const dL = (L2 - L1) / (1 + (0.015 * (L - 50) ** 2) / sqrt(20 + (L - 50) ** 2));
+  const dC = (C2 - C1) / (1 + 0.045 * C);
+  const dH = (2 * sqrt(C1 * C2) * sin((turn / 2) * radians)) / (1 + 0.015 * C * T);
+  return sqrt(dL ** 2 + dC ** 2 + dH ** 2 + rotation * dC * dH);
+}
+
+test("the difference of colours is that of the formula's published examples", () => {
+  const examples = [
+    [[50, 2.6772, -79.7751], [50, 0, -82.7485], 2.0425],
+    [[50, -1, 2], [50, 0, 0], 2.3669],
+    [[50, 2.49, -0.001], [50, -2.49, 0.0011], 7.2195],
+    [[50, 2.5, 0], [73, 25, -18], 27.1492],
+    [[60.2574, -34.0099, 36.2677], [60.4626, -34.1751, 39.4387], 1.2644],
+    [[22.7233, 20.0904, -46.694], [23.0331, 14.973, -42.5619], 2.0373],
+    [[2.0776, 0.0795, -1.135], [0.9033, -0.0636, -0.5514], 0.9082],
+  ];
+  for (const [a, b, expected] of examples) assert.equal(difference(a, b).toFixed(4), expected.toFixed(4));
+});
+
 const luminance = (colour) => times(SRGB, linear(colour))[1];
 function contrast(a, b) {
   const [low, high] = [luminance(a), luminance(b)].sort((x, y) => x - y);
   return (high + 0.05) / (low + 0.05);
 }
 
-for (const [theme, palette] of Object.entries(PALETTES))
+const seenBy = (matrix, colour) => lab(times(matrix, linear(colour)).map((each) => Math.min(1, Math.max(0, each))));
+
+for (const [theme, palette] of Object.entries(PALETTES)) {
   for (const [who, matrix] of Object.entries(SEEN))
     test(`${theme}: no two cameras look alike to eyes with ${who} cones`, () => {
-      const seen = palette.map((colour) => lab(times(matrix, linear(colour)).map((each) => Math.min(1, Math.max(0, each)))));
-      const near = seen.flatMap((a, i) => seen.slice(0, i).flatMap((b, j) => (Math.hypot(...a.map((each, k) => each - b[k])) < APART ? [[j, i]] : [])));
-      assert.deepEqual(near, []);
+      const seen = palette.map((colour) => seenBy(matrix, colour));
+      const pairs = seen.flatMap((a, i) => seen.slice(0, i).map((b, j) => ({ pair: [palette[j], palette[i]], by: difference(a, b) })));
+      assert.equal(pairs.length, 28); // of eight cameras
+      assert.deepEqual(pairs.filter(({ by }) => by < APART[who]), []);
     });
+  test(`${theme}: no camera is as dark or light as its background or looks like an alarm`, () => {
+    const [darkest, lightest] = LIGHTNESS[theme];
+    for (const colour of palette) {
+      const own = seenBy(SEEN.all, colour);
+      assert.ok(own[0] >= darkest && own[0] <= lightest, `${colour}: L* ${own[0].toFixed(1)}`);
+      for (const alarm of [RED, AMBER]) assert.ok(difference(own, seenBy(SEEN.all, alarm)) >= UNLIKE_ALARMS, `${colour}: ${alarm}`);
+    }
+  });
+}
 
 const sheet = readFileSync(new URL("../../runner/page/static/style.css", import.meta.url), "utf8");
 

@@ -1,8 +1,11 @@
-/** One colour per camera, the same in every tile and chart; chosen so that colour-blind users can tell them apart as well. */
+/**
+ * One colour per camera, the same in every tile and chart, and of about the same hue day and night. Also users who lack one
+ * kind of cones tell them apart, and none resembles an alarm; tests/js/colours.test.js states by how much.
+ */
 
 export const PALETTES = {
-  night: ["#56b4e9", "#ecac00", "#53f3c5", "#fff269", "#b46b99", "#ff7847", "#828af9", "#c4def9"],
-  day: ["#0b6fae", "#6c2c00", "#10372c", "#8d744d", "#45154f", "#c24100", "#6106af", "#676d7f"],
+  night: ["#8d6bfb", "#f3f123", "#ff078c", "#74901e", "#d2d3fd", "#e6ad83", "#139695", "#94fede"],
+  day: ["#1034c9", "#7f8502", "#ff0b7a", "#18530b", "#bf46fe", "#7d5f56", "#2c918b", "#880f5c"],
 };
 
 export const isDay = () => document.documentElement.dataset.theme === "day";
