@@ -1,12 +1,13 @@
 /** Charts of the last five minutes and the map. Plotly is large: it loads after the first pictures. */
 
-import { factorTicks, timeAxis } from "./axes.js";
+import { factorAxis, ticksWithin, timeAxis } from "./axes.js";
 import { listen, store } from "./store.js";
 import { colourOf, themed } from "./colours.js";
 import { byId, displayName, factor, make } from "./format.js";
 
 const SETTLE_MS = 3000; // after the first picture: while the charts load, controls do not answer for most of a second
 const AT_LATEST_MS = 5000; // if no picture is live by then
+const MARGIN = { l: 58, r: 10, t: 6, b: 40 }; // px around the axes
 const LEAST_PX = 70; // Plotly cannot place the axes in a lower chart; the rest is clipped
 const BETWEEN_MS = 60; // from one chart to the next, to avoid long tasks
 const EARTH_M = 6371000;
@@ -99,7 +100,7 @@ const axis = (title, more = {}) => ({
 
 function base(x, y, more = {}) {
   return {
-    autosize: true, margin: { l: 58, r: 10, t: 6, b: 40 }, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
+    autosize: true, margin: MARGIN, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
     font: { family: "system-ui, DejaVu Sans, sans-serif", size: 12, color: themed("text") }, xaxis: x, yaxis: y,
     showlegend: false, hovermode: "closest", hoverlabel: { font: { size: 12 } }, ...more,
   };
@@ -107,10 +108,14 @@ function base(x, y, more = {}) {
 
 const time = () => axis("seconds before now", { ...timeAxis(-(relativeTimes()[0] ?? 0)), tickangle: 0 });
 
-/** Ticks at the cameras' factors; mode S also allows values in between. */
-function factorAxis() {
-  const ticks = factorTicks(store.hello?.cameras ?? []);
-  return axis("factor", { rangemode: "tozero", tickvals: ticks, ticktext: ticks.map(factor) });
+/** @param {number} high px of the axis */
+const rates = (high) => axis("kbit/s", { rangemode: "tozero", nticks: ticksWithin(high) });
+
+/** @param {number} high px of the axis */
+function factorsAxis(high) {
+  const highest = Math.max(0, ...Object.values(store.series.cameras).flatMap(({ scaling }) => scaling.map((each) => each ?? 0)));
+  const { range, ticks } = factorAxis(store.hello?.cameras ?? [], highest, high);
+  return axis("factor", { range, tickvals: ticks, ticktext: ticks.map(factor) });
 }
 
 function mapLayout() {
@@ -122,9 +127,9 @@ function mapLayout() {
 }
 
 const charts = [
-  { id: "chart-totals", traces: totals, layout: () => base(time(), axis("kbit/s", { rangemode: "tozero" })) },
-  { id: "chart-cameras", traces: cameras, layout: () => base(time(), axis("kbit/s", { rangemode: "tozero" })) },
-  { id: "chart-factors", traces: factors, layout: () => base(time(), factorAxis()) },
+  { id: "chart-totals", traces: totals, layout: (high) => base(time(), rates(high)) },
+  { id: "chart-cameras", traces: cameras, layout: (high) => base(time(), rates(high)) },
+  { id: "chart-factors", traces: factors, layout: (high) => base(time(), factorsAxis(high)) },
   { id: "chart-map", traces: drive, layout: mapLayout },
 ];
 const config = { displaylogo: false, displayModeBar: false, responsive: false, doubleClick: false };
@@ -135,7 +140,7 @@ function draw(chart) {
   const element = byId(chart.id);
   if (!globalThis.Plotly || !visible.has(chart.id) || document.hidden || !element.clientHeight) return;
   const size = { width: element.clientWidth, height: Math.max(LEAST_PX, element.clientHeight), autosize: false };
-  Plotly.react(element, chart.traces(), { ...chart.layout(), ...size }, config);
+  Plotly.react(element, chart.traces(), { ...chart.layout(size.height - MARGIN.t - MARGIN.b), ...size }, config);
   document.getElementById("js-plotly-tester")?.setAttribute("aria-hidden", "true"); // Plotly measures text in it
 }
 
