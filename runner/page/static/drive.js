@@ -7,10 +7,10 @@ import { Attention } from "./attention.js";
 import { isGuided, nextChoice } from "./guides.js";
 import { controlWarning } from "./control.js";
 import { linkFault } from "./header.js";
-import { reportAttention, showGuides } from "./link.js";
+import { reportAttention } from "./link.js";
 import { monitored, ownPictures } from "./monitored.js";
 import { showProblem } from "./requests.js";
-import { SHAPES } from "./tiles.js";
+import { SHAPES, showLines } from "./tiles.js";
 import { limitReasons, pauseReason } from "./total.js";
 import { showUplinks, uplinkLines } from "./uplinks.js";
 import { byId, displayName, latency, setAttribute, setText, whole } from "./format.js";
@@ -147,7 +147,7 @@ export function toggleGuides() {
 function refreshGuides() {
   const cameras = placedCameras();
   const guided = store.view !== "configure" ? cameras.filter((camera) => isGuided(camera, guidesChoice())).map(({ name }) => name) : [];
-  showGuides(guided);
+  showLines(guided);
   byId("guides").hidden = !cameras.length;
   const isPartial = guidesChoice() === "calibrated" && guided.length < cameras.length;
   setText(byId("guides"), guided.length ? `Guides on${isPartial ? ` (${guided.length})` : ""}` : "Guides off");

@@ -1,29 +1,29 @@
 /**
- * The guides of one camera, drawn by the worker into its picture. With a canvas of their own above each picture, the browser would
- * copy and blend twice as many canvases: without a GPU that takes as long as drawing the lines.
+ * The guides of one camera, drawn by the worker into a canvas of their own above its picture: in px of the screen, however few the
+ * picture has, and only when they change.
  */
 
-import { readably } from "./overlay.js";
+import { imageToBox, toBox } from "./framing.js";
 import { imageOf, pathGuides, straightGuides } from "./guides.js";
 import { projection } from "./projection.js";
+import { resize } from "./resizing.js";
 
 export const COLOURS = { width: "#ffffff", distance: "#ffffff", path: "#5cd6ff" };
 const LINE_WIDTHS = { width: 1.5, distance: 1.5, path: 3 }; // CSS px, on a picture of 960 px
 const OUTLINE = 2; // CSS px, likewise
 export const ESTIMATED = "ESTIMATED"; // label of what is computed for a camera that is not calibrated
 const USUAL_PX = 960;
-const STRAIGHT_PX = 0.25; // of the canvas: points closer to a straight line are left out
+const STRAIGHT_PX = 0.25; // of the screen: points closer to a straight line are left out
 export const STEERING_STEP_RAD = 1e-3; // a smaller change of the steering moves no line by a pixel
 
 /** @typedef {{kind: string, metres: number|null, pieces: import("./projection.js").Point[][]}} Line */
 /** @typedef {{lines: Line[], strokes: Map<string, Path2D>}} InCanvas lines in the canvas, px, and what is stroked for each kind */
 /**
  * @typedef {object} Shown how a picture is shown
- * @property {import("./framing.js").Rectangle} region of the full image that the canvas shows, px
+ * @property {import("./framing.js").Rectangle} region of the full image that it shows, px
  * @property {number|null} rad steering when it was captured; null: unknown
- * @property {import("./framing.js").Rectangle} area the part of the canvas that is on the screen
- * @property {number} css px of the canvas per CSS px
- * @property {boolean} mirrored whether the canvas is mirrored
+ * @property {import("./framing.js").Size} picture px of the canvas with the picture
+ * @property {{width: number, height: number, ratio: number, view: import("./framing.js").View}} display its box, CSS px, and px per CSS px
  */
 
 /** @type {InCanvas} */
@@ -31,8 +31,11 @@ const NOTHING = { lines: [], strokes: new Map() };
 
 export class GuideLines {
   shown = false;
+  isResizeDue = false; // whether the canvas keeps an old size for now
+  /** @type {OffscreenCanvasRenderingContext2D|null} */
+  context = null;
   /** @type {Line[]} */
-  drawn = []; // for tests: in the canvas, px
+  drawn = []; // in the canvas, px; empty: nothing is
   /** @type {{rad: number, lines: Line[]}} */
   paths = { rad: NaN, lines: [] }; // in the full image
   /** @type {{where: string, rad: number|null, straight: InCanvas, wheels: InCanvas}} */
@@ -47,6 +50,12 @@ export class GuideLines {
     this.label = camera.calibrated ? "" : ESTIMATED;
     this.toImage = projection(camera);
     this.straight = this.straightLines();
+  }
+
+  /** @param {OffscreenCanvas} canvas */
+  attach(canvas) {
+    this.context = canvas.getContext("2d", { desynchronized: true });
+    this.drawn = [];
   }
 
   /** Set the picture's optics: straightened, or the original. @param {import("./projection.js").Optics} optics */
@@ -72,38 +81,48 @@ export class GuideLines {
   }
 
   /**
-   * Place the lines in the canvas; those that have not moved since the last picture take no time.
-   * @param {import("./framing.js").Rectangle} region  @param {{width: number, height: number}} canvas  @param {number|null} rad
-   */
-  place(region, { width, height }, rad) {
-    const where = [region.x, region.y, region.width, region.height, width, height].join();
-    const rounded = rad === null ? null : STEERING_STEP_RAD * Math.round(rad / STEERING_STEP_RAD);
-    const moved = where !== this.placed.where;
-    if (!moved && rounded === this.placed.rad) return;
-    const toCanvas = ({ x, y }) => ({ x: ((x - region.x) * width) / region.width, y: ((y - region.y) * height) / region.height });
-    const straight = moved ? inCanvas(this.straight, toCanvas) : this.placed.straight;
-    this.placed = { where, rad: rounded, straight, wheels: rounded === null ? NOTHING : inCanvas(this.pathsFor(rounded), toCanvas) };
-  }
-
-  /**
-   * Draw the guides over the picture in its canvas.
-   * @param {OffscreenCanvasRenderingContext2D} context
+   * Draw the guides over a picture; those that have not moved since the last one take no time.
    * @param {Shown|null} seen null: no moving picture, or an unknown region
    */
-  draw(context, seen) {
-    this.drawn = [];
-    if (!this.shown || !seen) return;
-    const { region, rad, area, css, mirrored } = seen;
-    this.place(region, context.canvas, rad);
+  draw(seen) {
+    const { context } = this;
+    if (!context) return;
+    if (!this.shown || !seen) return this.clear(context);
+    const { display, picture } = seen;
+    const [width, height] = [Math.round(display.width * display.ratio), Math.round(display.height * display.ratio)];
+    this.isResizeDue = !resize(context.canvas, { width, height });
+    if (this.isResizeDue) return this.clear(context); // in the old size, the browser would stretch them
+    if (!this.place(seen) && this.drawn.length) return;
+    this.clear(context);
     this.drawn = [...this.placed.straight.lines, ...this.placed.wheels.lines];
-    const thick = css * Math.min(1.5, Math.max(0.6, context.canvas.width / css / USUAL_PX));
-    context.save();
-    this.strokeAll(context, thick);
-    context.restore();
-    readably(context, area, mirrored, () => {
-      labelDistances(context, this.drawn, area, mirrored, css);
-      if (this.label) labelPicture(context, this.label, { left: 0, top: 0, bottom: area.height }, css);
-    });
+    const whole = toBox({ x: 0, y: 0, ...picture }, display, picture, display.view);
+    this.strokeAll(context, display.ratio * Math.min(1.5, Math.max(0.6, whole.width / USUAL_PX)));
+    const visible = inside(whole, display, display.ratio);
+    labelDistances(context, this.drawn, visible, display.ratio);
+    if (this.label) labelPicture(context, this.label, visible, display.ratio);
+  }
+
+  clear(context) {
+    if (this.drawn.length) context.clearRect(0, 0, context.canvas.width, context.canvas.height);
+    this.drawn = [];
+  }
+
+  /** Place the lines in the canvas. @param {Shown} seen  @returns {boolean} whether they have moved */
+  place({ region, rad, picture, display }) {
+    const { width, height, ratio, view } = display;
+    const { x, y, width: wide, height: high } = region;
+    const where = [x, y, wide, high, picture.width, picture.height, width, height, ratio, view.fit, view.align, view.mirrored].join();
+    const rounded = rad === null ? null : STEERING_STEP_RAD * Math.round(rad / STEERING_STEP_RAD);
+    const moved = where !== this.placed.where;
+    if (!moved && rounded === this.placed.rad) return false;
+    const inBox = imageToBox(display, picture, view, region);
+    const toCanvas = (point) => {
+      const at = inBox(point);
+      return { x: at.x * ratio, y: at.y * ratio };
+    };
+    const straight = moved ? inCanvas(this.straight, toCanvas) : this.placed.straight;
+    this.placed = { where, rad: rounded, straight, wheels: rounded === null ? NOTHING : inCanvas(this.pathsFor(rounded), toCanvas) };
+    return true;
   }
 
   /** All outlines, and then the lines, so that no outline covers a line; those of one kind at once. */
@@ -166,20 +185,34 @@ function areNear(points, from, to) {
   return true;
 }
 
-/** Write the distances next to the right ends of their lines, as seen on the screen, where there is room. */
-function labelDistances(context, lines, area, mirrored, css) {
-  const size = fontSize({ top: 0, bottom: area.height }, 0.028, css);
+/** @typedef {{left: number, top: number, right: number, bottom: number}} Sides */
+
+/**
+ * The part of a picture that is on the screen.
+ * @param {import("./framing.js").Rectangle} whole in its box  @param {import("./framing.js").Size} box
+ * @param {number} ratio px per unit of both
+ * @returns {Sides}
+ */
+function inside({ x, y, width, height }, box, ratio) {
+  const [left, top] = [Math.max(0, x), Math.max(0, y)];
+  const [right, bottom] = [Math.min(box.width, x + width), Math.min(box.height, y + height)];
+  return { left: left * ratio, top: top * ratio, right: right * ratio, bottom: bottom * ratio };
+}
+
+/** Write the distances next to the right ends of their lines, where there is room. @param {Sides} visible */
+function labelDistances(context, lines, visible, css) {
+  const size = fontSize(visible, 0.028, css);
   context.font = `600 ${size}px system-ui, "DejaVu Sans", sans-serif`;
   context.textAlign = "start";
   context.textBaseline = "middle";
-  const onScreen = ({ x, y }) => ({ x: mirrored ? area.x + area.width - x : x - area.x, y: y - area.y });
+  const { left, top, right, bottom } = visible;
   /** @type {{x: number, y: number}[]} */
   const labelled = [];
   for (const { metres, pieces } of lines.filter((line) => line.kind === "distance")) {
     const words = `${metres} m`;
-    const ends = pieces.flatMap((piece) => [piece[0], piece[piece.length - 1]].map(onScreen)).sort((a, b) => b.x - a.x);
+    const ends = pieces.flatMap((piece) => [piece[0], piece[piece.length - 1]]).sort((a, b) => b.x - a.x);
     const wide = context.measureText(words).width + size;
-    const at = ends.find(({ x, y }) => x >= 0 && x + wide <= area.width && y >= size && y <= area.height - size);
+    const at = ends.find(({ x, y }) => x >= left && x + wide <= right && y >= top + size && y <= bottom - size);
     if (!at || labelled.some(({ x, y }) => Math.abs(at.x - x) < wide && Math.abs(at.y - y) < 1.2 * size)) continue;
     labelled.push(at);
     context.lineWidth = size / 4;

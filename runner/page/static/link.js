@@ -73,10 +73,11 @@ function onWorkerRecovered(ages) {
 
 export const send = (message) => worker.postMessage({ order: "send", message });
 
-export function transferCanvas(name, element) {
+/** Transfer the canvases of a camera to the worker: one for its picture, one for the lines above it. */
+export function transferCanvases(name, ...elements) {
   if (!canShowVideo) return;
-  const canvas = element.transferControlToOffscreen();
-  worker.postMessage({ order: "canvas", name, canvas }, [canvas]);
+  const [canvas, lines] = elements.map((element) => element.transferControlToOffscreen());
+  worker.postMessage({ order: "canvas", name, canvas, lines }, [canvas, lines]);
 }
 
 /**

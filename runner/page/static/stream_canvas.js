@@ -1,9 +1,9 @@
 /** The canvas of one camera in the worker: its picture, what is written over it, and the lines on the ground. */
 
-import { imageToBox, placement, visible, WHOLE } from "./framing.js";
+import { placement, visible, WHOLE } from "./framing.js";
 import { ESTIMATED, GuideLines, labelPicture } from "./guide_lines.js";
 import { drawNote, drawOverlay, readably } from "./overlay.js";
-import { hasGpu, paintImage } from "./picture.js";
+import { paintImage } from "./picture.js";
 import { resize } from "./resizing.js";
 import { STALLED } from "./status.js";
 import { straightOptics } from "./straight.js";
@@ -24,7 +24,7 @@ export class StreamCanvas {
   /** @type {OffscreenCanvasRenderingContext2D|null} */
   context = null;
   isFresh = true; // whether nothing was painted into the canvas yet
-  isResizeDue = false; // whether the canvas keeps an old size for now
+  isPictureResizeDue = false; // whether the canvas keeps an old size for now
   display = { width: 0, height: 0, ratio: 1, view: WHOLE };
   /** @type {string|null} */
   painted_text = ""; // text in the canvas, "" for the plain picture; null: to be painted again
@@ -35,16 +35,23 @@ export class StreamCanvas {
     this.guides = camera.pose && dimensions ? new GuideLines(camera, dimensions) : null;
   }
 
-  attach(canvas) {
+  /** @param {OffscreenCanvas} canvas  @param {OffscreenCanvas} lines above it */
+  attach(canvas, lines) {
     this.canvas = canvas;
     this.isFresh = true;
     this.context = canvas.getContext("2d", { alpha: false, desynchronized: true });
+    this.guides?.attach(lines);
     this.painted_text = null;
   }
 
   /** Whether it is shown. */
   get isShown() {
     return this.display.width > 0;
+  }
+
+  /** Whether a canvas waits for its new size. */
+  get isResizeDue() {
+    return this.isPictureResizeDue || Boolean(this.guides?.isResizeDue);
   }
 
   setStraight(on) {
@@ -58,7 +65,7 @@ export class StreamCanvas {
     this.resize(canvas, shown, isStraight, STALLED.includes(status));
     if (shown && !["off", "refused", "unsupported"].includes(status)) paintPicture(context, shown, isStraight);
     else blank(context);
-    this.drawGuides(context, canvas, steered);
+    this.guides?.draw(steered && { ...steered, picture: canvas, display: this.display });
     if (isStraight && shown?.image && !this.camera.calibrated && !this.guides?.shown) this.labelEstimate(context, canvas);
     const { mirrored } = this.display.view;
     if (note) drawNote(context, this.visibleArea(canvas), mirrored, note);
@@ -72,19 +79,11 @@ export class StreamCanvas {
     return this.context !== null && this.painted_text !== textOf(text, note);
   }
 
-  /** Draw the guides over the picture in the canvas; none over a stalled one, since nobody may steer by it. */
-  drawGuides(context, canvas, steered) {
-    const area = this.visibleArea(canvas);
-    const css = (canvas.width * this.display.ratio) / (this.widthOnScreen(canvas) || canvas.width);
-    this.guides?.draw(context, steered && { ...steered, area, css, mirrored: this.display.view.mirrored });
-  }
-
   /** For tests: the guides that are drawn, in CSS px of the picture's box. */
   guideLines() {
-    const { canvas, guides, display } = this;
-    if (!canvas || !guides) return undefined;
-    const toBox = imageToBox(display, canvas, display.view, { x: 0, y: 0, width: canvas.width, height: canvas.height });
-    return guides.drawn.map((line) => ({ ...line, pieces: line.pieces.map((piece) => piece.map(toBox)) }));
+    const { ratio } = this.display;
+    const inBox = ({ x, y }) => ({ x: x / ratio, y: y / ratio });
+    return this.guides?.drawn.map((line) => ({ ...line, pieces: line.pieces.map((piece) => piece.map(inBox)) }));
   }
 
   /** A picture straightened by optics that nobody has measured says so, as lines on the ground do. */
@@ -96,19 +95,16 @@ export class StreamCanvas {
 
   /**
    * The canvas has the picture's size. For a lasting alarm it is an integer multiple of it, close to the size on the
-   * screen, so that words are sharp while the aspect ratio, and with it the page's layout, stays the same; for guides,
-   * too, if the browser scales pictures with a GPU.
+   * screen, so that words are sharp while the aspect ratio, and with it the page's layout, stays the same.
    */
   resize(canvas, shown, isStraight, sharp) {
     const { width: wide, height: high, ratio } = this.display;
     const box = { width: Math.round(wide * ratio) || 480, height: Math.round(high * ratio) || 270 };
     const own = isStraight ? (shown?.image ?? this.straightSize()) : (shown?.picture.painted ?? box);
-    const scale = this.widthOnScreen(own) / own.width;
-    const wanted = sharp ? Math.ceil(scale) : this.guides?.shown && hasGpu ? Math.round(scale) : 1;
-    const times = Math.min(6, Math.max(1, wanted));
+    const times = sharp ? Math.min(6, Math.max(1, Math.ceil(this.widthOnScreen(own) / own.width))) : 1;
     const size = { width: own.width * times, height: own.height * times };
     if (this.isFresh) Object.assign(canvas, size); // nothing is shown yet
-    this.isResizeDue = !resize(canvas, size);
+    this.isPictureResizeDue = !resize(canvas, size);
     this.isFresh = false;
   }
 

@@ -1,7 +1,7 @@
 /** The tiles: one per camera, with its status, its picture and the values of its stream. */
 
 import { alertStatus, camera, decisionOf, enlarge, inControl, listen, publish, select, store, whyUndecided } from "./store.js";
-import { drawFirst, reportSize, transferCanvas } from "./link.js";
+import { drawFirst, reportSize, showGuides, transferCanvases } from "./link.js";
 import { pending, request, whyNoControl } from "./requests.js";
 import { dragRegion, shownRegion } from "./roi.js";
 import { RegionFrame, showsPart } from "./region_frame.js";
@@ -109,16 +109,18 @@ function showNoVideo() {
 
 function buildTile({ name }) {
   const canvas = make("canvas", { "data-name": name, role: "img", "aria-label": `picture of ${displayName(name)}` });
+  const lines = make("canvas", { class: "lines", "aria-hidden": "true", hidden: true });
   const parts = {
     view: WHOLE,
     measured: { width: 0, height: 0 },
     canvas,
+    lines,
     swatch: make("span", { class: "swatch", "aria-hidden": "true" }),
     shown: make("span", { class: "shown" }),
     shape: make("span"),
     word: make("span", { class: "word" }),
     on: make("button", { class: "switch", role: "switch", tabindex: "0", onclick: () => switchCamera(name) }),
-    box: make("div", { class: "picture", "data-name": name }, canvas),
+    box: make("div", { class: "picture", "data-name": name }, canvas, lines),
     rates: make("span", { class: "rates" }),
     form: make("span", { class: "form" }),
     frame: new RegionFrame(),
@@ -138,10 +140,16 @@ function buildTile({ name }) {
   parts.box.addEventListener("dblclick", () => enlarge(store.enlarged === name ? null : name));
   parts.on.addEventListener("dblclick", (event) => event.stopPropagation());
   tiles.set(name, { element, status, reason, refused, ...parts });
-  transferCanvas(name, canvas);
+  transferCanvases(name, canvas, lines);
   dragRegion(name, parts.box, () => tiles.get(name).view);
   zoomRegion(name, parts.box, () => tiles.get(name).view);
   sizes.observe(parts.box);
+}
+
+/** Show the lines on the ground of these cameras only; a hidden canvas costs nothing. @param {string[]} names */
+export function showLines(names) {
+  for (const [name, { lines }] of tiles) lines.hidden = !names.includes(name);
+  showGuides(names);
 }
 
 /** A name that may be broken into lines after its underscores. @param {string} name */

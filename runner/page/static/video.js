@@ -283,8 +283,8 @@ const orders = {
     setInterval(reportAges, REPORT_MS);
     setInterval(() => send({ clock: now() }), 1000);
   },
-  canvas({ name, canvas }) {
-    find(name)?.canvas.attach(canvas);
+  canvas({ name, canvas, lines }) {
+    find(name)?.canvas.attach(canvas, lines);
     wake();
   },
   guided({ names }) {
