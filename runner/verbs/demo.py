@@ -2,8 +2,9 @@
 
 Runs both sides on this machine: vehicle and operator as two processes over real RTSP and a real control link, along a
 drive through a bandwidth map in mode A. Open the page that it prints, http://127.0.0.1:8090/, in a browser; the table
-in the terminal shows the same. Every camera runs at 3 Hz for each core, so that two cores also draw the page of the
-eight cameras without a GPU; to change this, give fps_max=40, or null for the cameras' own rates.
+in the terminal shows the same. It shows as many cameras, the front one first, as this machine's cores draw at 15 Hz or
+more without a GPU, and says which ones it left out. A vehicle, cameras, a rate or an experiment that you name is driven
+as it is: vehicle=tum_q7 for all eight cameras; fps_max=40 for another rate, or null for the cameras' own.
 
 With log=DIR both sides write their logs to DIR. With output=OUT a report is written at the end, as by the verb report
 (models= is passed to it); the drive is stored in OUT/drive, unless log= names another directory. An experiment defines
@@ -16,6 +17,7 @@ started separately with output=OUT/0, OUT/1, ... and log=DIR/0, DIR/1, ...; all 
 OUT/runs.jsonl, or DIR/runs.jsonl, has a line for each run: its directory and its overrides.
 
   tod-runner demo                                             synthetic drive, a minute
+  tod-runner demo vehicle=tum_q7                              all its cameras
   tod-runner demo duration_s=3600                             an hour
   tod-runner demo vehicle=delivery_robot duration_s=20
   tod-runner demo source=file source.clip=clip.mp4            every camera shows your clip
@@ -31,6 +33,8 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import shlex
 import tempfile
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -56,10 +60,11 @@ from runner.system import children, signals
 from runner.system.children import VerbProcess
 from runner.system.files import write_whole
 from runner.verbs import Arguments
+from runner.verbs.demo_choice import highest_rate, showable
 from runner.verbs.report import check_report, report
-from runner.verbs.screen import progress_bar, say, streaming
+from runner.verbs.screen import command_name, progress_bar, say, streaming
 
-FPS_PER_CORE = 3  # Hz; eight cameras are encoded, sent, decoded and drawn without a GPU at this rate
+AS_GIVEN = ("vehicle", "cameras", "fps_max", "experiment")  # what keeps all cameras, if the user gives one of them
 LOOK_S = 0.05  # how soon the other side is stopped once one has ended
 SIDE_END_S = signals.END_S + 0.2  # a side ends itself by force before it is killed
 END_S = 2.8  # both sides, link and broker
@@ -89,9 +94,13 @@ class _Run(NamedTuple):
 
 
 class _Demo(NamedTuple):
-    """The drives of an experiment, or the only one, and the report on them."""
+    """The drives of an experiment, or the only one, and the report on them.
+
+    shown  what is said of cameras and rate, if they were chosen for this machine
+    """
 
     about: str
+    shown: list[str]
     runs: list[_Run]
     output: Path | None
     models: Path | None
@@ -126,7 +135,7 @@ def _sweep(arguments: Arguments, apply: ModuleType) -> int:
 
 def _prepare_demo(arguments: Arguments, apply: ModuleType) -> _Demo:
     """Collect and check everything a demo needs, before it begins."""
-    arguments, config = _with_rate(arguments)
+    arguments, config, shown = with_shown(arguments)
     experiment, link = config.experiment(), config.link()
     output, models = arguments.path("output"), arguments.path("models")
     if output:
@@ -139,12 +148,12 @@ def _prepare_demo(arguments: Arguments, apply: ModuleType) -> _Demo:
         for name, words in (experiment.runs or {"": ()}).items()
     ]
     bases = [base / "cameras" for base in conf_directories(arguments.conf)]
-    return _Demo(experiment.about, runs, output, models, bases)
+    return _Demo(experiment.about, shown, runs, output, models, bases)
 
 
 def _run_demo(demo: _Demo) -> None:
-    if demo.about:
-        say(demo.about)
+    for line in (*([demo.about] if demo.about else []), *demo.shown):
+        say(line)
     driven = list[Path]()
     for number, one in enumerate(demo.runs, 1):
         if one.name:
@@ -208,15 +217,47 @@ def _prepare_run(
     return _Run(name, own, setup, directory, link, config.document, duration_s, keys)
 
 
-def _with_rate(arguments: Arguments) -> tuple[Arguments, Configuration]:
-    """Add a frame rate that this machine can handle, if neither the user nor an experiment gives one."""
+def with_shown(arguments: Arguments) -> tuple[Arguments, Configuration, list[str]]:
+    """Add cameras and frame rate that this machine can show, where neither the user nor an experiment states them.
+
+    returns  also what to say about it
+    raises   ConfigError
+    """
     config = configuration(arguments.overrides, arguments.conf, runnable=False)
-    named = any(word.lstrip("+~").startswith("fps_max") for word in arguments.overrides)
-    if named or config.document.get("fps_max") is not None:
-        return arguments, config
-    fps_max = f"fps_max={FPS_PER_CORE * len(os.sched_getaffinity(0))}"
-    arguments = replace(arguments, overrides=[fps_max, *arguments.overrides])
-    return arguments, configuration(arguments.overrides, arguments.conf, runnable=False)
+    if config.document.get("fps_max") is not None or _about(arguments.overrides, ["fps_max"]):
+        return arguments, config, []
+    cameras, cores = list(config.vehicle().cameras.values()), len(os.sched_getaffinity(0))
+    names = [camera.name for camera in cameras]
+    every = choice = highest_rate(cameras, cores)
+    if arguments.conf is None and not _about(arguments.overrides, AS_GIVEN, names):
+        choice = showable(cameras, cores)
+    left_out = [name for name in names if name not in choice.cameras]
+    words = [f"~cameras.{name}" for name in left_out]
+    words += [f"fps_max={choice.fps_max}"] if choice.fps_max else []
+    chosen = replace(arguments, overrides=[*words, *arguments.overrides])
+    told = []
+    if left_out:
+        told = [f"left out: {', '.join(left_out)}", f"all {len(names)}{every.rate}: {_command(arguments, config)}"]
+    elif choice.fps_max:
+        told = ["fps_max=null: the cameras' own rates"]
+    if told:
+        count = f"{len(choice.cameras)} of {len(names)}" if left_out else f"all {len(names)}"
+        told = [f"{count} cameras{choice.rate}: what {cores} cores draw", *told]
+    return chosen, configuration(chosen.overrides, chosen.conf, runnable=False), told
+
+
+def _about(overrides: Iterable[str], keys: Sequence[str], names: Sequence[str] = ()) -> bool:
+    """Whether one of the overrides sets one of these keys, or mentions one of these names."""
+    mentioned = re.compile(rf"\b({'|'.join(map(re.escape, names))})\b") if names else None
+    return any(
+        re.split("[.=@]", word.lstrip("+~/"))[0] in keys or (mentioned and mentioned.search(word)) for word in overrides
+    )
+
+
+def _command(arguments: Arguments, config: Configuration) -> str:
+    """The command line that drives all cameras of the vehicle."""
+    given = [*arguments.overrides, *(f"{key}={value}" for key, value in arguments.values.items())]
+    return shlex.join([command_name(), "demo", *given, f"vehicle={config.choices['vehicle']}"])
 
 
 def _directory(arguments: Arguments, run: str) -> Path | None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from types import ModuleType
 from typing import IO, cast
 
@@ -14,6 +16,7 @@ from runner.errors import MissingBindings, RunError
 from runner.redact import printable
 from runner.system import signals
 
+NAME = "tod-runner"
 SWITCH_S = 0.0005  # the longest that a thread with a frame or a message to pass on waits for one that computes
 
 
@@ -29,6 +32,12 @@ def streaming() -> ModuleType:
         raise RunError(f"{error}; or run `make setup`") from None
     signals.check()
     return apply
+
+
+def command_name() -> str:
+    """How to start this program again: by name if the path finds it, otherwise as it was started."""
+    started = sys.argv[0]
+    return NAME if shutil.which(NAME) or Path(started).name != NAME else started
 
 
 class _Forgiving:
