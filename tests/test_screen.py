@@ -5,10 +5,13 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import IO
 
 import pytest
+from rich.console import Console
 
+from runner.operator.meter import ReceptionMeter
 from runner.records.lines import Note
 from runner.verbs.screen import progress_bar, say
 from runner.verbs.table import LiveTable, show_summary
@@ -57,3 +60,21 @@ def test_progress_that_does_not_interrupt(monkeypatch: pytest.MonkeyPatch) -> No
         progress("front", 0.5)
     with pytest.raises(KeyboardInterrupt), progress_bar() as progress:
         progress("front", 0.5)
+
+
+def test_the_page_is_announced_above_the_table(capsys: pytest.CaptureFixture[str]) -> None:
+    with LiveTable() as table:
+        table.announce("page: http://127.0.0.1:8090/ (Ctrl-C ends)")
+        table.show([], "mode A")
+    first, *_ = capsys.readouterr().out.splitlines()
+    assert first.endswith(" page: http://127.0.0.1:8090/ (Ctrl-C ends)")
+
+
+def test_a_narrow_terminal_gets_a_summary_that_fits(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("runner.verbs.table._console", lambda: Console(file=sys.stdout, width=80))
+    show_summary({"front_center": ReceptionMeter(15)}, {"front_center": SimpleNamespace(frames=229, lost=3, rebuilt=0)})
+    out = capsys.readouterr().out
+    assert "…" not in out and max(map(len, out.splitlines())) <= 80
+    assert out.splitlines()[-2].split() == ["front_center", "229", "15", "0", "of", "0", "-", "-", "3"]

@@ -140,7 +140,7 @@ def _distribute(views: Sequence[View], seconds: float, cache: Path, world: Path,
                     clips += 1
                     if waiting:
                         pipe.send(waiting.pop(0))
-                progress(f"rendering the drive, {clips} of {len(views)} clips", min(done / total, 1.0))
+                progress("rendering the drive, once", min(done / total, 1.0))
     finally:
         for pipe, worker in workers.items():
             worker.kill()

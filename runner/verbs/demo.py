@@ -237,12 +237,15 @@ def with_shown(arguments: Arguments) -> tuple[Arguments, Configuration, list[str
     chosen = replace(arguments, overrides=[*words, *arguments.overrides])
     told = []
     if left_out:
-        told = [f"left out: {', '.join(left_out)}", f"all {len(names)}{every.rate}: {_command(arguments, config)}"]
+        told = [
+            f"{len(choice.cameras)} of {len(names)} cameras{choice.rate}: as many as {cores} cores show smoothly",
+            f"left out: {', '.join(left_out)}",
+            f"all {len(names)}{every.rate}: {_command(arguments, config)}",
+        ]
     elif choice.fps_max:
-        told = ["fps_max=null: the cameras' own rates"]
-    if told:
-        count = f"{len(choice.cameras)} of {len(names)}" if left_out else f"all {len(names)}"
-        told = [f"{count} cameras{choice.rate}: what {cores} cores draw", *told]
+        told = [
+            f"{len(names)} cameras{choice.rate}: as fast as {cores} cores show them; fps_max=null: at their own rates"
+        ]
     return chosen, configuration(chosen.overrides, chosen.conf, runnable=False), told
 
 

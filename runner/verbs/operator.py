@@ -23,7 +23,7 @@ only while somebody looks at them. With drives=DIR those of each vehicle go to D
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -64,7 +64,8 @@ def run(arguments: Arguments) -> int:
         station = operator.station
         station.listeners.append(table)
         room = keeping_room(arguments.path("drives"), operator.setup.log, station.note)
-        with room, _served(operator, arguments.conf) as page:
+        end = "Ctrl-C ends" if duration is None else f"ends after {duration:g} s, or with Ctrl-C"
+        with room, _served(operator, arguments.conf, announce=lambda what: table.announce(f"{what} ({end})")) as page:
             operator.start(page.show if page else None, duration)
             freeze_loaded()
             with stopping(action=operator.end) as stop:
@@ -93,7 +94,7 @@ def _run_behind(socket: Path, arguments: Arguments) -> int:
     ) as operator:
         operator.station.listeners.append(_Notes())
         room = keeping_room(arguments.path("drives"), operator.setup.log, operator.station.note)
-        with room, _served(operator, arguments.conf, socket) as page:
+        with room, _served(operator, arguments.conf, socket=socket) as page:
             assert page
             operator.on_dropped = page.forget
             operator.start(page.show)
@@ -105,11 +106,14 @@ def _run_behind(socket: Path, arguments: Arguments) -> int:
 
 
 @contextmanager
-def _served(operator: LiveOperator, conf: Path | None, socket: Path | None = None) -> Iterator[PageServer | None]:
+def _served(
+    operator: LiveOperator, conf: Path | None, *, announce: Callable[[str], None] = say, socket: Path | None = None
+) -> Iterator[PageServer | None]:
     """The page, unless the configuration switches it off.
 
-    conf    the user's directory, with the operator's layouts
-    socket  see `PageServer`
+    conf      the user's directory, with the operator's layouts
+    announce  is told its address
+    socket    see `PageServer`; then there is none
     """
     setup, station = operator.setup, operator.station
     if not setup.page.serve:
@@ -125,7 +129,7 @@ def _served(operator: LiveOperator, conf: Path | None, socket: Path | None = Non
     station.listeners.append(page)
     page.start()
     if socket is None:
-        station.note(f"page: {page.url}")
+        announce(f"page: {page.url}")
     try:
         yield page
     finally:

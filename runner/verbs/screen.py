@@ -73,7 +73,7 @@ def say(what: str) -> None:
 
 @contextmanager
 def progress_bar(*, interrupts: bool = True) -> Iterator[Progress]:
-    """Shows the progress of long work once it is reported. Without a terminal, prints a line for each tenth.
+    """Shows the progress of long work while it lasts. Without a terminal, prints a line for each tenth.
 
     interrupts  whether a signal interrupts work in the main thread when it reports its progress
     """
@@ -86,7 +86,7 @@ def progress_bar(*, interrupts: bool = True) -> Iterator[Progress]:
     from rich.progress import Progress as Bars
 
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-    with Bars(*columns, console=Console(file=forgiving(sys.stderr))) as bars:
+    with Bars(*columns, console=Console(file=forgiving(sys.stderr)), transient=True) as bars:
         tasks: dict[str, int] = {}
 
         def progress(what: str, done: float) -> None:

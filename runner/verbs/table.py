@@ -32,7 +32,20 @@ MAX_PENDING = 1000
 WHY = "why"
 HEADINGS = ("fps", "kbit/s", "allocated", "demand", "size", "factor", "latency ms", "lost", WHY)
 NARROW = ("fps", "kbit/s", "allocated", "size", "latency ms", "lost")
+SUMMARY = (
+    *(
+        "frames",
+        "Hz",
+        "seconds short\nof frames",
+        "kbit/s of\nallocated",
+        "seconds at the\ndecided size",
+        "sizes\nseen",
+    ),
+    *("latency ms\nmedian", "p95", "packets\nlost", "rebuilt"),
+)
+IN_SHORT = ("frames", "Hz", "seconds short\nof frames", "latency ms\nmedian", "p95", "packets\nlost")
 WHOLE = 110  # columns from which all of these fit
+WHOLE_SUMMARY = 130
 MOST_NAME = 20  # columns that a camera's name keeps on a narrow terminal
 
 
@@ -56,9 +69,13 @@ class LiveTable(Listener):
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self._stack.__exit__(kind, error, at)
 
+    def announce(self, text: str) -> None:
+        """Print one line that stays above the table."""
+        self._console.print(_line(time.time(), text), markup=False, highlight=False)
+
     def on_note(self, note: Note) -> None:
         """Add one line below the table, shown with its next update. May be called from any thread."""
-        self._pending.append(f"{time.strftime('%H:%M:%S', time.localtime(note.t))} {printable(note.text)}")
+        self._pending.append(_line(note.t, note.text))
 
     def show(self, rows: Sequence[CameraRow], headline: str, uplinks: Sequence[UplinkRow] = ()) -> None:
         while self._pending:
@@ -72,6 +89,10 @@ class LiveTable(Listener):
         elif time.monotonic() - self._shown >= PLAIN_EVERY_S:
             self._shown = time.monotonic()
             self._console.print(_table(rows, title, self._console.width))
+
+
+def _line(t: float, text: str) -> str:
+    return f"{time.strftime('%H:%M:%S', time.localtime(t))} {printable(text)}"
 
 
 def _console() -> Console:
@@ -130,29 +151,33 @@ def _size_style(row: CameraRow) -> str:
 
 def show_summary(meters: Mapping[str, ReceptionMeter], received: Mapping[str, Any]) -> None:
     """Reception compared with the decisions, over the whole run."""
+    console = _console()
+    shown = IN_SHORT if console.width < WHOLE_SUMMARY else SUMMARY
     table = RichTable(title="received", title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
-    table.add_column("camera")
-    headings = ["frames", "Hz", "seconds short\nof frames", "kbit/s of\nallocated", "seconds at the\ndecided size"]
-    for heading in (*headings, "sizes\nseen", "latency ms\nmedian", "p95", "packets\nlost", "rebuilt"):
+    table.add_column("camera", overflow="fold")
+    for heading in shown:
         table.add_column(heading, justify="right", no_wrap=True)
     for name, meter in meters.items():
-        sample = received.get(name)
-        if sample is None:
-            continue
-        table.add_row(
-            name,
-            str(sample.frames),
-            f"{meter.fps:g}",
-            f"{meter.short} of {meter.windows}",
-            _share(middle(meter.followed)),
-            f"{sum(meter.sizes.values())} of {meter.windows}",
-            str(len(meter.sizes)),
-            _number(middle(meter.latencies_ms)),
-            _number(percentile(meter.latencies_ms, 0.95)),
-            str(sample.lost),
-            str(sample.rebuilt),
-        )
-    _console().print(table)
+        if sample := received.get(name):
+            cells = _summary(meter, sample)
+            table.add_row(name, *(cells[heading] for heading in shown))
+    console.print(table)
+
+
+def _summary(meter: ReceptionMeter, sample: Any) -> dict[str, str]:
+    values = (
+        str(sample.frames),
+        f"{meter.fps:g}",
+        f"{meter.short} of {meter.windows}",
+        _share(middle(meter.followed)),
+        f"{sum(meter.sizes.values())} of {meter.windows}",
+        str(len(meter.sizes)),
+        _number(middle(meter.latencies_ms)),
+        _number(percentile(meter.latencies_ms, 0.95)),
+        str(sample.lost),
+        str(sample.rebuilt),
+    )
+    return dict(zip(SUMMARY, values, strict=True))
 
 
 def _share(value: float | None) -> str:
