@@ -366,15 +366,15 @@ def test_the_published_state_names_the_operator_in_control() -> None:
     watched = Watched()
 
     def named() -> Any:
-        return next((state.operator for state in reversed(watched.of(VehicleState))), None)
+        return next((state.driving.in_control for state in reversed(watched.of(VehicleState))), None)
 
     with watched.running():
-        until(lambda: named() is UNSET)
+        until(lambda: named() == "")
         for sender, event in (("driver", "operator_connected"), ("other", "operator_connected")):
             watched.loop.take(Request(sender, {"event": event}))
         until(lambda: named() == "driver")
         watched.loop.take(Request("driver", {"event": "operator_disconnected"}))
-        until(lambda: named() is UNSET)
+        until(lambda: named() == "")
         until(lambda: (watched.loop.take(Request("other", {"event": "control_taken"})), named() == "other")[1])
 
 

@@ -148,6 +148,7 @@ def test_an_uplink_in_words() -> None:
             Driving(Control.HELD, "anna", offered="bob", requested=("bob", "eve")),
             "you are in control since {}; offered to bob; eve asks for control",
         ),
+        (Driving(Control.HELD, "bob", stop="eve"), "bob is in control since {}; eve asked to stop: advised speed 0"),
         (Driving(Control.LOST, "bob", offered="anna"), "bob is lost since {}; offered to you"),
     ],
 )

@@ -609,6 +609,11 @@ def test_a_monitor_shares_selection_and_control_with_the_page_in_its_browser():
         await stranger.send_json(request)
         await received(stranger, "reply", id="1", reason="this page does not hold control; take it first")
         assert requests == [{"event": "mode_selected", "mode": "single"}]
+        await stranger.send_json({"id": "2", "event": "stop_requested"})  # which any window may
+        await received(stranger, "reply", id="2", result="applied")
+        await stranger.send_json({"id": "3", "event": "stop_lifted"})
+        await received(stranger, "reply", id="3", reason="this page does not hold control; take it first")
+        assert requests[1:] == [{"event": "stop_requested"}]
         for window in (monitor, stranger):
             await window.send_json({"take_control": True})
             await received(window, "reply", result="refused")

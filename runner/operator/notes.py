@@ -69,6 +69,8 @@ def driver_words(driving: Driving, own: str, since: float) -> str:
     if driving.offered is not None:
         parts.append(f"offered to {named(driving.offered)}")
     asking = [named(name) for name in driving.requested if name != driving.offered]
+    if driving.stop:
+        parts.append(f"{named(driving.stop)} asked to stop: advised speed 0")
     if asking:
         parts.append(f"{', '.join(asking)} {'ask' if asking[1:] or asking == ['you'] else 'asks'} for control")
     return "; ".join(parts)

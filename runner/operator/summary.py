@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from msgspec import UNSET
 
-from runner.core.driving import Control
+from runner.core.driving import Control, Driving
 from runner.core.events import Attention
 from runner.core.model import Mode
 from runner.operator.station import Station, holds_control
@@ -88,12 +88,15 @@ def summary(station: Station) -> Summary:
 
 def _alarms(state: VehicleState) -> Iterator[str]:
     """What is wrong on the vehicle, or with its driver."""
+    driving = Driving() if state.driving is UNSET else state.driving
+    if driving.stop:
+        yield f"{driving.stop} asked to stop"
     if state.fault:
         yield state.fault
     for name, camera in state.cameras.items():
         if camera.fault:
             yield f"{name}: {camera.fault}"
-        elif state.operator and camera.on and not camera.sending:
+        elif driving.in_control and camera.on and not camera.sending:
             yield f"{name}: paused"
-    if state.operator and state.attention in UNSEEN:
+    if driving.in_control and state.attention in UNSEEN:
         yield f"the driver's page is {state.attention}"

@@ -17,7 +17,7 @@ from msgspec import UNSET
 from runner.configuration.layout import Layouts
 from runner.core.events import Attention
 from runner.core.model import Camera, plain
-from runner.core.roles import MAY_REQUEST, PRESENCE, Role
+from runner.core.roles import MAY_REQUEST, PRESENCE, STOP_REQUESTED, Role
 from runner.graph import video_codec
 from runner.h264.access_unit import AccessUnit, RecentUnits
 from runner.mqtt.messages import read_message
@@ -285,18 +285,18 @@ class PageServer(Listener):
         def answer(result: str, reason: str) -> None:
             viewer.post("reply", {"id": request_id, "result": result, "reason": reason})
 
-        if problem := self._refusal(viewer, request_id):
+        if problem := self._refusal(viewer, request_id, document.get("event")):
             answer("refused", problem)
         elif kind := next((kind for kind in ("layout", "drive") if kind in document), None):
             self._page_layouts.save(kind, document, answer)
         else:
             self._send_request(document, answer)
 
-    def _refusal(self, viewer: PageViewer, request_id: object) -> str | None:
+    def _refusal(self, viewer: PageViewer, request_id: object, event: object) -> str | None:
         """Why a viewer's request is refused; None: it is accepted."""
         if not isinstance(request_id, str) or not 0 < len(request_id) <= 64:
             return "id: must be given, as text of at most 64 characters"
-        if self._windows.holder_for(viewer) != "you":
+        if event != STOP_REQUESTED and self._windows.holder_for(viewer) != "you":
             return "this page does not hold control; take it first"
         return None
 
@@ -314,10 +314,13 @@ class PageServer(Listener):
 
 
 def _stated(state: VehicleState | None, station: Station) -> dict[str, Any]:
-    """The vehicle's state, and since when its holder has been in control, s since 1970."""
+    """The vehicle's state, and since when its holder is in control and a stop was asked for, s since 1970."""
     driving = state.driving if state else UNSET
-    since = station.own_time(driving.since) if driving is not UNSET and driving.holder else None
-    return {**state_to_json(state), "held_since": since}
+    if driving is UNSET:
+        return state_to_json(state)
+    since = station.own_time(driving.since) if driving.holder else None
+    stop = None if driving.stop_since is None else station.own_time(driving.stop_since)
+    return {**state_to_json(state), "held_since": since, "stop_since": stop}
 
 
 def _recent(camera: Camera) -> RecentUnits:

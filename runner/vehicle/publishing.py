@@ -163,7 +163,6 @@ def vehicle_state(run: Run, cameras: Mapping[str, CameraReading], t: float, caus
         states,
         run.fault,
         attention=run.state.attention or UNSET,
-        operator=run.state.driving.in_control or UNSET,
         driving=run.state.driving,
         believed=decision.believed or UNSET,
         uplinks=uplinks_decided(decision),

@@ -38,7 +38,8 @@ class Heard:
         return {camera for camera, each in cameras.items() if each["frames"]}
 
     def driver(self, name):
-        return self.state.get(name, {}).get("operator")
+        driving = self.state.get(name, {}).get("driving", {})
+        return driving.get("holder") if driving.get("state") == "held" else None
 
 
 @pytest.fixture(scope="module")

@@ -159,6 +159,15 @@ def test_operators_hand_control_over_with_pictures(chromium, drive, moving):
         says_holder(bob, "Operator alice is in control")
 
 
+def says_stop(page, who):
+    until(lambda: page.inner_text("#hand-over-words").startswith(f"{who} asked to stop at "))
+    assert page.inner_text("#hand-over-words").endswith(": advised speed 0")
+
+
+def is_advised(page, factor):
+    return page.evaluate("tod.sample?.speed_factor") == factor
+
+
 def choice(page):
     """The texts of the buttons about control."""
     return page.locator("#control button").all_inner_texts()
@@ -173,6 +182,19 @@ def test_a_supervisor_takes_control_a_watcher_may_not_and_a_driver_is_lost(chrom
             has_title(eve, "#take-control", "a watcher may not drive")
             eve.keyboard.press("t")
             until(lambda: "a watcher may not drive" in eve.inner_text("#toasts"))
+            eve.keyboard.press("x")
+            says_stop(eve, "You")
+            eve.keyboard.press("x")  # which lifts nothing
+            says_stop(alice, "eve")
+            assert not eve.get_by_text("Lift stop").count()
+            both_palettes(eve, "stop-asked")
+            for view in ("drive", "configure"):
+                both_palettes(alice, f"stop-{view}")
+                alice.keyboard.press("v")
+            until(lambda: is_advised(alice, 0))
+            alice.get_by_text("Lift stop").click()
+            until(lambda: eve.is_hidden("#hand-over"))
+            until(lambda: is_advised(alice, None))
         moving()
         with paged(chromium, drive, "sam") as sam:
             says_holder(sam, "Operator alice is in control")

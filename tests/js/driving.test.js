@@ -3,9 +3,9 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-import { choicesOf, driverWords, handOverWords, LivePictures, onlyNamed, speedWords, whoDrives } from "../../runner/page/static/driving.js";
+import { choicesOf, driverWords, handOverWords, LivePictures, speedWords, stopWords, whoDrives } from "../../runner/page/static/driving.js";
 
-const NONE = { state: "free", holder: null, since: 0, offered: null, offer_ends: null, requested: [], released: null, standing: true, why: "" };
+const NONE = { state: "free", holder: null, since: 0, offered: null, offer_ends: null, requested: [], stop: null, stop_since: null, released: null, standing: true, why: "" };
 const PRESENT = { anna: "controller", bob: "controller", eve: "watcher" };
 
 /** @returns {any} what the page of anna's station sees */
@@ -29,11 +29,6 @@ test("who drives follows from the vehicle's record and the page that acts for th
   ];
   for (const [view, who] of table) assert.equal(whoDrives(view), who);
   assert.deepEqual(["operator", "lost"].map((who) => driverWords(/** @type {any} */ (who), /** @type {any} */ (held("bob")))), ["Operator bob is in control", "Operator bob is lost"]);
-});
-
-test("a vehicle of an earlier version names who is in control, or obeys everybody", () => {
-  const who = (operator) => whoDrives({ driving: onlyNamed(operator, "anna"), own: "anna", page: "you" });
-  assert.deepEqual([who(undefined), who("anna"), who("bob")], ["you", "you", "operator"]);
 });
 
 test("the driver offers control to those who ask before others", () => {
@@ -83,6 +78,17 @@ test("everybody is told who asks and to whom control is offered", () => {
   for (const [driving, words] of table) assert.equal(handOverWords(seen(driving)), words);
   const view = seen(held("bob", { offered: "anna", requested: ["anna"] }), { unseen: ["rear"] });
   assert.equal(handOverWords(view), "bob offers control to you; waiting for pictures: rear");
+});
+
+test("whoever drives, or a supervisor, lifts a stop that somebody has asked for", () => {
+  const stop = { stop: "eve", stop_since: 5 };
+  assert.deepEqual(texts(seen(held("anna", stop))), ["Release", "Offer …", "Lift stop"]);
+  assert.deepEqual(texts(seen(held("bob", stop))), ["Request control"]);
+  assert.deepEqual(texts(seen(held("bob", { ...stop, present: { ...PRESENT, anna: "supervisor" } }))), ["Request control", "Take control", "Lift stop"]);
+  assert.deepEqual(texts(seen(stop)), ["Take control"], "then it can be lifted");
+  assert.equal(stopWords(seen(stop).driving, "anna", "14:03"), "eve asked to stop at 14:03: advised speed 0");
+  assert.equal(stopWords(seen(stop).driving, "eve"), "You asked to stop: advised speed 0");
+  assert.equal(stopWords(seen().driving, "eve"), "");
 });
 
 test("a picture counts once it has been live for a second without a break", () => {

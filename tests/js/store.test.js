@@ -5,8 +5,9 @@ import { beforeEach, test } from "node:test";
 
 import { alertStatus, camera, decisionOf, dropOldSample, enlarge, inControl, listen, mode, note, onlyWatches, onStationMessage, remind, select, store } from "../../runner/page/static/store.js";
 
-const HELLO = { kind: "hello", vehicle: "robot", cameras: [{ name: "front" }, { name: "rear" }] };
-const STATE = { kind: "state", online: true, mode: "single", cameras: { front: { kbps: 500 } } };
+const HELLO = { kind: "hello", operator: "anna", vehicle: "robot", cameras: [{ name: "front" }, { name: "rear" }] };
+const heldBy = (holder) => ({ driving: { state: "held", holder, present: {} } });
+const STATE = { kind: "state", online: true, mode: "single", cameras: { front: { kbps: 500 } }, ...heldBy("anna") };
 const published = [];
 listen("hello state sample note control history selected enlarged", (payload) => published.push(payload));
 
@@ -83,13 +84,13 @@ test("a pause alerts the driver unless nobody drives, or the camera has no weigh
 });
 
 test("refused pictures alert whoever has control of the vehicle, and nobody else", () => {
-  onStationMessage({ ...HELLO, operator: "anna", visitor: { name: "anna", may_drive: true } });
-  onStationMessage({ ...STATE, operator: "anna" });
+  onStationMessage({ ...HELLO, visitor: { name: "anna", may_drive: true } });
+  onStationMessage(STATE);
   assert.equal(alertStatus("front", "refused"), "off"); // this page has no control
   store.connected = true;
   onStationMessage({ kind: "control", holder: "you" });
   assert.equal(alertStatus("front", "refused"), "refused");
-  onStationMessage({ ...STATE, operator: "bob" });
+  onStationMessage({ ...STATE, ...heldBy("bob") });
   assert.equal(alertStatus("front", "refused"), "off");
 });
 

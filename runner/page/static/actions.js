@@ -3,6 +3,7 @@
 import { camera, enlarge, inControl, publish, select, store } from "./store.js";
 import { selectMode } from "./header.js";
 import { toggleControl } from "./control.js";
+import { askToStop } from "./stopping.js";
 import { driveRoles, focusTile, switchCamera } from "./tiles.js";
 import { scaleTotal } from "./total.js";
 import { sendFull } from "./panel.js";
@@ -64,6 +65,7 @@ export const ACTIONS = {
   keep: { description: "keep the last 60 s: mark them, and protect the drive that is logged", run: keepMoment },
   full_image: { description: "full image of the selected camera (mode S)", run: sendFull },
   control: { description: "take, request, offer, accept or release control: the first of its buttons", run: toggleControl },
+  stop: { description: "ask the vehicle to stop; whoever drives lifts it by a button", run: askToStop },
   theme: { description: "night or day theme", run: toggleTheme },
   help: { description: "show this list", run: () => publish("help") },
 };

@@ -5,7 +5,7 @@ import { pending, reportProblem, showProblem, submit, whyNoControl } from "./req
 import { send } from "./link.js";
 import { withKey } from "./hints.js";
 import { Holding } from "./holding.js";
-import { choicesOf, driverWords, handOverWords, LivePictures, speedWords } from "./driving.js";
+import { choicesOf, driverWords, handOverWords, LivePictures, speedWords, stopWords } from "./driving.js";
 import { byId, clockTime, displayName, make, setAttribute, setText } from "./format.js";
 
 /** @typedef {import("./driving.js").Choice} Choice */
@@ -30,6 +30,7 @@ function unseen() {
 }
 
 const view = () => ({ ...driverView(), unseen: unseen().map(displayName) });
+const timeOf = (time) => (time ? clockTime(time).slice(0, 5) : "");
 
 /** Whether the vehicle hears nothing from this station, and has had time to. */
 export const isUnheard = () => who() === "unheard" && holding.isSettled(performance.now());
@@ -157,16 +158,19 @@ function refresh() {
     setAttribute(byId(words), "data-holder", LEVELS[who()] ?? "nobody");
     showButtons(group, usual, choices[0], first);
   }
-  const text = isKnown && store.view !== "monitor" ? handOverWords(now) : "";
+  const stop = stopWords(now.driving, now.own, timeOf(store.state?.stop_since));
+  const words = [stop, store.view === "monitor" ? "" : handOverWords(now)].filter(Boolean);
+  const text = isKnown ? words.join(". ") : "";
   byId("hand-over").hidden = !text;
+  setAttribute(byId("hand-over"), "data-stop", stop && "true");
   setText(byId("hand-over-words"), text);
   showButtons("answers", choices.filter(({ isAnswer }) => isAnswer), choices[0], "answer");
 }
 
 function driverText() {
-  const since = store.state?.held_since;
+  const since = timeOf(store.state?.held_since);
   const words = who() !== "unheard" || isUnheard() ? driverWords(who(), store.driving) : "";
-  return words && since ? `${words} since ${clockTime(since).slice(0, 5)}` : words;
+  return words && since ? `${words} since ${since}` : words;
 }
 
 /**
@@ -191,8 +195,9 @@ function showButtons(group, choices, keyed, id) {
   buttons[focused]?.focus({ preventScroll: true });
 }
 
+const ASIDE = ["Release", "Decline", "Lift stop"];
 /** Whether a button is what its person most likely wants next. @param {Choice} choice */
-const isMain = ({ text, why, takers, from }) => !why && !["Release", "Decline"].includes(text) && !takers && from !== "operator";
+const isMain = ({ text, why, takers, from }) => !why && !ASIDE.includes(text) && !takers && from !== "operator";
 
 export function startControl() {
   confirmed.addEventListener("close", onConfirmed);

@@ -17,6 +17,7 @@
  * @property {string} page which of the station's pages acts for it: you, another or nobody; unknown: there is no connection
  * @property {boolean} [online] whether the vehicle is
  * @property {string[]} [unseen] cameras that are sent but have not been live here for long enough
+ * @property {string} [stopAt] time of day at which somebody asked to stop
  *
  * @typedef {object} Choice
  * @property {string} text of the button
@@ -38,15 +39,6 @@ export function whoDrives({ driving, own, page }) {
   return state === "lost" ? "unheard" : /** @type {Who} */ (page);
 }
 
-/**
- * What a vehicle of an earlier version says: only who is in control, and it obeys every operator if it names none.
- * @param {string|undefined} operator in control  @param {string} own  @returns {Driving}
- */
-export const onlyNamed = (operator, own) => ({
-  state: "held", holder: operator ?? own, since: 0, offered: null, offer_ends: null, requested: [], present: { [own]: "controller" },
-  released: null, standing: false, why: "",
-});
-
 /** Who drives, in words. @param {Who} who  @param {Driving|null} driving */
 export const driverWords = (who, driving) =>
   ({
@@ -59,6 +51,15 @@ export const driverWords = (who, driving) =>
     free: "Nobody is in control",
     unknown: "",
   })[who];
+
+/**
+ * Who has asked the vehicle to stop, in words; "": nobody.
+ * @param {Driving|null} driving  @param {string} own  @param {string} [at] time of day
+ */
+export function stopWords(driving, own, at) {
+  if (!driving?.stop) return "";
+  return `${driving.stop === own ? "You" : driving.stop} asked to stop${at ? ` at ${at}` : ""}: advised speed 0`;
+}
 
 /**
  * What operators have asked or offered, in words; "": nothing. Those that only watch are told, too.
@@ -86,11 +87,22 @@ export const speedWords = (speed_mps) =>
   Number.isFinite(speed_mps) ? `at ${Math.round(3.6 * (speed_mps ?? 0))} km/h` : "at a speed that is not known, which counts as moving";
 
 /**
- * The buttons about control; the first one is also the key's.
+ * The buttons about control, and about a stop that somebody has asked for; the first one is also the key's.
  * @param {View} view
  * @returns {Choice[]}
  */
-export function choicesOf(view) {
+export const choicesOf = (view) => [...aboutControl(view), ...(mayLift(view) ? [LIFT] : [])];
+
+const LIFT = { text: "Lift stop", isAnswer: true, event: { event: "stop_lifted" } };
+
+/** @param {View} view */
+function mayLift(view) {
+  const { driving, own, online } = view;
+  return Boolean(online && driving?.stop) && (whoDrives(view) === "you" || driving?.present[own] === "supervisor");
+}
+
+/** @param {View} view @returns {Choice[]} */
+function aboutControl(view) {
   const { driving, own, page, online } = view;
   const who = whoDrives(view);
   if (page === "unknown") return [{ text: "Take control", why: "no connection to the station" }];

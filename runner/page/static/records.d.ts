@@ -124,8 +124,6 @@ export interface VehicleState {
   online: boolean;
   /** of the driver; absent: the operator in control states none */
   attention?: "watching" | "unfocused" | "slow" | "hidden" | "absent";
-  /** id of the operator in control; absent: none */
-  operator?: string;
   /** absent: by an earlier version */
   driving?: Driving;
   /** when the certificate of the vehicle expires, s since 1970; absent: it has none */

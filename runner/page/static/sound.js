@@ -10,7 +10,8 @@ import { withKey } from "./hints.js";
 import { byId, setAttribute, setText } from "./format.js";
 
 const KEY = "tod-muted";
-const TONES = { lost: [880, 587, 880, 587], late: [659], asked: [784, 784], passed: [523, 784, 1047] }; // Hz, one after the other
+/** Hz, one after the other */
+const TONES = { lost: [880, 587, 880, 587], late: [659], asked: [784, 784], passed: [523, 784, 1047], stop: [988, 988, 988] };
 const TONE_S = 0.15;
 const VOLUME = 0.3;
 const CHECK_MS = 250;
@@ -124,6 +125,7 @@ export function startSound() {
   listen("deposed unseen unplugged", () => sound("lost"));
   listen("passed", () => sound("passed"));
   listen("asked", () => sound("asked"));
+  listen("stopping", () => store.holder === "you" && sound("stop"));
   addEventListener("storage", refresh); // muted in another window
   setInterval(() => {
     const kind = alarm.overdue(performance.now());

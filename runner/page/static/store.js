@@ -1,7 +1,7 @@
 /** The page's state, as received from the station; views listen for the kinds of messages that they show. */
 
 import { BIRDSEYE } from "./arrange.js";
-import { onlyNamed, whoDrives } from "./driving.js";
+import { whoDrives } from "./driving.js";
 
 const SHOWN_S = 300;
 const UNDRIVEN = ["free", "nobody", "unknown"];
@@ -12,8 +12,10 @@ let sampledAt = -Infinity; // page time of the last sample
 /**
  * The part of the station's messages that the page uses.
  * @typedef {import("./records.js").CameraState & {applied: Applied}} Decision
- * @typedef {import("./records.js").VehicleState & {cameras: Record<string, Decision>, held_since: number|null}} State
- *   held_since: since when its holder is in control, or was until it was lost, s since 1970
+ * @typedef {import("./records.js").VehicleState & {cameras: Record<string, Decision>} & Since} State
+ * @typedef {{held_since: number|null, stop_since: number|null}} Since
+ *   held_since: since when its holder is in control, or was until it was lost; stop_since: since when a stop that was asked
+ *   for stands; s since 1970
  * @typedef {import("./records.js").Sample & {time: number}} Sample time: s since 1970
  * @typedef {object} Camera of hello
  * @property {string} name
@@ -152,8 +154,8 @@ function onControl({ holder, abandoned, elsewhere, covered, watching = [] }) {
 }
 
 /** While the vehicle is offline, what it published last counts. @param {State} state */
-function onState({ online, driving, operator }) {
-  if (online) store.driving = driving ?? onlyNamed(operator, store.hello?.operator ?? "");
+function onState({ online, driving }) {
+  if (online) store.driving = driving ?? null;
   forgetReminders();
 }
 
