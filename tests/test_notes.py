@@ -21,6 +21,7 @@ from runner.operator.notes import (
     change_notes,
     decision_note,
     driver_words,
+    size_words,
 )
 from runner.operator.uplinks import uplink_rows
 from runner.records.vehicle import UplinkMeasured, VehicleState
@@ -48,7 +49,8 @@ def state(
 
 
 PREDICTED = "bitrate_predicted kbps 900"
-LOW = "300 of 4000 kbit/s, range [0, 400) -> 0.25"
+LOW = "500 of 4000 kbit/s, range [0, 800) -> 0.25"
+RATE = "0.5 of 4.0 Mbit/s"
 STALE = "no prediction for 2 s"
 
 
@@ -57,14 +59,18 @@ STALE = "no prediction for 2 s"
     [
         (state(PREDICTED), None),
         (state(PREDICTED, rear=camera(reason="another")), None),
-        (state(PREDICTED, rear=camera(0.25, reason=LOW)), f"Prediction 900 kbit/s: rear 0.5 -> 0.25 ({LOW})"),
+        (
+            state(PREDICTED, rear=camera(0.25, reason=LOW)),
+            f"Prediction 900 kbit/s: rear smaller, at quarter size ({RATE})",
+        ),
         (
             state("bitrate_predicted uplink a kbps 900", rear=camera(0.25, reason=LOW)),
-            f"Prediction 900 kbit/s, uplink a: rear 0.5 -> 0.25 ({LOW})",
+            f"Prediction 900 kbit/s, uplink a: rear smaller, at quarter size ({RATE})",
         ),
         (
             state(PREDICTED, total=900, rear=camera(0.25), front=camera(0.25), mast=camera(0.125)),
-            "Prediction 900 kbit/s: front, rear 0.5 -> 0.25; mast 0.5 -> 0.125 (3 of 3 cameras, total 900 kbit/s)",
+            "Prediction 900 kbit/s: front, rear smaller, at quarter size; mast smaller, at 1/8 size"
+            " (3 of 3 cameras, total 900 kbit/s)",
         ),
         (
             state(
@@ -72,30 +78,61 @@ STALE = "no prediction for 2 s"
                 total=400,
                 **{name: camera(0.25, reason=f"{name}; {STALE}") for name in ("front", "rear")},
             ),
-            f"Time elapsed: front, rear 0.5 -> 0.25 (2 of 3 cameras, total 400 kbit/s; {STALE})",
+            f"Time elapsed: front, rear smaller, at quarter size (2 of 3 cameras, total 400 kbit/s; {STALE})",
         ),
-        (state(PREDICTED, rear=camera(0.125, sending=False)), f"Prediction 900 kbit/s: rear 0.5 -> paused ({WHY})"),
+        (
+            state(PREDICTED, rear=camera(0.375, kbps=99, demand_kbps=2000.5, reason=f"99 of 2000; {STALE}")),
+            f"Prediction 900 kbit/s: rear smaller, at 3/8 size (99 of 2000 kbit/s; {STALE})",
+        ),
+        (
+            state("source_reported camera rear works False", rear=camera(None, on=True, reason="lost: no /dev/video0")),
+            "rear's source: rear lost (no /dev/video0)",
+        ),
+        (state(PREDICTED, rear=camera(0.125, sending=False)), "Prediction 900 kbit/s: rear paused"),
         (
             state("camera_switched camera rear on False", rear=camera(None, reason="switched off")),
-            "rear switched: rear 0.5 -> off (switched off)",
+            "rear switched: rear off",
         ),
         (
             state("roi_set camera rear x 8 y 4 width 640 height 360", rear=camera(roi=PART)),
-            f"ROI of rear set: rear ROI 640x360 at 8, 4 ({WHY})",
+            f"ROI of rear set: rear ROI 640x360 at 8, 4 ({RATE})",
         ),
-        (state("mode_selected mode single", mode="single"), "Mode single: total 3000 kbit/s"),
+        (
+            state("mode_selected mode single", mode="single"),
+            "Mode single: total 3000 kbit/s, cameras keep what mode automatic gave them",
+        ),
         (
             state("mode_selected mode single", mode="single", rear=camera(0.25)),
-            f"Mode single: rear 0.5 -> 0.25 ({WHY})",
+            f"Mode single: rear smaller, at quarter size ({RATE})",
         ),
-        (state(PREDICTED, mode="single"), "Mode single; Prediction 900 kbit/s: total 3000 kbit/s"),
-        (state("attention_changed", rear=camera(0.25)), f"Attention changed: rear 0.5 -> 0.25 ({WHY})"),
-        (state("total_set", rear=camera(0.25)), f"total_set: rear 0.5 -> 0.25 ({WHY})"),  # of another version
-        (state("tide_turned high 3", rear=camera(0.25)), f"tide_turned high 3: rear 0.5 -> 0.25 ({WHY})"),
+        (
+            state(PREDICTED, mode="single"),
+            "Mode single; Prediction 900 kbit/s: total 3000 kbit/s, cameras keep what mode automatic gave them",
+        ),
+        (state("attention_changed", rear=camera(0.25)), f"Attention changed: rear smaller, at quarter size ({RATE})"),
+        (
+            state("total_set", rear=camera(0.25)),
+            f"total_set: rear smaller, at quarter size ({RATE})",
+        ),  # of another version
+        (state("tide_turned high 3", rear=camera(0.25)), f"tide_turned high 3: rear smaller, at quarter size ({RATE})"),
     ],
 )
 def test_a_decision_is_one_phrase(after: VehicleState, text: str | None) -> None:
     assert decision_note(state(), after) == text
+
+
+@pytest.mark.parametrize(
+    "factor, words",
+    [(1, "full size"), (0.5, "half size"), (0.25, "quarter size"), (0.375, "3/8 size"), (0.3, "0.3 of full size")],
+)
+def test_sizes_have_names(factor: float, words: str) -> None:
+    assert size_words(factor) == words
+
+
+def test_a_camera_comes_back() -> None:
+    before = state(rear=camera(None, reason="switched off"), mast=camera(sending=False))
+    text = "rear switched: rear, mast on, at half size (2 of 3 cameras, total 3000 kbit/s)"
+    assert decision_note(before, state("camera_switched camera rear on True")) == text
 
 
 def test_phrases_are_of_events() -> None:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from fractions import Fraction
 from typing import TYPE_CHECKING
 
 from msgspec import UNSET
 
 from runner.core.driving import Control, Driving
 from runner.core.events import EVENTS
+from runner.core.model import Mode
 from runner.records.vehicle import CameraState, VehicleState
 
 if TYPE_CHECKING:
@@ -33,6 +35,9 @@ CAUSES = {
     "source_reported": "{camera}'s source",
     "clock_advanced": "Time elapsed",
 }
+
+
+NAMED_SIZES = {Fraction(1): "full", Fraction(1, 2): "half", Fraction(1, 4): "quarter"}
 
 
 def change_notes(before: VehicleState, state: VehicleState) -> Iterator[str]:
@@ -79,10 +84,11 @@ def driver_words(driving: Driving, own: str, since: float) -> str:
 def decision_note(before: VehicleState, state: VehicleState) -> str | None:
     """The changes made by a decision, and why.
 
-        Prediction 900 kbit/s: rear 0.5 -> 0.25 (300 of 4000 kbit/s, range [0, 400) -> 0.25)
-        Prediction 3000 kbit/s: front, rear 0.5 -> 0.25; mast off -> 0.125 (3 of 8 cameras, total 3000 kbit/s)
+        Prediction 900 kbit/s: rear smaller, at quarter size (0.3 of 4.0 Mbit/s)
+        Mode automatic: front, rear smaller, at quarter size; mast on, at 1/8 size (3 of 8 cameras, total 900 kbit/s)
+        Mode single: total 3000 kbit/s, cameras keep what mode collective gave them
 
-    before, state  as the vehicle publishes them
+    before, state  as the vehicle publishes them; the formula behind a size is the camera's `reason`
     returns        None if neither the mode nor any camera's stream changes
     """
     cameras = state.cameras
@@ -92,19 +98,20 @@ def decision_note(before: VehicleState, state: VehicleState) -> str | None:
     if before.mode != state.mode and not cause.startswith("Mode "):
         cause = f"Mode {state.mode}; {cause}"
     if not changed:
-        return None if before.mode == state.mode else f"{cause}: total {state.total_words} kbit/s"
-    reasons = [cameras[name].reason for name in changed]
-    if len(changed) > 1:
-        # Each has the camera's own reason first, then those of the whole decision.
-        common = [reason.split("; ")[1:] for reason in reasons]
-        shared = [part for part in common[0] if all(part in parts for parts in common)]
-        total = f"{len(changed)} of {len(cameras)} cameras, total {state.total_words} kbit/s"
-        reasons = ["; ".join([total, *shared])]
+        kept = f", cameras keep what mode {before.mode} gave them" if state.mode is Mode.SINGLE else ""
+        return None if before.mode == state.mode else f"{cause}: total {state.total_words} kbit/s{kept}"
+    # Each has the camera's own reason first, then those of the whole decision.
+    common = [cameras[name].reason.split("; ")[1:] for name in changed]
+    shared = [part for part in common[0] if all(part in parts for parts in common)]
+    what = f"{len(changed)} of {len(cameras)} cameras, total {state.total_words} kbit/s"
+    if len(changed) == 1:
+        what = _rate(cameras[next(iter(changed))])
+    why = "; ".join(filter(None, (what, *shared)))
     names_by_change: dict[str, list[str]] = {}
     for name, change in changed.items():
         names_by_change.setdefault(change, []).append(name)
     listed = "; ".join(f"{', '.join(names)} {change}" for change, names in names_by_change.items())
-    return f"{cause}: {listed} ({reasons[0]})"
+    return f"{cause}: {listed}" + (f" ({why})" if why else "")
 
 
 def _uplink_notes(before: VehicleState, state: VehicleState) -> Iterator[str]:
@@ -150,19 +157,45 @@ def _cause(described: str) -> str:
 
 def _change(was: CameraState, now: CameraState) -> str:
     """The change of one camera; "" if none."""
-    factors = [_factor(was), _factor(now)]
-    parts = [" -> ".join(factors)] if factors[0] != factors[1] else []
+    parts = [_sent(was, now)] if _form(was) != _form(now) else []
     if was.roi != (roi := now.roi):
         parts.append(f"ROI {roi.width}x{roi.height} at {roi.x}, {roi.y}")
     return ", ".join(parts)
 
 
-def _factor(camera: CameraState) -> str:
+def _sent(was: CameraState, now: CameraState) -> str:
+    """Whether, and at which size."""
+    form, before = _form(now), _form(was)
+    if isinstance(form, str):
+        return form
+    change = "on" if isinstance(before, str) else "smaller" if form < before else "larger"
+    return f"{change}, at {size_words(form)}"
+
+
+def _form(camera: CameraState) -> str | float:
+    """The factor of a camera that is sent, or why it is not."""
     if not camera.on:
         return "off"
     if camera.scaling is None:
         return "lost"
-    return f"{camera.scaling:g}" if camera.sending else "paused"
+    return camera.scaling if camera.sending else "paused"
+
+
+def size_words(factor: float) -> str:
+    """A scaling factor for a driver: half size, 3/8 size, 0.3 of full size."""
+    exact = Fraction(factor).limit_denominator(16)
+    name = NAMED_SIZES.get(exact, str(exact))
+    return f"{name} size" if exact == factor else f"{factor:.2g} of full size"
+
+
+def _rate(camera: CameraState) -> str:
+    """The allocated bitrate of what the camera could use; of one that is not sent, why."""
+    if not camera.sending:
+        return camera.reason.split("; ")[0].removeprefix("lost: ") if camera.scaling is None and camera.on else ""
+    kbps, demand = camera.kbps, max(camera.kbps, camera.demand_kbps)
+    if kbps < 100:
+        return f"{kbps:.0f} of {demand:.0f} kbit/s"
+    return f"{kbps / 1000:.1f} of {demand / 1000:.1f} Mbit/s"
 
 
 class Refusals:

@@ -383,7 +383,7 @@ def test_a_decision_is_one_note_however_many_cameras_it_changes(both):
     vehicle.publish("state", state)
     vehicle.publish("state", {**state, "cause": "bitrate_predicted kbps 880", "total_kbps": 880})
     until(lambda: station.state.total_kbps == 880)
-    text = "Prediction 900 kbit/s: front, rear, mast 0.5 -> 0.25 (3 of 3 cameras, total 900 kbit/s)"
+    text = "Prediction 900 kbit/s: front, rear, mast smaller, at quarter size (3 of 3 cameras, total 900 kbit/s)"
     assert listener.notes[1:] == [text]
 
 
