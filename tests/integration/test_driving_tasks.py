@@ -227,7 +227,12 @@ def test_find_out_why_a_camera_got_less(typist, page):
     typist.does("camera_left")
     typist.does("drawer")
     reason = page.locator("#camera-panel .why-decided")
-    until(lambda: f"100 of {FULL_KBPS} kbit/s, range [0, 200) -> 0.5" in reason.inner_text())
+    rate = f"0.1 of {FULL_KBPS / 1000:.1f} Mbit/s"
+    until(lambda: f"Half size: {rate}, its share of the 0.4 Mbit/s that were set." in reason.inner_text())
+    formula = f"100 of {FULL_KBPS} kbit/s, range [0, 200) -> 0.5"
+    assert formula not in reason.inner_text()
+    reason.locator("summary").press("Enter")
+    until(lambda: formula in reason.inner_text())
     assert reason.is_visible() and page.locator("#camera-panel h2").inner_text() == "left"
     assert typist.presses == 2
 

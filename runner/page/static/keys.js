@@ -60,8 +60,9 @@ function leaveField({ key, target }) {
  * A button pressed by a key keeps it, as does one that moves a picture of the layout by arrow keys.
  */
 function onClick({ detail, target }) {
-  const button = detail > 0 && target instanceof Element ? target.closest("button") : null;
-  if (button === document.activeElement && !button?.closest("dialog, .mover")) button?.blur();
+  const button = detail > 0 && target instanceof Element ? target.closest("button, summary") : null;
+  if (!(button instanceof HTMLElement) || button.closest("dialog, .mover")) return;
+  if (button === document.activeElement) button.blur();
 }
 
 function onFixedKey(key) {

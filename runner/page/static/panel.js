@@ -10,6 +10,7 @@ import { EXPLAINED, SHAPES, STALE, switchCamera, unapplied } from "./tiles.js";
 import { canStraighten } from "./straight.js";
 import { isStraight, toggleStraight } from "./straighten.js";
 import { withKey } from "./hints.js";
+import { reasonWords } from "./reasons.js";
 import { colourOf } from "./colours.js";
 import { byId, factor, latency, make, region, setAttribute, setText, size, tenth, whole } from "./format.js";
 
@@ -35,7 +36,8 @@ const straight = make("button", {
   "data-control": "straight", "data-key": "straighten", onclick: () => toggleStraight(),
   "data-title": "straighten the picture of this fisheye, or show the original",
 }, "Straighten");
-const reason = make("p", { class: "why-decided" });
+const reason = make("span");
+const formula = make("p", { class: "muted" });
 const byHand = make("p", { class: "why" });
 const bitrate = makeSlider({
   label: "bitrate",
@@ -174,7 +176,9 @@ function refreshHead(now) {
   on.disabled = Boolean(whyNot());
   on.title = whyNot() ?? withKey("switch this camera on or off", "switch");
   setText(on, requested ? (requested.event.on ? "on…" : "off…") : now?.on ? "on" : now ? "off" : "–");
-  setText(reason, [EXPLAINED.includes(word) ? store.refused[name()] : "", now?.reason || "–"].filter(Boolean).join(" · "));
+  const words = reasonWords(now, store.state, fullRegion(name()), Number.isFinite(store.sample?.predicted_kbps));
+  setText(reason, [EXPLAINED.includes(word) ? store.refused[name()] : "", words].filter(Boolean).join(" · "));
+  setText(formula, now?.reason || "–");
 }
 
 function refreshSettings(info, now) {
@@ -267,7 +271,9 @@ export function startPanel() {
     make("div", { class: "beside" }, field("Weight", weight, weightNote), frame.element),
   );
   const head = make("div", { class: "head" }, swatch, title, status, straight, on);
-  byId("camera-panel").append(head, reason, controls, comparison(), differing);
+  const more = make("span", { class: "more", "aria-hidden": "true" }, "Why?"); // "disclosure triangle" in a screen reader
+  const why = make("details", { class: "why-decided" }, make("summary", {}, reason, more), formula);
+  byId("camera-panel").append(head, why, controls, comparison(), differing);
   byId("latency-panel").append(stageTable());
   listen("hello state sample control requests socket status theme straight aspect", refresh);
   listen("selected", onSelected);

@@ -14,6 +14,7 @@ import { isStraight } from "./straighten.js";
 import { straightOptics } from "./straight.js";
 import { withKey } from "./hints.js";
 import { ALARMS } from "./alarm.js";
+import { reasonWords } from "./reasons.js";
 import { colourOf } from "./colours.js";
 import { announce, boxSize, byId, displayName, factor, latency, make, setAttribute, setText, size, whole } from "./format.js";
 
@@ -321,7 +322,8 @@ function refreshCaption(name, { rates, form, reason }) {
   caption(form, region, `${shape} · ${latency(age_ms, bound_ms)}${lost}`, why);
   const isUncertain = (bound_ms ?? 0) > UNCERTAIN_MS && store.status[name] !== "synchronising"; // clocks agree soon
   setAttribute(form, "data-uncertain", isUncertain ? "" : null);
-  setText(reason, now?.reason ?? "");
+  const info = camera(name);
+  setText(reason, info ? reasonWords(now, store.state, info, Number.isFinite(store.sample?.predicted_kbps)) : "");
 }
 
 /** From capture to drawing; on a page without video, from capture to decoding at the station. */

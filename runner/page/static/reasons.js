@@ -1,0 +1,63 @@
+/** Why a camera is sent as it is, in words for a driver; the vehicle's own reason has the formula. Pure. */
+
+import { sameRegion, whole } from "./format.js";
+
+const NAMED = { 1: "full size", 0.5: "half size", 0.25: "quarter size" };
+const PARTS = [2, 4, 8, 16]; // of a size that has a name: 3/8
+const PAUSED = "not sending: ";
+
+/** A scaling factor as a size: half size, 3/8 size, 0.3 of full size. @param {number} factor */
+export function sizeWords(factor) {
+  const parts = PARTS.find((each) => Number.isInteger(each * factor));
+  return NAMED[factor] ?? (parts ? `${parts * factor}/${parts} size` : `${Number(factor.toPrecision(2))} of full size`);
+}
+
+/** A bitrate of what could be used: 1.0 of 6.0 Mbit/s. @param {number} kbps  @param {number} most */
+export function rateWords(kbps, most) {
+  if (kbps < 100) return `${whole(kbps)} of ${whole(most)} kbit/s`;
+  return `${(kbps / 1000).toFixed(1)} of ${(most / 1000).toFixed(1)} Mbit/s`;
+}
+
+/** How much of its image a camera sends, 0 to 1. @param {import("./framing.js").Size} roi  @param {import("./framing.js").Size} full */
+export const shareOf = (roi, full) => (roi.width * roi.height) / (full.width * full.height);
+
+/** @param {number} share */
+export const percent = (share) => `${share < 0.01 ? "less than 1" : whole(100 * share)} %`;
+
+/**
+ * Half size: 1.2 of 6.0 Mbit/s, its share of the 6.5 Mbit/s that are predicted.
+ * @param {import("./records.js").CameraState|undefined} camera its decision
+ * @param {import("./store.js").State|null} state of the vehicle
+ * @param {import("./framing.js").Size} full image
+ * @param {boolean} predicted whether there is a prediction
+ */
+export function reasonWords(camera, state, full, predicted) {
+  if (!camera || !state) return "–";
+  if (!camera.on) return "Switched off.";
+  const [own, ...common] = camera.reason.split("; ");
+  if (camera.scaling === null) return `No picture: ${own.replace(/^lost: /, "")}.`;
+  if (!camera.sending) return `Paused: ${pauseWords(camera, state, common)}.`;
+  const image = { x: 0, y: 0, width: full.width, height: full.height };
+  const part = sameRegion(camera.roi, image) ? "" : ` of ${percent(shareOf(camera.roi, full))} of the image`;
+  const over = camera.uplinks?.length ? `, over ${camera.uplinks.join(" and ")}` : "";
+  const words = sizeWords(camera.scaling);
+  const most = Math.max(camera.kbps, camera.demand_kbps);
+  const cause = `${rateWords(camera.kbps, most)}, ${causeWords(camera, state, predicted)}`;
+  return `${words[0].toUpperCase()}${words.slice(1)}${part}: ${cause}${over}.`;
+}
+
+function pauseWords({ weight }, { mode }, common) {
+  const rule = common.find((part) => part.startsWith(PAUSED));
+  if (rule) return rule.slice(PAUSED.length);
+  return weight === 0 && mode !== "single" ? "its weight is 0" : "nothing of the total is left for it";
+}
+
+/** What limits its bitrate. */
+function causeWords({ kbps, demand_kbps }, { mode, total_kbps, asked_kbps }, predicted) {
+  const isLimited = total_kbps < asked_kbps;
+  if (mode === "single") return isLimited ? "less than was set: the link carries no more" : "as set in mode S or left by the mode before";
+  if (kbps >= Math.floor(demand_kbps)) return "all that it can use";
+  const total = `its share of the ${(total_kbps / 1000).toFixed(1)} Mbit/s that`;
+  if (mode === "collective") return `${total} ${isLimited ? "the link carries" : "were set"}`;
+  return `${total} ${total_kbps !== asked_kbps ? "the link carries" : predicted ? "are predicted" : "it starts with"}`;
+}

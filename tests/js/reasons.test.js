@@ -1,0 +1,50 @@
+/** Why a camera is sent as it is, in words. */
+
+import assert from "node:assert/strict";
+import { test } from "node:test";
+
+import { percent, rateWords, reasonWords, sizeWords } from "../../runner/page/static/reasons.js";
+
+const FULL = { width: 1920, height: 1040 };
+const CAMERA = /** @type {any} */ ({
+  on: true, sending: true, demand_kbps: 6000, kbps: 1181, scaling: 0.5, roi: { x: 0, y: 0, ...FULL }, width: 960, height: 520,
+  reason: "1181 of 6000 kbit/s, range [950, ...) -> 0.5", weight: 1, applied: {}, fault: null,
+});
+const STATE = /** @type {any} */ ({ mode: "automatic", total_kbps: 6500, asked_kbps: 6500 });
+
+test("a factor is a size", () => {
+  const words = [1, 0.5, 0.25, 0.125, 0.375, 0.75, 0.3].map(sizeWords);
+  assert.deepEqual(words, ["full size", "half size", "quarter size", "1/8 size", "3/8 size", "3/4 size", "0.3 of full size"]);
+});
+
+test("a bitrate is of what could be used", () => {
+  assert.equal(rateWords(1000, 6000), "1.0 of 6.0 Mbit/s");
+  assert.equal(rateWords(99, 6000), "99 of 6000 kbit/s");
+});
+
+test("a part of the image is never none of it", () => assert.deepEqual([0.25, 0.001].map(percent), ["25 %", "less than 1 %"]));
+
+const SHARE = "Half size: 1.2 of 6.0 Mbit/s, its share of the 6.5 Mbit/s that";
+const TABLE = [
+  [{}, {}, `${SHARE} are predicted.`],
+  [{}, { predicted: false }, `${SHARE} it starts with.`],
+  [{}, { asked_kbps: 9000 }, `${SHARE} the link carries.`],
+  [{}, { asked_kbps: 3000 }, `${SHARE} the link carries.`], // more than was predicted
+  [{}, { mode: "collective" }, `${SHARE} were set.`],
+  [{}, { mode: "collective", asked_kbps: 9000 }, `${SHARE} the link carries.`],
+  [{}, { mode: "single" }, "Half size: 1.2 of 6.0 Mbit/s, as set in mode S or left by the mode before."],
+  [{}, { mode: "single", asked_kbps: 9000 }, "Half size: 1.2 of 6.0 Mbit/s, less than was set: the link carries no more."],
+  [{ kbps: 6000, scaling: 1 }, {}, "Full size: 6.0 of 6.0 Mbit/s, all that it can use."],
+  [{ kbps: 7000 }, { mode: "single" }, "Half size: 7.0 of 7.0 Mbit/s, as set in mode S or left by the mode before."],
+  [{ roi: { x: 0, y: 0, width: 960, height: 520 }, demand_kbps: 1500, kbps: 300, scaling: 0.25 }, {}, "Quarter size of 25 % of the image: 0.3 of 1.5 Mbit/s, its share of the 6.5 Mbit/s that are predicted."],
+  [{ uplinks: ["a", "b"] }, {}, `${SHARE} are predicted, over a and b.`],
+  [{ on: false, sending: false, scaling: null, reason: "switched off" }, {}, "Switched off."],
+  [{ sending: false, scaling: null, reason: "lost: no /dev/video0" }, {}, "No picture: no /dev/video0."],
+  [{ sending: false, reason: "0 of 6000 kbit/s; not sending: operator gone for 3.2 s" }, {}, "Paused: operator gone for 3.2 s."],
+  [{ sending: false, weight: 0, reason: "0 of 6000 kbit/s, below 1 kbit/s: not sending" }, {}, "Paused: its weight is 0."],
+  [{ sending: false, reason: "0 of 6000 kbit/s, below 1 kbit/s: not sending" }, {}, "Paused: nothing of the total is left for it."],
+];
+for (const [camera, { predicted = true, ...state }, words] of /** @type {any[]} */ (TABLE))
+  test(words, () => assert.equal(reasonWords({ ...CAMERA, ...camera }, { ...STATE, ...state }, FULL, predicted), words));
+
+test("nothing is said of a vehicle that is offline", () => assert.equal(reasonWords(undefined, null, FULL, false), "–"));
