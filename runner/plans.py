@@ -64,3 +64,17 @@ def render_missing(vehicle: Vehicle, progress: Progress) -> None:
             render(views, seconds, cache_directory(), progress)
         except (RuntimeError, OSError, ImportError) as error:  # numba may be installed, but not load
             raise RunError(f"the synthetic drive cannot be rendered: {error}") from None
+
+
+def drive_steering(setup: Setup) -> Callable[[float], float] | None:
+    """The steering angle in the pictures of a synthetic drive: rad, by s of the monotonic clock, which they follow.
+
+    returns  None: no camera shows such a drive, or the vehicle's dimensions are unknown
+    """
+    lengths = [camera.source.render_s for camera in setup.vehicle.cameras.values() if camera.source.render]
+    if not (lengths and setup.dimensions):
+        return None
+    from runner.synthetic.course import plan_course
+
+    course, seconds, wheelbase_m = plan_course(lengths[0]), lengths[0], setup.dimensions.wheelbase_m
+    return lambda now: course.steering(now % seconds / seconds, wheelbase_m)

@@ -138,7 +138,8 @@ ALL_AROUND = tuple(_all_around())
 
 def paint(world: Path, marks: Sequence[Mark] = (*LINE_ENDS, *WHEELS)) -> None:
     """Build the street, with marks around the start of the drive."""
-    from runner.synthetic.world import GROUND, build_world, level_of, open_atlas, plan_course, shrink
+    from runner.synthetic.course import plan_course
+    from runner.synthetic.world import GROUND, build_world, level_of, open_atlas, shrink
 
     build_world(SECONDS, world)
     course = plan_course(SECONDS)

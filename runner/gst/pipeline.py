@@ -92,7 +92,7 @@ class CameraPipeline:
         self.untimed = False
         self.knobs = KnobPanel(pipeline, plan.camera, on_turned, on_report)
         if plan.loops:
-            loop_clip(pipeline, plan)
+            loop_clip(pipeline, plan, plan.camera.source.render_s or None)
         if plan.bag and source is None:
             from runner.gst.bag_feed import play_bag
 

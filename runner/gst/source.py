@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import threading
+import time
 from fractions import Fraction
 from pathlib import Path
 
@@ -17,6 +18,8 @@ from runner.inputs import input_problem
 
 CHECK_MS = 1000
 BEHIND_S = 0.3  # a clip that lags by more skips the lag instead of catching up
+AHEAD_S = 0.5  # a synthetic drive begins so far ahead, and waits: seeking and starting take less, usually
+INTO_FRAME_S = 1e-6  # a seek to exactly its start may hit the frame before, by rounding
 
 # Not through PyGObject: from GStreamer 1.26 on, the reference held by its wrapper makes a query immutable.
 _set_latency = ctypes.CDLL("libgstreamer-1.0.so.0").gst_query_set_latency
@@ -52,15 +55,18 @@ def _device_problem(camera: Camera) -> str | None:
     return f"{path} {why}" if why else None
 
 
-def loop_clip(pipeline: Gst.Bin, plan: Plan) -> None:
+def loop_clip(pipeline: Gst.Bin, plan: Plan, period_s: float | None = None) -> None:
     """Make a clip restart at its end while running time continues.
+
+    period_s  length of the drive that the clips of several cameras show together: each is where the monotonic clock,
+              modulo this, says, also one that starts later or has lagged; None: it begins with its first frame
 
     A segment seek makes the demuxer send SEGMENT_DONE instead of EOS; the next seek then queues the clip behind
     itself. Python runs once per round, not per frame.
     """
     identity = pipeline.get_by_name(plan.source[-1].name)
     pace = identity.get_static_pad("sink")
-    _Loop(pace.get_peer(), identity, float(plan.camera.fps))
+    _Loop(pace.get_peer(), identity, float(plan.camera.fps), period_s)
     _report_no_latency(pace)
     GLib.timeout_add(CHECK_MS, _Pace(identity).check)
 
@@ -71,11 +77,15 @@ class _Loop:
     It is kept by the pad, so it does not keep the pad.
     """
 
-    def __init__(self, pad: Gst.Pad, identity: Gst.Element, fps: float) -> None:
-        self._identity, self._fps = identity.weak_ref(), fps
+    def __init__(self, pad: Gst.Pad, identity: Gst.Element, fps: float, period_s: float | None) -> None:
+        self._identity, self._fps, self._period_s = identity.weak_ref(), fps, period_s
         self._starts_round = True  # the next segment starts a round, and is not the current one with another offset
         self._round: tuple[int, int] | None = None  # start of this round: running time in ns, frames before it
         self._seek_sent = self._flushed = False
+        self._start_s = 0.0  # where in the clip this round begins
+        self._first = BufferProbe(identity.get_static_pad("src"), self._on_first_frame)
+        if period_s is not None:
+            self._first.arm()
         pad.add_probe(Gst.PadProbeType.BUFFER, self._on_early_frame)
         pad.add_probe(Gst.PadProbeType.EVENT_DOWNSTREAM | Gst.PadProbeType.EVENT_FLUSH, self._on_event)
 
@@ -85,8 +95,28 @@ class _Loop:
             return Gst.PadProbeReturn.REMOVE
         if not self._seek_sent:
             self._seek_sent = True
-            _seek(pad, Gst.SeekFlags.FLUSH | Gst.SeekFlags.SEGMENT)
+            self._begin(pad, Gst.SeekFlags.FLUSH | Gst.SeekFlags.SEGMENT, time.monotonic() + AHEAD_S)
         return Gst.PadProbeReturn.DROP
+
+    def _begin(self, pad: Gst.Pad, flags: Gst.SeekFlags, due_s: float) -> None:
+        """Begin a round, whose first frame is due at that time of the monotonic clock, where the drive is then."""
+        frame = 0
+        if self._period_s is not None:
+            frames = round(self._period_s * self._fps)
+            frame = round(due_s % self._period_s * self._fps) % frames
+            frame = 0 if min(frame, frames - frame) <= 1 else frame  # rounding alone cuts no round short
+        self._start_s = frame / self._fps
+        _seek(pad, flags, self._start_s)
+
+    def _on_first_frame(self, pad: Gst.Pad, frame: PassingBuffer) -> bool:
+        """Delay the frames after the first one, which is early, so that they are where the drive is."""
+        identity = self._identity()
+        if identity is not None and self._period_s is not None and frame.pts is not None:
+            early_s = (self._start_s - _due_s(pad, frame.pts)) % self._period_s
+            if early_s <= AHEAD_S + 2 / self._fps:  # otherwise starting took longer; the next round makes up for it
+                above = identity.get_static_pad("sink").get_peer()
+                above.set_offset(above.get_offset() + round(early_s * Gst.SECOND))
+        return True
 
     def _on_event(self, pad: Gst.Pad, info: Gst.PadProbeInfo) -> Gst.PadProbeReturn:
         match info.get_event().type:
@@ -100,9 +130,14 @@ class _Loop:
                 self._extend_round(pad, info.get_event().parse_segment().base)
             case Gst.EventType.SEGMENT_DONE | Gst.EventType.EOS:
                 self._starts_round = True
-                _seek(pad, Gst.SeekFlags.SEGMENT)
+                self._begin(pad, Gst.SeekFlags.SEGMENT, self._next_due_s(pad, info.get_event()))
                 return Gst.PadProbeReturn.DROP
         return Gst.PadProbeReturn.OK
+
+    def _next_due_s(self, pad: Gst.Pad, end: Gst.Event) -> float:
+        """When the frame after a round is due, by the monotonic clock. A round ends where its last frame begins."""
+        is_told = end.type == Gst.EventType.SEGMENT_DONE
+        return _due_s(pad.get_peer(), end.parse_segment_done()[1] if is_told else None) + 1 / self._fps
 
     def _extend_round(self, pad: Gst.Pad, base: int) -> None:
         """Extend a round to the duration of its frames.
@@ -121,8 +156,11 @@ class _Loop:
         self._round = (base, frames)
 
 
-def _seek(pad: Gst.Pad, flags: Gst.SeekFlags) -> None:
-    event = Gst.Event.new_seek(1.0, Gst.Format.TIME, flags, Gst.SeekType.SET, 0, Gst.SeekType.NONE, 0)
+def _seek(pad: Gst.Pad, flags: Gst.SeekFlags, start_s: float) -> None:
+    start = 0
+    if start_s:
+        start, flags = round((start_s + INTO_FRAME_S) * Gst.SECOND), flags | Gst.SeekFlags.ACCURATE
+    event = Gst.Event.new_seek(1.0, Gst.Format.TIME, flags, Gst.SeekType.SET, start, Gst.SeekType.NONE, 0)
     # Not from the streaming thread, which the seek waits for. A source pad accepts it from downstream.
     threading.Thread(target=pad.send_event, args=(event,), daemon=True).start()
 
@@ -166,6 +204,11 @@ def _late_ns(pad: Gst.Pad, pts: int | None) -> int:
         return 0
     due: int = element.get_base_time() + segment.parse_segment().to_running_time(Gst.Format.TIME, pts)
     return int(clock.get_time()) - due
+
+
+def _due_s(pad: Gst.Pad, pts: int | None) -> float:
+    """When a frame is due at a pad, s of the monotonic clock; now if that is unknown."""
+    return time.monotonic() - _late_ns(pad, pts) / 1e9
 
 
 def fixed_rate(pipeline: Gst.Bin) -> list[Gst.Element]:

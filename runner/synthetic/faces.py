@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from runner.synthetic.course import Array, Course
 from runner.synthetic.world import (
     BOXES,
     HEDGE,
@@ -18,8 +19,6 @@ from runner.synthetic.world import (
     TREE,
     WALL,
     WALL_D,
-    Array,
-    Course,
     arc_lengths,
     plan_houses,
 )

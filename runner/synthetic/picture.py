@@ -18,8 +18,9 @@ import numpy as np
 from runner.clips import View
 from runner.core.intrinsics import focal_px
 from runner.core.model import Pose
+from runner.synthetic.course import Array, plan_course
 from runner.synthetic.faces import VISIBLE_M, stand_faces
-from runner.synthetic.world import GROUND, LEVELS, RAILING, SKY, TREE, WALL, Array, compiled, open_atlas, plan_course
+from runner.synthetic.world import GROUND, LEVELS, RAILING, SKY, TREE, WALL, compiled, open_atlas
 
 AZIMUTHS = 8192  # about a pixel of the sharpest usual view, 1920 over 90 degrees
 LAYERS = 20  # faces kept per azimuth; farther ones are not visible

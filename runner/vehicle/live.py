@@ -43,7 +43,7 @@ from runner.mqtt.messages import (
     run_of,
     topic,
 )
-from runner.plans import as_offered, compile_plans, render_missing
+from runner.plans import as_offered, compile_plans, drive_steering, render_missing
 from runner.records import to_json
 from runner.records.vehicle import ClockAnswer, Outcome, Settings, SpeedAdvice, SteeringAngle, Telemetry, VehicleState
 from runner.security.exposure import may_listen, vehicle_keyring
@@ -476,7 +476,8 @@ def live_vehicle(
 
         holder = KeptHolder(Path(state) / f"{setup.vehicle.name}.json" if state else None, report)
         ending.callback(holder.close)
-        loop = ControlLoop(setup, side, pqos, track, drive, publish, report, Access(keyring, report), holder.former)
+        access, steering = Access(keyring, report), drive_steering(setup)
+        loop = ControlLoop(setup, side, pqos, track, drive, publish, report, access, steering, holder.former)
         side.on_turned = loop.wake
         live = LiveVehicle(side, loop, holder, on_driving)
         if ros := ros_cameras(setup, side.push_shared, report):

@@ -89,6 +89,7 @@ class ControlLoop:
                  second; returns False for a record that has to wait because the control link is behind
     on_report    called with one line per event and its result
     access       who may request what
+    steering     the angle of a synthetic drive, rad, by time.monotonic, until somebody else reports one; None: not one
     former       who was in control, and who had asked to stop, when this vehicle's last process ended
     on_driving   called, in the loop's thread, with who drives whenever that changes
 
@@ -104,6 +105,7 @@ class ControlLoop:
     publish: Publish
     on_report: Callable[[str], None]
     access: Access
+    steering: Callable[[float], float] | None = None
     former: Held = NOBODY
     on_driving: Callable[[Driving], None] = lambda driving: None
     errors: int = 0
@@ -124,6 +126,7 @@ class ControlLoop:
         self._report_once = RepeatedReports(self.on_report)
         self._operators_checked = 0.0  # when operators were last checked for silence
         self._began = time.monotonic()
+        self._steered: SteeringReported | None = None  # the last one of the synthetic drive
 
     def post(self, document: Mapping[str, Any], answer: Answer | None = None) -> None:
         """An event as JSON without `t`, from this process, from any thread.
@@ -207,6 +210,8 @@ class ControlLoop:
         if self.track is not None:
             position_at = self.track.at
             self._guarded("position_reported", lambda: self._take(replace(position_at(t), t=t)))
+        if self.steering is not None:
+            self._guarded("steering_reported", lambda: self._steer(t))
         self._guarded("clock_advanced", lambda: self._take(ClockAdvanced(t=t)))
         self._guarded("cameras", self._read)
         self._guarded("sources", lambda: self._notice(source_events(self._run.state, self._cameras, t)))
@@ -215,6 +220,13 @@ class ControlLoop:
             self._guarded("telemetry", lambda: self._publish_measured(t))
         self._guarded("operators", lambda: self._watch_operators(t))
         self._guarded("advice", lambda: self._publisher.advise(self._run, t))
+
+    def _steer(self, t: float) -> None:
+        """Report the angle of the synthetic drive."""
+        if self.steering is None or self._run.state.steering is not self._steered:
+            return  # somebody else steers
+        self._steered = SteeringReported(t=t, rad=self.steering(self._began + t))
+        self._take(self._steered)
 
     def _read(self) -> None:
         self._cameras = self.applier.read()

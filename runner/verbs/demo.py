@@ -200,7 +200,7 @@ def _prepare_run(
         raise ArgumentError("link", link.kind, "needs a log to show its effect: give log=DIR or output=OUT")
     if link:
         check_possible(link.kind)
-    own = replace(own, overrides=with_choice(own.overrides, "pqos", config))
+    own = replace(own, overrides=[*_calibrated(config), *with_choice(own.overrides, "pqos", config)])
     config = config.drivable(apply.check_plan)
     config.pqos()
     setup = config.setup()
@@ -215,6 +215,12 @@ def _prepare_run(
     with progress_bar() as progress:
         render_missing(setup.vehicle, progress)
     return _Run(name, own, setup, directory, link, config.document, duration_s, keys)
+
+
+def _calibrated(config: Configuration) -> list[str]:
+    """Overrides that state what the demo knows of both sides: a rendered clip has its camera's very pose and lens."""
+    rendered = [camera.name for camera in config.setup().vehicle.cameras.values() if camera.source.render]
+    return [f"++cameras.{name}.calibrated=true" for name in rendered]
 
 
 def with_shown(arguments: Arguments) -> tuple[Arguments, Configuration, list[str]]:
