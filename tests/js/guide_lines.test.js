@@ -36,8 +36,10 @@ test("a corner, points that coincide, and short lines are kept", () => {
 const NATIVE = { width: 640, height: 360, left: 0, top: 0 };
 const CAMERA = { native: NATIVE, fov_deg: 90, lens: "pinhole", pose: { x_m: 2, y_m: 0, z_m: 1.5, yaw_deg: 0, pitch_deg: 0, roll_deg: 0 }, calibrated: true };
 const DIMENSIONS = { wheelbase_m: 2.9, track_m: 1.65, width_m: 1.92, front_m: 3.65, rear_m: 0.95 };
+/** As a canvas has its size: not in properties of its own. */
+const sized = (width, height) => Object.create({ width, height });
 const DISPLAY = { width: 640, height: 360, ratio: 1, view: WHOLE };
-const SHOWN = { region: { x: 0, y: 0, width: 640, height: 360 }, rad: 0.1, picture: { width: 640, height: 360 }, display: DISPLAY };
+const SHOWN = { region: { x: 0, y: 0, width: 640, height: 360 }, rad: 0.1, picture: sized(640, 360), display: DISPLAY };
 
 /** Draws into a canvas of 640x360 px that records how many paths were built, and returns what was drawn, in order. */
 function drawing() {
@@ -124,7 +126,7 @@ test("lines follow the region, the box, the steering and the optics", () => {
 test("lines and words have the resolution of the screen, however few px the picture has", () => {
   const { context, draw } = drawing();
   const first = draw();
-  assert.deepEqual(draw({ picture: { width: 160, height: 90 } }).calls, first.calls);
+  assert.deepEqual(draw({ picture: sized(160, 90) }).calls, first.calls);
   Object.assign(context.canvas, { width: 1280, height: 720 }); // on a screen with two px per CSS px
   const sharp = draw({ display: { ...DISPLAY, ratio: 2 } });
   for (const [i, { pieces }] of first.lines.entries())
@@ -133,6 +135,7 @@ test("lines and words have the resolution of the screen, however few px the pict
         const at = sharp.lines[i].pieces[j][k];
         assert.ok(Math.hypot(at.x - 2 * x, at.y - 2 * y) < 1e-9);
       }
+  assert.ok(first.calls.filter(([what]) => what === "words").length >= 3);
   assert.ok(sharp.stroked.every(([, width], i) => Math.abs(width - 2 * first.stroked[i][1]) < 1e-9));
 });
 

@@ -3,7 +3,7 @@
  * picture has, and only when they change.
  */
 
-import { imageToBox, toBox } from "./framing.js";
+import { imageToBox, placement } from "./framing.js";
 import { imageOf, pathGuides, straightGuides } from "./guides.js";
 import { projection } from "./projection.js";
 import { resize } from "./resizing.js";
@@ -95,7 +95,7 @@ export class GuideLines {
     if (!this.place(seen) && this.drawn.length) return;
     this.clear(context);
     this.drawn = [...this.placed.straight.lines, ...this.placed.wheels.lines];
-    const whole = toBox({ x: 0, y: 0, ...picture }, display, picture, display.view);
+    const whole = placement(display, picture, display.view);
     this.strokeAll(context, display.ratio * Math.min(1.5, Math.max(0.6, whole.width / USUAL_PX)));
     const visible = inside(whole, display, display.ratio);
     labelDistances(context, this.drawn, visible, display.ratio);
