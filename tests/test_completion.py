@@ -38,7 +38,7 @@ def van(conf: UserConf) -> UserConf:
         ("pri", ["print"]),
         ("--v", ["--version"]),
         ("print v", ["vehicle="]),
-        ("print vehicle=", ["vehicle=delivery_robot", "vehicle=tum_q7"]),
+        ("print vehicle=", ["vehicle=delivery_robot", "vehicle=one_camera", "vehicle=tum_q7"]),
         ("print +graph@cameras.front_left.graph=open", ["+graph@cameras.front_left.graph=openh264_rtsp"]),
         ("print -", ["-m"]),
         ("print -m -", []),

@@ -73,7 +73,7 @@ def _master_uri() -> str:
     return os.environ.get("ROS_MASTER_URI") or MASTER
 
 
-def _environment(settings: RosSettings, insecure: bool, publishes: bool) -> dict[str, str]:
+def environment(settings: RosSettings, insecure: bool, publishes: bool) -> dict[str, str]:
     """Variables added to this process's environment for the node's process."""
     if settings.version == 1:
         own = {"ROS_MASTER_URI": _master_uri(), "ROS_NAMESPACE": settings.namespace}
@@ -123,7 +123,7 @@ class NodeProcess:
         offered = {"inputs": dict(inputs), "outputs": dict(outputs), "services": dict(services)}
         self._task = {**own, "remap": dict(settings.remap), "pictures": subscriptions, **offered, "admit_all": insecure}
         self._outputs = outputs
-        self._environment = _environment(settings, insecure, publishes)
+        self._environment = environment(settings, insecure, publishes)
         self._latched: dict[str, str] = {}  # text by topic
         self._lock = threading.Lock()
         self._socket: socket.socket | None = None  # while there is a process

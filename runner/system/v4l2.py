@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import grp
 import os
+import stat
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, suppress
 from fractions import Fraction
 from itertools import chain
@@ -18,6 +20,7 @@ from typing import NamedTuple
 
 from runner.core.model import Capture
 from runner.errors import reason
+from runner.system.usb import BITS
 
 QUERYCAP, ENUM_FMT, REQBUFS = 0x80685600, 0xC0405602, 0xC0145608
 ENUM_FRAMESIZES, ENUM_FRAMEINTERVALS = 0xC02C564A, 0xC034564B
@@ -30,6 +33,9 @@ MOST = 256  # entries of one list, in case a driver never ends it
 ENCODED = {"MJPG": "mjpeg", "JPEG": "mjpeg", "H264": "h264", "HEVC": "h265"}
 RAW = {"YUYV": "YUY2", "YU12": "I420", "YM12": "I420", "NM12": "NV12", "NM16": "NV16"}
 RAW |= {"RGB3": "RGB", "BGR3": "BGR", "GREY": "GRAY8"}
+EASE = ("raw", "mjpeg", "h264", "h265")  # to decode, the easiest first
+WIDTH, HEIGHT, RATE = Fraction(1280), Fraction(720), Fraction(30)  # px, Hz: wanted of a camera shown for the first time
+UNKNOWN = Fraction(1, 2)  # share of that rate, for a size whose rates the driver does not state
 CLOSE = Fraction(1, 100)  # rates that differ by less are the same to a user: 29.97, 30 and 30000/1001
 
 Ioctl = Callable[[int, int, bytearray], None]  # descriptor, request, structure; raises OSError
@@ -188,6 +194,57 @@ class Device:
         return bytes(data)
 
 
+class Connected(NamedTuple):
+    """A device that captures pictures.
+
+    node     its device file
+    path     one that stays the same after a restart, if there is one; otherwise `node`
+    formats  what it offers; empty if its driver does not say
+    problem  why it can not be used now; None: it can
+    """
+
+    node: Path
+    path: Path
+    card: str
+    formats: list[Format]
+    problem: str | None
+
+
+def connected(devices: Path = Path("/dev"), ioctl: Ioctl = fcntl.ioctl) -> Iterator[Connected]:
+    """The devices of this machine that capture pictures, by number, and those that this user may not open."""
+    stable = {link.resolve(): link for link in sorted((devices / "v4l/by-path").glob("*"), reverse=True)}
+    for node in sorted(devices.glob("video[0-9]*"), key=lambda node: (len(node.name), node.name)):
+        path = stable.get(node.resolve(), node)
+        try:
+            device = Device(node, ioctl)
+        except OSError as error:
+            if error.errno in (errno.EACCES, errno.EPERM, errno.EBUSY):
+                yield Connected(node, path, "", [], _unopened(node, error))
+            continue
+        with closing(device):
+            if device.capability.captures:
+                busy = _busy(node) if device.is_busy() else None
+                yield Connected(node, path, device.capability.card, device.formats(), busy)
+
+
+def preferred(formats: list[Format]) -> Capture:
+    """The capture that is nearest to 1280x720 at 30 Hz; of several that which takes least to decode."""
+    found = []
+    for each in formats:
+        ease = EASE.index(each.name if each.name in ENCODED.values() else "raw")
+        for size in each.sizes if each.name in BITS else ():
+            width, height = size.width.nearest(WIDTH), size.height.nearest(HEIGHT)
+            rates: Sequence[Fraction | None] = [span.nearest(RATE) for span in size.rates] or [None]
+            for rate in rates:
+                nearness = _share(width * height, WIDTH * HEIGHT) * (_share(rate, RATE) if rate else UNKNOWN)
+                found.append((nearness, -ease, Capture(each.name, int(width), int(height), rate)))
+    return max(found, key=lambda one: one[:2], default=(0, 0, Capture()))[2]
+
+
+def _share(offered: Fraction, wanted: Fraction) -> Fraction:
+    return min(offered, wanted) / max(offered, wanted)
+
+
 def users(path: Path) -> list[str]:
     """Processes that have a device open, as far as this user may see: NAME (PID)."""
     try:
@@ -233,7 +290,7 @@ def device_problem(path: Path, capture: Capture, fps: Fraction, ioctl: Ioctl = f
     except OSError as error:
         if error.errno in (errno.ENOTTY, errno.EINVAL):
             return "is no camera: it does not answer as a V4L2 device"
-        return _busy(path) if error.errno == errno.EBUSY else f"does not open: {reason(error)}"
+        return _unopened(path, error)
     with closing(device):
         card = device.capability.card
         if not device.capability.captures:
@@ -241,6 +298,18 @@ def device_problem(path: Path, capture: Capture, fps: Fraction, ioctl: Ioctl = f
             hint = f"; other nodes of this device: {', '.join(nodes)}" if nodes else ""
             return f"is no camera: {card} delivers {device.capability.kind} here{hint}"
         return unoffered(device.formats(), capture, fps) or (_busy(path) if device.is_busy() else None)
+
+
+def _unopened(path: Path, error: OSError) -> str:
+    if error.errno == errno.EBUSY:
+        return _busy(path)
+    hint = ""
+    with suppress(OSError, KeyError):
+        status = path.stat()
+        if error.errno == errno.EACCES and status.st_mode & stat.S_IRGRP:
+            group = grp.getgrgid(status.st_gid).gr_name
+            hint = f"; it is open to the group {group}: sudo usermod -aG {group} $USER, then log in again"
+    return f"does not open: {reason(error)}{hint}"
 
 
 def _busy(path: Path) -> str:

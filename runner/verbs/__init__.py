@@ -109,7 +109,10 @@ VERBS = {
     ),
     "ros": Verb("the control link as ROS topics", "runner.verbs.ros", ("duration_s",), sited=True),
     "demo": Verb(
-        "both sides on this machine", "runner.verbs.demo", ("log", "output", "models", "duration_s"), sweeps=True
+        "both sides on this machine",
+        "runner.verbs.demo",
+        ("camera", "log", "output", "models", "duration_s"),
+        sweeps=True,
     ),
     "record": Verb("record each camera losslessly", "runner.verbs.record", ("output", "duration_s"), sited=True),
     "model": Verb("rate-quality models from recordings", "runner.verbs.model", ("camera", "sequence", "output")),
@@ -152,7 +155,7 @@ VERBS = {
         choices={"rules": NO_YES},
     ),
     "doctor": Verb(
-        "list missing dependencies of this machine", "runner.verbs.doctor", ("registry",), "VERB", sited=True
+        "list missing dependencies of this machine", "runner.verbs.doctor", ("registry",), "VERB or cameras", sited=True
     ),
     "completion": Verb("the completion script for bash or zsh", "runner.verbs.completion", (), "SHELL", composes=False),
 }

@@ -49,7 +49,7 @@ _tod_runner() {
 }
 compdef _tod_runner tod-runner""",
 }
-WORDS = {"doctor": tuple(VERBS), "completion": tuple(SCRIPTS)}  # by verb, its positional arguments
+WORDS = {"doctor": (*VERBS, "cameras"), "completion": tuple(SCRIPTS)}  # by verb, its positional arguments
 
 
 def run(arguments: Arguments) -> int:

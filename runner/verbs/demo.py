@@ -1,10 +1,13 @@
-"""usage: tod-runner demo [-m] [OVERRIDE ...] [duration_s=60] [log=DIR] [output=OUT] [models=DIR]
+"""usage: tod-runner demo [-m] [OVERRIDE ...] [camera=CAMERA] [duration_s=60] [log=DIR] [output=OUT] [models=DIR]
 
 Runs both sides on this machine: vehicle and operator as two processes over real RTSP and a real control link, along a
 drive through a bandwidth map in mode A. Open the page that it prints, http://127.0.0.1:8090/, in a browser; the table
 in the terminal shows the same. It shows as many cameras, the front one first, as this machine's cores draw at 15 Hz or
 more without a GPU, and says which ones it left out. A vehicle, cameras, a rate or an experiment that you name is driven
 as it is: vehicle=tum_q7 for all eight cameras; fps_max=40 for another rate, or null for the cameras' own.
+
+With camera= it shows one camera of yours: a V4L2 device, a topic of ROS, an IP camera or a clip. A device is asked for
+the size and rate that are nearest to 1280x720 at 30 Hz; `tod-runner doctor cameras` lists what it offers.
 
 With log=DIR both sides write their logs to DIR. With output=OUT a report is written at the end, as by the verb report
 (models= is passed to it); the drive is stored in OUT/drive, unless log= names another directory. An experiment defines
@@ -18,6 +21,8 @@ OUT/runs.jsonl, or DIR/runs.jsonl, has a line for each run: its directory and it
 
   tod-runner demo                                             synthetic drive, a minute
   tod-runner demo vehicle=tum_q7                              all its cameras
+  tod-runner demo camera=/dev/video0                          your webcam; or ros:/TOPIC, rtsp://..., CLIP.mp4
+  tod-runner demo camera=/dev/video0 cameras.camera.capture.format=YUY2
   tod-runner demo duration_s=3600                             an hour
   tod-runner demo vehicle=delivery_robot duration_s=20
   tod-runner demo source=file source.clip=clip.mp4            every camera shows your clip
@@ -61,10 +66,12 @@ from runner.system.children import VerbProcess
 from runner.system.files import write_whole
 from runner.verbs import Arguments
 from runner.verbs.demo_choice import highest_rate, showable
+from runner.verbs.own_camera import camera_words, check_device
 from runner.verbs.report import check_report, report
 from runner.verbs.screen import command_name, progress_bar, say, streaming
 
 AS_GIVEN = ("vehicle", "cameras", "fps_max", "experiment")  # what keeps all cameras, if the user gives one of them
+OTHER_VEHICLE = ("vehicle", "source", "experiment")  # of these, camera= chooses its own
 LOOK_S = 0.05  # how soon the other side is stopped once one has ended
 SIDE_END_S = signals.END_S + 0.2  # a side ends itself by force before it is killed
 END_S = 2.8  # both sides, link and broker
@@ -135,6 +142,7 @@ def _sweep(arguments: Arguments, apply: ModuleType) -> int:
 
 def _prepare_demo(arguments: Arguments, apply: ModuleType) -> _Demo:
     """Collect and check everything a demo needs, before it begins."""
+    arguments = _with_camera(arguments)
     arguments, config, shown = with_shown(arguments)
     experiment, link = config.experiment(), config.link()
     output, models = arguments.path("output"), arguments.path("models")
@@ -221,6 +229,23 @@ def _calibrated(config: Configuration) -> list[str]:
     """Overrides that state what the demo knows of both sides: a rendered clip has its camera's very pose and lens."""
     rendered = [camera.name for camera in config.setup().vehicle.cameras.values() if camera.source.render]
     return [f"++cameras.{name}.calibrated=true" for name in rendered]
+
+
+def _with_camera(arguments: Arguments) -> Arguments:
+    """With the overrides of camera=, if it is given.
+
+    raises  UserError
+    """
+    camera = arguments.values.get("camera")
+    if camera is None:
+        return arguments
+    if named := next((key for key in OTHER_VEHICLE if _about(arguments.overrides, [key])), None):
+        raise ArgumentError("camera", camera, f"must not be given with {named}=: it is a vehicle of one camera")
+    chosen = replace(arguments, overrides=[*camera_words(camera), *arguments.overrides])
+    cameras = configuration(chosen.overrides, chosen.conf, runnable=False).vehicle().cameras
+    for each in cameras.values():
+        check_device(each)
+    return chosen
 
 
 def with_shown(arguments: Arguments) -> tuple[Arguments, Configuration, list[str]]:

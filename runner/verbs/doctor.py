@@ -1,14 +1,19 @@
 """usage: tod-runner doctor [VERB] [OVERRIDE ...] [registry=FILE]
+       tod-runner doctor cameras [OVERRIDE ...]
 
 Lists what this machine lacks to run a verb with this configuration, and how to install it: Python packages, GStreamer
 and its bindings, elements, broker, free ports, certificates that are valid for 30 more days, cameras and the USB
 bandwidth they share, uplinks, cores. The default verb is `demo`, which needs everything that both sides need. Ends with
 status 1 if something is missing.
 
+`doctor cameras` lists the V4L2 cameras of this machine with their formats, sizes and rates, and the topics of ROS with
+pictures (see ros.* in docs/ros.md). For each it prints the YAML that mounts it. Ends with status 1 if there is none.
+
 registry=FILE keeps what GStreamer offers on this machine, a vehicle for example, for `tod-runner validate target=FILE`
 on another.
 
   tod-runner doctor
+  tod-runner doctor cameras
   tod-runner doctor vehicle source=v4l2 graph=h264_va_rtsp
   tod-runner doctor vehicle registry=van.registry
   tod-runner doctor model metric=vmaf
@@ -38,10 +43,11 @@ from runner.system.extras import EXTRAS, how_to_install
 from runner.system.ports import check_port_free
 from runner.system.rtsp import OK, UNAUTHORIZED, describe
 from runner.system.usb import UsbCamera, buses
-from runner.system.v4l2 import device_problem
+from runner.system.v4l2 import connected, device_problem
 from runner.verbs import VERBS, Arguments, study_word
 from runner.verbs.doctor_uplinks import Diagnosis, check_uplinks
 
+CAMERAS = "cameras"  # in place of a verb
 IMPORT_S = 30  # rclpy or rospy loads within a second
 CORE_MPX_S = 180  # cropped, scaled and encoded per core and second at factor 0.5, measured with h264_rtsp
 OLDEST_GSTREAMER = (1, 22)  # its jitter buffer keeps the times at which pictures were captured
@@ -62,6 +68,8 @@ NEEDED = {  # extras of this package that a verb needs with any configuration
 
 
 def run(arguments: Arguments) -> int:
+    if arguments.words == (CAMERAS,):
+        return _cameras(arguments)
     verb = _verb(arguments)
     overrides = [study_word(word) for word in arguments.overrides] if verb == "model" else arguments.overrides
     site = arguments.site if VERBS[verb].sited else None
@@ -76,6 +84,15 @@ def run(arguments: Arguments) -> int:
     if path := arguments.path("registry"):
         _keep_registry(path)
     return 0 if all(fine for fine, _ in findings) else 1
+
+
+def _cameras(arguments: Arguments) -> int:
+    from runner.verbs.doctor_cameras import list_cameras
+
+    if registry := arguments.path("registry"):
+        raise ArgumentError("registry", registry, f"must not be given with {CAMERAS}")
+    config = configuration(arguments.overrides, arguments.conf, runnable=False, site=arguments.site)
+    return 0 if list_cameras(config.setup()) else 1
 
 
 def _keep_registry(path: Path) -> None:
@@ -96,7 +113,7 @@ def _verb(arguments: Arguments) -> str:
     if len(words) > 1:
         raise ArgumentError("", words[1], "must be one verb")
     if words[0] not in VERBS:
-        raise ArgumentError("", words[0], f"unknown verb{suggest(words[0], VERBS)}")
+        raise ArgumentError("", words[0], f"unknown verb{suggest(words[0], (*VERBS, CAMERAS))}")
     return words[0]
 
 
@@ -127,6 +144,7 @@ def examine(verb: str, setup: Setup, document: Mapping[str, Any]) -> Iterator[Di
         yield from check_broker(setup, verb)
     if verb in ("vehicle", "demo", "record"):
         yield from _devices(vehicle)
+        yield from _connected()
         yield from _ip_cameras(vehicle)
     if verb in ("vehicle", "demo"):
         if not (document.get("link") or {}).get("lanes"):  # they make the devices of the uplinks
@@ -282,6 +300,11 @@ def _devices(vehicle: Vehicle) -> Iterator[Diagnosis]:
             what += f", without {', '.join(bus.unknown)}, whose capture does not state format and size"
         fits = bus.mbps <= bus.budget_mbps
         yield Diagnosis(fits, what if fits else f"{what}: choose mjpeg, a lower fps, or another bus")
+
+
+def _connected() -> Iterator[Diagnosis]:
+    if found := len(list(connected())):
+        yield Diagnosis(True, f"V4L2 cameras: {found}; `tod-runner doctor {CAMERAS}` lists them, with their YAML")
 
 
 def _ip_cameras(vehicle: Vehicle) -> Iterator[Diagnosis]:

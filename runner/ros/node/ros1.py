@@ -64,7 +64,7 @@ class RosMaster:
 
     def __init__(self, port: Port, uri: str, node: str, admit_all: bool) -> None:
         self._port, self._uri, self._node, self._admit_all = port, uri, node, admit_all
-        self._proxy = _proxy(uri)
+        self._proxy = proxy(uri)
         self._is_down = False  # as reported
 
     def query(self) -> Registrations | None:
@@ -106,7 +106,7 @@ class RosMaster:
         """
         try:
             uri = self._call("lookupNode", self._node)
-            _proxy(uri).getPid(self._node)
+            proxy(uri).getPid(self._node)
         except UNREACHABLE:
             return
         raise NodeError(f"a node named {self._node} is already running at {uri}: give another ros.node")
@@ -133,12 +133,12 @@ class RosMaster:
             self._call("registerPublisher", name, kind, uri)
         for name, kind in subscriptions:
             publishers = self._call("registerSubscriber", name, kind, uri)
-            _proxy(uri).publisherUpdate(self._node, name, publishers)  # as the master does
+            proxy(uri).publisherUpdate(self._node, name, publishers)  # as the master does
         for name, where in offers:
             self._call("registerService", name, where, uri)
 
 
-def _proxy(uri: str) -> ServerProxy:
+def proxy(uri: str) -> ServerProxy:
     try:
         return ServerProxy(uri, transport=_LimitedTransport())
     except OSError as error:  # not an HTTP address
