@@ -23,6 +23,7 @@ EXAMPLES: list[dict[str, Any]] = [
     {"t": 0.2, "event": "position_reported", "lat": 48.26, "lon": 11.66, "speed_mps": 8.3, "heading_deg": 90},
     {"t": 0.2, "event": "position_reported", "lat": -90, "lon": -180},
     {"t": 0.2, "event": "steering_reported", "rad": -0.35},
+    {"t": 0.2, "event": "steering_reported", "rad": -0.35, "gear": "R"},
     {"t": 0.3, "event": "total_set", "kbps": 4000},
     {"t": 0.4, "event": "camera_switched", "camera": "rear_center", "on": False},
     {"t": 0.5, "event": "roi_set", "camera": "front_left", "x": 0, "y": 0, "width": 960, "height": 520},

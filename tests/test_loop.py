@@ -222,14 +222,15 @@ def test_a_steering_angle_is_published_immediately_with_its_time_and_at_most_eve
         assert (first.rad, before - 1e-3 <= first.at <= time.time()) == (0.25, True)
         began = time.monotonic()
         while time.monotonic() < began + 0.5:
-            watched.loop.post({"event": "steering_reported", "rad": 0.5})
+            watched.loop.post({"event": "steering_reported", "rad": 0.5, "gear": "D"})
             time.sleep(0.005)
         until(
             lambda: watched.loop.post({"event": "steering_reported", "rad": 0.5}) or len(watched.of(SteeringAngle)) > 2
         )
     published = watched.of(SteeringAngle)
     assert all(b.at - a.at >= 0.049 for a, b in pairwise(published))
-    assert {angle.rad for angle in published[1:]} == {0.5}
+    assert (first.gear, {angle.rad for angle in published[1:]}) == (UNSET, {0.5})
+    assert published[1].gear == "D"
 
 
 EXAMPLES: tuple[dict[str, Any], ...] = (

@@ -70,11 +70,21 @@ class PositionReported(_Event):
     heading_deg: Annotated[float | None, Limits(0, 360), "direction of travel, degrees clockwise from north"] = None
 
 
+class Gear(StrEnum):
+    """Gear of the vehicle, as its lever names it."""
+
+    PARK = "P"
+    REVERSE = "R"
+    NEUTRAL = "N"
+    DRIVE = "D"
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SteeringReported(_Event):
-    """The front wheels are turned."""
+    """The front wheels are turned; what reports them usually knows the gear, too."""
 
     rad: Annotated[Steering, "their angle (bicycle model), rad, positive to the left"]
+    gear: Annotated[Gear | None, "in which the vehicle is"] = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -384,6 +394,7 @@ _WORDS: Mapping[str, Callable[[Any], Any]] = {
     "attention": Attention,
     "role": Role,
     "departure": Departure,
+    "gear": Gear,
     "live": tuple,
 }
 _EXACT = ("kbps", "lower_kbps", "scaling")

@@ -12,7 +12,7 @@ from msgspec import UNSET, UnsetType
 
 from runner.configuration import agreement
 from runner.core.decision import NOTHING
-from runner.core.events import BACK_S, NAMES, Attention, MomentMarked
+from runner.core.events import BACK_S, NAMES, Attention, Gear, MomentMarked
 from runner.mqtt.copies import Newest
 from runner.mqtt.link import ControlLink, login_of
 from runner.mqtt.messages import (
@@ -79,8 +79,8 @@ class Listener:
     def on_sample(self, sample: Sample) -> None:
         """The reception of all cameras, a few times a second."""
 
-    def on_steering(self, at: float, rad: float) -> None:
-        """The steering angle reported to the vehicle; `at` is by this machine's clock."""
+    def on_steering(self, at: float, rad: float, gear: Gear | None) -> None:
+        """The steering angle reported to the vehicle, and its gear, if known; `at` is by this machine's clock."""
 
     def on_note(self, note: Note) -> None:
         """A message for the operator."""
@@ -400,7 +400,7 @@ class Station:
         at = None if message.retained else self.latency.own_time(steering.at)
         if at is not None and self._newest_steering.takes("steering", steering.at, time.monotonic()):
             for listener in self.listeners:
-                listener.on_steering(at, steering.rad)
+                listener.on_steering(at, steering.rad, None if steering.gear is UNSET else steering.gear)
 
     def _on_configuration(self, message: MqttMessage) -> None:
         self._differences = agreement.differences(self._settings, read_settings(message.payload).settings)

@@ -15,7 +15,7 @@ from aiohttp import WSMsgType, web
 from msgspec import UNSET
 
 from runner.configuration.layout import Layouts
-from runner.core.events import Attention
+from runner.core.events import Attention, Gear
 from runner.core.model import Camera, plain
 from runner.core.roles import MAY_REQUEST, PRESENCE, STOP_REQUESTED, Role
 from runner.graph import video_codec
@@ -124,8 +124,9 @@ class PageServer(Listener):
     def on_sample(self, sample: Sample) -> None:
         self._call_soon(self._add_sample, sample)
 
-    def on_steering(self, at: float, rad: float) -> None:
-        self._call_soon(self._windows.broadcast, "steering", {"at_ms": 1000 * at, "rad": rad})
+    def on_steering(self, at: float, rad: float, gear: Gear | None = None) -> None:
+        known = {} if gear is None else {"gear": gear}
+        self._call_soon(self._windows.broadcast, "steering", {"at_ms": 1000 * at, "rad": rad, **known})
 
     def on_link(self, link: LinkState) -> None:
         self._call_soon(self._windows.broadcast, "link", link._asdict())

@@ -13,6 +13,7 @@ from runner.core.decision import NOTHING, Believed, Setting
 from runner.core.driving import Driving
 from runner.core.events import (
     Attention,
+    Gear,
     Latitude,
     LinkMeasured,
     LinkState,
@@ -200,6 +201,7 @@ class SteeringAngle:
 
     at: Annotated[Clock, "when it was reported, s since 1970 by the vehicle's clock, as capture times are"]
     rad: Annotated[Steering, "as in `runner.core.events.SteeringReported`"]
+    gear: Annotated[Gear | UnsetType, "as there; absent: unknown"] = UNSET
 
 
 @dataclass(frozen=True, slots=True)

@@ -123,7 +123,8 @@ class Publisher:
     def steering(self, event: SteeringReported, now: float) -> None:
         if event.t - self._steering_published >= STEERING_S:
             self._steering_published = event.t
-            self.publish(SteeringAngle(round(time.time() - (now - event.t), 4), event.rad))
+            at = round(time.time() - (now - event.t), 4)
+            self.publish(SteeringAngle(at, event.rad, UNSET if event.gear is None else event.gear))
 
     def advise(self, run: Run, t: float) -> None:
         """Publish the speed that the latency of the operator's pictures allows.

@@ -248,8 +248,8 @@ def test_a_steering_angle_is_passed_on_with_its_time_by_this_machines_clock(both
     received = []
 
     class Steered(Listener):
-        def on_steering(self, at, rad):
-            received.append((at, rad))
+        def on_steering(self, at, rad, gear):
+            received.append((at, rad, gear))
 
     station, vehicle, _ = both
     station.listeners.append(Steered())
@@ -258,9 +258,9 @@ def test_a_steering_angle_is_passed_on_with_its_time_by_this_machines_clock(both
     report_until(station, vehicle, lambda: station.latency.clock)
     at = time.time()
     vehicle.publish("steering", {"at": at + 3.7 + 60, "rad": 0.2})
-    vehicle.publish("steering", {"at": at + 3.7, "rad": 0.3})
+    vehicle.publish("steering", {"at": at + 3.7, "rad": 0.3, "gear": "R"})
     until(lambda: received)
-    assert received == [(pytest.approx(at, abs=station.latency.clock.bound_s + 1e-3), 0.3)]
+    assert received == [(pytest.approx(at, abs=station.latency.clock.bound_s + 1e-3), 0.3, "R")]
 
 
 def test_the_heartbeat_states_the_drivers_attention(both):
