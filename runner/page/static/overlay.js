@@ -1,10 +1,16 @@
 /**
  * Alarms, drawn by the worker into the picture itself: they appear even when the page's main thread is busy.
- * Each alarm has a colour, a word and a shape: LOST a cross, FROZEN a hatch, DAMAGED and LATE, whose picture moves, a dashed frame.
+ * They keep to its rim: a frame, and a label at the upper edge, away from the road. Each has a colour, a word, a mark and a
+ * frame of its own: LOST solid with crosses in its corners, FROZEN hatched; DAMAGED dotted and LATE dashed, whose pictures move.
  */
 
 export const RED = "#e01b24";
 export const AMBER = "#ffb000";
+const MARKS = { lost: "✕", frozen: "■", damaged: "◪", late: "▲" };
+const THICK = 0.05; // of the shorter side: an alarm's frame
+const THIN = 0.03; // a warning's
+const HEAD_PX = 24; // CSS px at the upper edge that a picture's name may cover
+const SOLID = [];
 
 /**
  * Draw the alarm or notice of a status over the picture in the canvas.
@@ -13,9 +19,10 @@ export const AMBER = "#ffb000";
  * @param {boolean} mirrored whether the canvas is mirrored: text is drawn so that it reads correctly
  * @param {string} status
  * @param {string} text
+ * @param {number} css px of the canvas in a CSS px
  */
-export function drawOverlay(context, area, mirrored, status, text) {
-  readably(context, area, mirrored, () => drawStatus(context, area, status, text));
+export function drawOverlay(context, area, mirrored, status, text, css) {
+  readably(context, area, mirrored, () => drawStatus(context, area, status, text, css));
 }
 
 /**
@@ -33,13 +40,35 @@ export function readably(context, area, mirrored, draw) {
   context.restore();
 }
 
-function drawStatus(context, { width, height }, status, text) {
+function drawStatus(context, { width, height }, status, text, css) {
   const side = Math.min(width, height);
-  if (status === "late" || status === "damaged") return drawWarning(context, width, height, side, text);
-  if (status === "frozen" || status === "lost") return drawAlarm(context, width, height, side, status, text);
-  dim(context, width, height, 0.72);
-  drawLabel(context, width, height / 2, side * 0.13, text, "#2b333c", "#e6ebf0");
+  if (!MARKS[status]) {
+    dim(context, width, height, 0.72);
+    return drawLabel(context, width, height / 2, side * 0.13, text, "#2b333c", "#e6ebf0");
+  }
+  const isStalled = status === "frozen" || status === "lost";
+  const size = side * (isStalled ? 0.15 : 0.1);
+  if (isStalled) dim(context, width, height, 0.5);
+  FRAMES[status](context, width, height, side);
+  const y = Math.min(HEAD_PX * css, 0.35 * height) + 0.8 * size;
+  drawLabel(context, width, y, size, `${MARKS[status]} ${text}`, isStalled ? RED : AMBER, isStalled ? "#fff" : "#000");
 }
+
+const FRAMES = {
+  lost(context, width, height, side) {
+    const thick = THICK * side;
+    frame(context, width, height, thick, RED, SOLID);
+    for (const x of [1.5 * thick, width - 1.5 * thick]) for (const y of [1.5 * thick, height - 1.5 * thick]) cross(context, x, y, thick);
+  },
+  frozen(context, width, height, side) {
+    const thick = 1.3 * THICK * side;
+    frame(context, width, height, thick, "#000", SOLID);
+    hatch(context, width, height, thick);
+    frame(context, width, height, 0.25 * thick, RED, SOLID);
+  },
+  damaged: (context, width, height, side) => frame(context, width, height, THIN * side, AMBER, [THIN * side, THIN * side]),
+  late: (context, width, height, side) => frame(context, width, height, THIN * side, AMBER, [side * 0.16, side * 0.08]),
+};
 
 /**
  * Draw a note into the lower right corner: no alarm, so that it neither covers nor colours the picture.
@@ -62,19 +91,6 @@ export function drawNote(context, area, mirrored, text) {
   });
 }
 
-function drawAlarm(context, width, height, side, status, text) {
-  dim(context, width, height, 0.5);
-  if (status === "frozen") hatch(context, width, height, side);
-  else cross(context, width, height, side);
-  frame(context, width, height, side * 0.06, RED, []);
-  drawLabel(context, width, height / 2, side * 0.17, text, RED, "#fff");
-}
-
-function drawWarning(context, width, height, side, text) {
-  frame(context, width, height, side * 0.06, AMBER, [side * 0.16, side * 0.08]);
-  drawLabel(context, width, height - side * 0.15, side * 0.13, text, AMBER, "#000");
-}
-
 /** Desaturate and darken the last picture, so that it is not mistaken for a live one. */
 function dim(context, width, height, dark) {
   context.globalCompositeOperation = "saturation";
@@ -85,21 +101,31 @@ function dim(context, width, height, dark) {
   context.fillRect(0, 0, width, height);
 }
 
-function hatch(context, width, height, side) {
-  stroke(context, side * 0.03, "rgba(224,27,36,0.55)", () => {
-    for (let x = -height; x < width; x += side * 0.16) {
+/** Stripes in a frame. */
+function hatch(context, width, height, thick) {
+  context.save();
+  context.beginPath();
+  context.rect(0, 0, width, height);
+  context.rect(thick, thick, width - 2 * thick, height - 2 * thick);
+  context.clip("evenodd");
+  stroke(context, thick * 0.7, RED, () => {
+    for (let x = -height; x < width; x += 2 * thick) {
       context.moveTo(x, height);
       context.lineTo(x + height, 0);
     }
   });
+  context.restore();
 }
 
-function cross(context, width, height, side) {
-  stroke(context, side * 0.04, "rgba(224,27,36,0.8)", () => {
-    context.moveTo(0, 0);
-    context.lineTo(width, height);
-    context.moveTo(0, height);
-    context.lineTo(width, 0);
+/** A cross on a red ground. */
+function cross(context, x, y, size) {
+  context.fillStyle = RED;
+  context.fillRect(x - 1.5 * size, y - 1.5 * size, 3 * size, 3 * size);
+  stroke(context, size * 0.5, "#fff", () => {
+    for (const sign of [1, -1]) {
+      context.moveTo(x - size, y - sign * size);
+      context.lineTo(x + size, y + sign * size);
+    }
   });
 }
 

@@ -69,7 +69,7 @@ export class StreamCanvas {
     if (isStraight && shown?.image && !this.camera.calibrated && !this.guides?.shown) this.labelEstimate(context, canvas);
     const { mirrored } = this.display.view;
     if (note) drawNote(context, this.visibleArea(canvas), mirrored, note);
-    if (text) drawOverlay(context, this.visibleArea(canvas), mirrored, status, text);
+    if (text) drawOverlay(context, this.visibleArea(canvas), mirrored, status, text, this.perCssPx(canvas));
     this.painted_text = textOf(text, note);
     return true;
   }
@@ -77,6 +77,11 @@ export class StreamCanvas {
   /** Whether it shows other texts than these. */
   isOutdated(text, note) {
     return this.context !== null && this.painted_text !== textOf(text, note);
+  }
+
+  /** Px of the canvas in a CSS px of the screen. */
+  perCssPx(canvas) {
+    return (canvas.width * this.display.ratio) / (this.widthOnScreen(canvas) || canvas.width);
   }
 
   /** For tests: the guides that are drawn, in CSS px of the picture's box. */
