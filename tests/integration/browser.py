@@ -208,10 +208,10 @@ BOXES = """() => {
   const isCut = (element) => isRead(element) && element.scrollWidth > element.clientWidth + 1;
   const isLow = ({ scrollHeight, clientHeight }) => scrollHeight > clientHeight + 1;
   const named = ({ id, className, tagName, textContent }) => `${id || className || tagName}: ${textContent}`;
-  const seen = ".tile, .picture, #header > *, #side, #drive *";
+  const seen = ".tile, .picture, #header > *, #side, #drive *, #messages *";
   const panels = "#side > [role=tabpanel]:not(#news-panel), dialog[open]";
   const inputs = "#side :is(input, button, label)";
-  const texts = `#drive *, .tile .head, .tile .head *, .tile .caption, #header *, ${inputs}`;
+  const texts = `#drive *, #messages *, .tile .head, .tile .head *, .tile .caption, #header *, ${inputs}`;
   const leavesPanel = (element) => {
     const [own, panel] = [element, document.querySelector("#side")].map((each) => each.getBoundingClientRect());
     return own.left < panel.left - 1 || own.right > panel.right + 1;
@@ -223,7 +223,7 @@ BOXES = """() => {
       {
         outside: [...find(seen).filter((each) => isOutside(box(each))), ...find(inputs).filter(leavesPanel)].map(named),
         cut: find(texts).filter(isCut).map(named),
-        low: find(`#drive > *, .tile .head, .tile .caption, ${panels}`).filter(isLow).map(named),
+        low: find(`#drive > *, #messages, .tile .head, .tile .caption, ${panels}`).filter(isLow).map(named),
         scrolls: scrollWidth > innerWidth + 1 || scrollHeight > innerHeight + 1,
       },
     ];

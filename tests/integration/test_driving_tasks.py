@@ -177,10 +177,11 @@ def selected(page):
 
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_look_aside(driver, page, side):
-    """One press selects the picture next to the front camera's, another enlarges it."""
-    front, aside = box(page, "front"), box(page, side)
-    assert (aside["x"] < front["x"]) == (side == "left")
-    assert aside["height"] > 0.4 * page.viewport_size["height"]
+    """One press selects the picture of a side, which is whole, another enlarges it."""
+    front, rear, aside = (box(page, name) for name in ("front", "rear", side))
+    assert (aside["x"] < rear["x"]) == (side == "left")
+    assert aside["width"] > 0.32 * front["width"]
+    assert aside["width"] / aside["height"] == pytest.approx(16 / 9, rel=0.02)
     driver.does(f"camera_{side}")
     until(lambda: selected(page) == side)
     assert driver.presses == 1
@@ -262,9 +263,10 @@ def test_take_control_back_from_another_page(typist, page, chromium, drive):
 
 
 def test_silence_the_tones(typist, page):
-    until(lambda: page.inner_text("#sound") == "Sound on")
+    until(lambda: page.inner_text("#sound") == "Mute")
     typist.does("sound")
-    assert (page.inner_text("#sound"), typist.presses) == ("✕ Muted", 1)
+    assert (page.inner_text("#sound"), typist.presses) == ("Unmute", 1)
+    assert page.inner_text("#line").endswith("✕ tones muted")
 
 
 # --- what a driver must notice ----------------------------------------------------------------------------------------

@@ -32,3 +32,11 @@ for (const [what, pairs, captured, expected] of TABLE)
     if (expected === null) assert.equal(found, null);
     else assert.ok(Math.abs((found ?? NaN) - expected) < 1e-12, `${found}, not ${expected}`);
   });
+
+test("the newest report is shown for a second, with the gear", () => {
+  const steering = reported([1000, 0.1]);
+  steering.onReport(1100, -0.2, "R");
+  const newest = { at: 1100, rad: -0.2, gear: "R" };
+  assert.deepEqual([steering.newest(1100), steering.newest(2100), steering.newest(2101)], [newest, newest, null]);
+  assert.equal(reported().newest(1000), null);
+});

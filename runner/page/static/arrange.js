@@ -1,22 +1,35 @@
-/** The Drive view: which camera looks where, and the boxes of the pictures. Pure; lengths in px. */
+/** The Drive view: which camera looks where, and the boxes of pictures and panels. Pure; lengths in px. */
+
+import { WHOLE } from "./framing.js";
 
 const AHEAD_DEG = 30; // a camera within this of straight ahead is the front camera
 const BEHIND_DEG = 135; // a camera turned further than this looks backwards
 const DOWN_DEG = 25; // a camera tipped down by this much is a top view
 const GAP = 4;
-// Shares of the area: the front camera's minimum, and of its height or width for the others.
-const FRONT = 0.42;
-const BAND = { min: 0.1, usual: 0.14, max: 0.22 }; // above the pictures: the mirror and the figures
-const BAND_WITHOUT_MIRROR = { min: 0.1, usual: 0.1, max: 0.12 };
-const STRIP = { min: 0.1, usual: 0.17 };
-const SIDE = { min: 0.07, usual: 0.12, max: 0.16 };
-const COLUMN = 0.14;
-const NARROW = 1.3; // width / height below which an area is narrow
-const MIRROR = 0.3; // maximum share of the width
+// Shares of the area's width or height.
+const COLUMN = { usual: 0.17, birdseye: 0.25 }; // beside the front picture, at least; with a bird's-eye view where there is height
+const STRIP = { min: 0.12, max: 0.3 }; // above it
+const SMALL = { usual: 0.45, birdseye: 0.6 }; // of the column: small pictures, at most
+const FRONT = 0.5; // the front picture in a tall area, at most
+const BELOW = 0.2; // what a tall area keeps for the panels
+const TALL = 0.95; // width / height below which an area is tall
+const ROW = 0.95; // of the front picture's width; a row below it may cost the rest
+const LEAST_PX = 56; // a lower rest of the area stays empty
+/** Share of the height that panels have in common; and the height at most: a share of the width, and px. The map gets the rest. */
+const PANELS = { figures: [26, 0.35, 60], messages: [20, 0.3, 60], words: [16, 0.25, 50], map: [18, 0, 0], buttons: [26, 0.3, 90] };
+const LEAST_MAP_PX = 90;
 
 /** @typedef {import("./framing.js").View} View */
 /** @typedef {{x: number, y: number, width: number, height: number}} Box */
 /** @typedef {Box & {view: View}} Framed a picture's box and how the picture is placed in it */
+/** @typedef {"figures"|"messages"|"words"|"map"|"buttons"} Panel */
+/** @typedef {Record<"front"|"left"|"rear"|"right"|"row", Box>} Slots */
+/**
+ * @typedef {object} Arrangement
+ * @property {Map<string, Framed>} pictures of cameras, and BIRDSEYE
+ * @property {Partial<Record<Panel, Box>>} panels all but the map, for which there may be no room
+ * @property {Slots} slots where pictures are, or would be, by place
+ */
 /**
  * @typedef {object} Camera
  * @property {string} name
@@ -77,126 +90,212 @@ function nearest(cameras, yaw, within) {
 }
 
 /**
- * The box of each picture, of the band above them, and of the mirror in its middle (of no width without one). No two boxes
- * of pictures overlap. A bird's-eye view replaces the top views in the row, except the main one.
+ * The box of each picture and of each panel. Side and rear pictures are a strip above the front picture, as mirrors are
+ * above a windscreen; small pictures and panels are in a column beside it, or below it where the area is tall. No two boxes
+ * overlap. A bird's-eye view replaces the top views, except the main one.
  * @param {Camera[]} cameras  @param {number} width  @param {number} height of the area
  * @param {string|null} main camera that is swapped with the front camera
  * @param {{width: number, height: number}|null} birdseye its size, in any unit; null: none
  * @param {import("./placing.js").Places|null} places that an operator has saved
- * @returns {{band: Box, mirror: Box, pictures: Map<string, Framed>}} pictures of cameras, and BIRDSEYE
+ * @returns {Arrangement}
  */
 export function arrange(cameras, width, height, main = null, birdseye = null, places = null) {
   const large = [main, places?.front, places?.left, places?.right, places?.rear];
   const kept = cameras.filter((each) => !birdseye || !isTopView(each) || large.includes(each.name));
-  const roles = rolesOf(birdseye ? [...kept, asCamera(birdseye)] : kept, places);
-  const area = (found) => (roles.front ? found.pictures.get(roles.front.name).width : 0);
-  const hasSides = roles.left || roles.right || !roles.others.length;
-  const found = [withStrip(roles, width, height), ...(hasSides ? [] : [withColumn(roles, width, height)])];
-  const best = found.sort((a, b) => area(b) - area(a))[0];
-  swap(best.pictures, roles.front?.name, main);
-  return best;
+  const roles = rolesOf(kept, places);
+  if (birdseye) roles.others.unshift({ ...birdseye, name: BIRDSEYE, pose: null, framing: null });
+  const found = width < TALL * height ? stacked(roles, width, height) : beside(roles, width, height);
+  swap(found.pictures, roles.front?.name, main);
+  return found;
 }
-
-/** @returns {Camera} */
-const asCamera = (birdseye) => ({ ...birdseye, name: BIRDSEYE, pose: null, framing: null });
 
 /** Swap two cameras; both are shown whole. */
 function swap(pictures, front, main) {
   const [a, b] = [pictures.get(front), pictures.get(main)];
   if (!a || !b || a === b) return;
-  const whole = (box, { mirrored }) => ({ ...box, view: { fit: "contain", align: 0.5, mirrored } });
+  const whole = (box, { mirrored }) => ({ ...box, view: { ...WHOLE, mirrored } });
   pictures.set(main, whole(a, b.view)).set(front, whole(b, a.view));
 }
 
-/** Neighbours at both sides of the front camera, the others in a row below. */
-function withStrip(roles, width, height) {
-  const { front, left, right, others } = roles;
-  const sides = [left, right].filter((side) => side !== null).length;
-  const room = roomAbove(roles);
-  const strip = others.length ? STRIP : { min: 0, usual: 0 };
-  const gaps = GAP * (others.length ? 2 : 1);
-  const wide = front ? frontWidth(aspectOf(front), width, height, sides, room.min + strip.min, room.usual + strip.usual, gaps) : 0;
-  const high = front ? Math.floor(wide / aspectOf(front)) : 0;
-  const rest = height - high - gaps;
-  const row = others.length ? rowHeight(others, width, height, rest, room) : 0;
-  const band = bandOf(roles, width, Math.floor(Math.min(rest - row, room.max * height)));
-  const middle = { y: band.band.height + GAP, height: height - band.band.height - row - gaps };
-  const side = sides ? Math.floor((width - wide) / sides) - GAP : 0;
-  const at = left ? side + GAP : sides ? 0 : Math.floor((width - wide) / 2);
-  const pictures = band.pictures;
-  if (left) pictures.set(left.name, { x: 0, ...middle, width: side, view: viewOf(left, "fill", 1) });
-  const y = middle.y + Math.floor((middle.height - high) / 2);
-  if (front) pictures.set(front.name, { x: at, y, width: wide, height: high, view: viewOf(front) });
-  if (right) pictures.set(right.name, { x: at + wide + GAP, ...middle, width: side, view: viewOf(right, "fill", 0) });
-  const total = Math.ceil(sum(others.map((camera) => row * aspectOf(camera) + GAP)) - GAP);
-  let x = Math.max(0, Math.floor((width - total) / 2));
-  for (const camera of others) {
-    const own = Math.floor(row * aspectOf(camera));
-    pictures.set(camera.name, { x, y: height - row, width: own, height: row, view: viewOf(camera) });
-    x += own + GAP;
-  }
-  return { ...band, pictures };
-}
-
-/**
- * The front camera's width: at least its share of the area, beyond that what the height allows and the sides leave. In a
- * narrow area, next to the open drawer, the sides have priority.
- */
-function frontWidth(aspect, width, height, sides, min, usual, gaps) {
-  const share = Math.sqrt(FRONT * width * height * aspect);
-  const roomy = (height * (1 - usual) - gaps) * aspect;
-  const low = sides ? width * (1 - sides * SIDE.max) : 0;
-  const high = width * (1 - sides * SIDE.usual);
-  const wanted = width < NARROW * height ? low || roomy : Math.max(share, Math.min(Math.max(roomy, low), high));
-  return Math.floor(Math.min(wanted, (height * (1 - min) - gaps) * aspect, width * (1 - sides * SIDE.min)));
-}
-
-/** Height of the row below: limited by the width, and about half of the rest, which it shares with the band. */
-function rowHeight(others, width, height, rest, room) {
-  const widest = (width - GAP * (others.length - 1)) / sum(others.map(aspectOf));
-  const wanted = Math.max(rest * 0.55, rest - room.max * height);
-  return Math.floor(Math.min(widest, wanted, rest - room.min * height));
-}
-
-/** Without neighbours: the others in a column at the right, which leaves a wide screen's height to the front camera. */
-function withColumn(roles, width, height) {
+/** With a column at the right: the front picture is as large as the strip above it, a row below it and the column allow. */
+function beside(roles, width, height) {
   const { front, others } = roles;
-  const room = roomAbove(roles);
-  const wide = Math.floor(Math.min(width * (1 - COLUMN) - GAP, (height * (1 - room.usual) - GAP) * aspectOf(front)));
-  const high = Math.floor(wide / aspectOf(front));
-  const band = bandOf(roles, width, Math.floor(Math.min(height - high - GAP, room.max * height)));
-  const y = band.band.height + GAP;
-  const available = height - y - GAP * (others.length - 1);
-  const column = Math.min(width - wide - GAP, available / sum(others.map((camera) => 1 / aspectOf(camera))));
-  band.pictures.set(front.name, { x: 0, y, width: wide, height: high, view: viewOf(front) });
-  let down = y;
-  for (const camera of others) {
-    const own = Math.floor(column / aspectOf(camera));
-    band.pictures.set(camera.name, { x: wide + GAP, y: down, width: Math.floor(column), height: own, view: viewOf(camera) });
-    down += own + GAP;
+  const isHigh = others[0]?.name === BIRDSEYE && width < 1.5 * height;
+  const widest = Math.floor(width * (1 - (isHigh ? COLUMN.birdseye : COLUMN.usual))) - GAP;
+  const [alone, withRow] = [[], others].map((row) => frontWidth(roles, row, widest, height));
+  const row = others.length > 1 && withRow >= ROW * alone ? others : [];
+  const wide = row.length ? withRow : alone;
+  const [high, low] = [heightOf(front, wide), rowHeight(row, wide)];
+  const strip = stripOf(roles, wide, height, height - high - GAP - below(low));
+  const { pictures } = strip;
+  const y = below(strip.height);
+  if (front) pictures.set(front.name, { x: 0, y, width: wide, height: high, view: viewOf(front) });
+  put(pictures, row, { x: 0, y: y + high + GAP, width: wide, height: low });
+  const column = { x: wide + GAP, y: 0, width: width - wide - GAP, height };
+  const share = others[0]?.name === BIRDSEYE ? SMALL.birdseye : SMALL.usual;
+  const small = putRows(pictures, row.length ? [] : others, column, share * height);
+  const end = y + high + below(low) + GAP;
+  const rest = height - end < LEAST_PX ? [] : [{ x: 0, y: end, width: wide, height: height - end }];
+  const panels = panelsIn([...strip.free, ...rest], { ...column, height: height - below(small) });
+  const head = { width: wide, height: Math.max(strip.height, STRIP.min * height) };
+  return { pictures, panels, slots: slotsOf(roles, pictures, head, column) };
+}
+
+/** The largest width of the front picture at which all is inside the area. */
+function frontWidth(roles, row, widest, height) {
+  const needed = (wide) => below(leastStrip(roles, wide, height)) + heightOf(roles.front, wide) + below(rowHeight(row, wide));
+  let [low, high] = [0, widest];
+  while (low < high) {
+    const middle = Math.ceil((low + high) / 2);
+    if (needed(middle) <= height) low = middle;
+    else high = middle - 1;
   }
-  return band;
+  return low;
 }
 
-const roomAbove = ({ rear }) => (rear ? BAND : BAND_WITHOUT_MIRROR);
-
-/** The band, with the rear view in its middle. */
-function bandOf({ rear }, width, height) {
-  const wide = rear ? Math.floor(Math.min(height * aspectOf(rear), width * MIRROR)) : 0;
-  const mirror = { x: Math.floor((width - wide) / 2), y: 0, width: wide, height };
-  /** @type {Map<string, Framed>} */
-  const pictures = new Map(rear ? [[rear.name, { ...mirror, view: viewOf(rear) }]] : []);
-  return { band: { x: 0, y: 0, width, height }, mirror, pictures };
+/** The parts of a tall area below each other: strip, front picture, small pictures, panels. */
+function stacked(roles, width, height) {
+  const { front, left, rear, right, others } = roles;
+  const isFull = left && rear && right;
+  const strip = isFull ? stripOf(roles, width, height, STRIP.max * height) : { height: 0, pictures: new Map() };
+  const { pictures } = strip;
+  const wide = front ? Math.floor(Math.min(width, FRONT * height * aspectOf(front))) : 0;
+  const [y, high] = [below(strip.height), heightOf(front, wide)];
+  if (front) pictures.set(front.name, { x: Math.floor((width - wide) / 2), y, width: wide, height: high, view: viewOf(front) });
+  const small = [...(isFull ? [] : [left, rear, right].filter((camera) => camera !== null)), ...others];
+  const from = y + high + GAP;
+  const used = putRows(pictures, small, { x: 0, y: from, width, height: 0 }, height - from - GAP - BELOW * height);
+  const rest = { x: 0, y: from + below(used), width, height: height - from - below(used) };
+  const head = { width, height: Math.max(strip.height, STRIP.min * height) };
+  return { pictures, panels: panelsIn([], rest), slots: slotsOf(roles, pictures, head, rest) };
 }
 
+// --- pictures ---------------------------------------------------------------------------------------------------------
+
+/** Height of the strip at which it is as wide as the front picture, or where places in it are free, at least. */
+function leastStrip({ left, rear, right }, wide, height) {
+  const taken = [left, rear, right].filter((camera) => camera !== null);
+  if (taken.length < 3) return taken.length ? Math.floor(STRIP.min * height) : 0;
+  return Math.floor(Math.min(rowHeight(taken, wide), STRIP.max * height));
+}
+
+/** The strip of side and rear pictures, from the left; free places are for panels, and so are the ends of a strip too short. */
+function stripOf(roles, wide, height, most) {
+  const slots = [roles.left, roles.rear, roles.right];
+  const taken = slots.filter((camera) => camera !== null);
+  const least = leastStrip(roles, wide, height);
+  const high = taken.length === 3 ? least : taken.length || most >= LEAST_PX ? Math.floor(most) : 0;
+  const own = Math.floor(Math.min(high, STRIP.max * height, taken.length < 3 ? (0.6 * wide) / sum(taken.map(aspectOf)) : high));
+  const widths = taken.map((camera) => Math.floor(own * aspectOf(camera)));
+  const isShort = taken.length === 3 && wide - sum(widths) > 2 * LEAST_PX;
+  const places = isShort ? [null, ...slots, null] : slots.filter((camera, i) => camera || i === 0 || slots[i - 1]);
+  const gaps = GAP * (places.length - 1);
+  const share = Math.floor((wide - sum(widths) - gaps) / Math.max(1, places.length - taken.length));
+  /** @type {{height: number, free: Box[], pictures: Map<string, Framed>}} */
+  const strip = { height: high, free: [], pictures: new Map() };
+  let x = 0;
+  for (const camera of high ? places : []) {
+    const width = camera ? widths[taken.indexOf(camera)] : share;
+    if (camera) strip.pictures.set(camera.name, { x, y: 0, width, height: own, view: viewOf(camera) });
+    else strip.free.push({ x, y: 0, width, height: high });
+    x += width + GAP;
+  }
+  return strip;
+}
+
+/** Place small pictures in as many rows as show them largest, at the lower end of a box or, of no height, below its edge. */
+function putRows(pictures, cameras, box, most) {
+  const isAbove = cameras[0]?.name === BIRDSEYE; // it has a row of its own
+  const rows = isAbove ? [[cameras[0]], ...rowsOf(cameras.slice(1), box.width, most / 3)] : rowsOf(cameras, box.width, most);
+  const limit = (row) => (isAbove && row[0] !== cameras[0] ? most / 3 : most);
+  const heights = rows.map((row) => Math.floor(Math.min(rowHeight(row, box.width), limit(row))));
+  const total = sum(heights) + GAP * Math.max(0, rows.length - 1);
+  let y = box.height ? box.y + box.height - total : box.y;
+  for (const [i, row] of rows.entries()) {
+    put(pictures, row, { ...box, y, height: heights[i] });
+    y += heights[i] + GAP;
+  }
+  return total;
+}
+
+/** Cameras in rows of equal length, not higher than allowed together. */
+function rowsOf(cameras, width, most) {
+  const split = (count) => {
+    const length = Math.ceil(cameras.length / count);
+    return Array.from({ length: Math.ceil(cameras.length / length) }, (_, i) => cameras.slice(i * length, (i + 1) * length));
+  };
+  const total = (rows) => sum(rows.map((row) => rowHeight(row, width) + GAP));
+  const found = cameras.map((_, i) => split(i + 1));
+  return found.findLast((rows) => total(rows) <= most) ?? found[0] ?? [];
+}
+
+/** Place pictures side by side in the middle of a box. */
+function put(pictures, row, box) {
+  const widths = row.map((camera) => Math.floor(Math.min(box.height * aspectOf(camera), box.width)));
+  let x = box.x + Math.floor((box.width - sum(widths) - GAP * (row.length - 1)) / 2);
+  for (const [i, camera] of row.entries()) {
+    pictures.set(camera.name, { x, y: box.y, width: widths[i], height: box.height, view: viewOf(camera) });
+    x += widths[i] + GAP;
+  }
+}
+
+/** Height of pictures side by side that are as wide as this. */
+const rowHeight = (row, wide) => (row.length ? Math.floor((wide - GAP * (row.length - 1)) / sum(row.map(aspectOf))) : 0);
+const heightOf = (camera, wide) => (camera ? Math.floor(wide / aspectOf(camera)) : 0);
+/** A height with the gap next to it; 0 without one. */
+const below = (height) => (height ? height + GAP : 0);
 const aspectOf = ({ width, height }) => width / height;
 const sum = (values) => values.reduce((a, b) => a + b, 0);
 
-/**
- * @param {Camera} camera  @param {"fit"|"fill"} usual unless the camera states it  @param {number} align where it is cropped
- * @returns {View}
- */
-export function viewOf(camera, usual = "fit", align = 0.5) {
-  const fills = (camera.framing ?? usual) === "fill";
-  return { fit: fills ? "cover" : "contain", align: fills ? align : 0.5, mirrored: looksBackwards(camera) };
+/** @param {Camera} camera  @returns {View} */
+export const viewOf = (camera) => ({ fit: camera.framing === "fill" ? "cover" : "contain", mirrored: looksBackwards(camera) });
+
+/** @returns {Slots} */
+function slotsOf(roles, pictures, strip, row) {
+  const wide = strip.width / 3;
+  const slot = (role, i) => pictures.get(roles[role]?.name) ?? { x: i * wide, y: 0, width: wide, height: strip.height };
+  return { front: pictures.get(roles.front?.name) ?? row, left: slot("left", 0), rear: slot("rear", 1), right: slot("right", 2), row };
+}
+
+// --- panels -----------------------------------------------------------------------------------------------------------
+
+const ALL = /** @type {Panel[]} */ (Object.keys(PANELS));
+
+/** The panels: what a driver reads most often in free places next to the front picture, if there are any. */
+function panelsIn(free, column) {
+  if (!free.length) return column.width > 1.5 * column.height ? abreast(column) : piled(column, ALL);
+  const [first, second = null] = free;
+  const half = Math.floor((first.width - GAP) / 2);
+  const [figures, messages] = second ? [first, second] : [{ ...first, width: half }, { ...first, x: first.x + half + GAP, width: half }];
+  return { figures, messages, ...piled(column, ["words", "map", "buttons"]) };
+}
+
+/** Panels below each other. */
+function piled(box, names) {
+  const weights = sum(names.map((name) => PANELS[name][0]));
+  const heights = names.map((name) => {
+    const [weight, share, px] = PANELS[name];
+    return Math.floor(Math.min((weight / weights) * (box.height - GAP * (names.length - 1)), share * box.width + px));
+  });
+  const rest = box.height - sum(heights) - GAP * (names.length - 1);
+  const map = names.indexOf("map");
+  if (map >= 0 && rest < LEAST_MAP_PX) return piled(box, names.filter((name) => name !== "map"));
+  heights[map >= 0 ? map : names.length - 1] += rest;
+  let { y } = box;
+  /** @type {Partial<Record<Panel, Box>>} */
+  const panels = {};
+  for (const [i, name] of names.entries()) {
+    panels[name] = { ...box, y, height: heights[i] };
+    y += heights[i] + GAP;
+  }
+  return panels;
+}
+
+/** Panels of a wide box: two columns, and the map where it is high enough. */
+function abreast(box) {
+  const map = box.height >= LEAST_MAP_PX ? Math.floor(Math.min(box.height, 0.25 * box.width)) : 0;
+  const half = Math.floor((box.width - below(map) - GAP) / 2);
+  const left = piled({ ...box, width: half }, ["figures", "words"]);
+  const right = piled({ ...box, x: box.x + half + GAP, width: half }, ["messages", "buttons"]);
+  return { ...left, ...right, ...(map && { map: { ...box, x: box.x + box.width - map, width: map } }) };
 }

@@ -6,7 +6,7 @@ import { groundOf } from "./ground.js";
 import { showGround, transferGround } from "./link.js";
 import { reportProblem, showProblem } from "./requests.js";
 import { STALLED } from "./status.js";
-import { byId, displayName, setAttribute, setText } from "./format.js";
+import { byId, displayName, setAttribute, setBox, setText } from "./format.js";
 
 const CHOICE = "tod-birdseye";
 let failure = ""; // why it cannot be drawn any more
@@ -30,7 +30,7 @@ function choose(choice) {
   publish("birdseye");
 }
 
-/** Cycle: in the row below the front camera, large in its place, off. */
+/** Cycle: beside the front camera, large in its place, off. */
 export function cycleBirdseye() {
   if (store.view !== "drive" || !cameras().length) return;
   if (failure) return showProblem(failure);
@@ -44,10 +44,9 @@ export function cycleBirdseye() {
 export function placeBirdseye(box) {
   const element = byId("birdseye");
   element.hidden = !box;
-  const sides = box && { left: box.x, top: box.y, width: box.width, height: box.height };
-  for (const [side, px] of Object.entries(sides ?? {})) element.style[side] = `${px}px`;
+  if (box) setBox(element, box);
   showGround(Boolean(box), element);
-  setAttribute(byId("to-birdseye"), "aria-pressed", Boolean(box));
+  setText(byId("to-birdseye"), `${box ? (store.enlarged === BIRDSEYE ? "Hide" : "Enlarge") : "Show"} bird's eye`);
 }
 
 /** The worker could not draw it: the pictures of its cameras take its place. */

@@ -3,6 +3,7 @@
 import { factorAxis, ticksWithin, timeAxis } from "./axes.js";
 import { listen, store } from "./store.js";
 import { colourOf, themed } from "./colours.js";
+import { metres, rangeOf } from "./track.js";
 import { byId, displayName, factor, make } from "./format.js";
 
 const SETTLE_MS = 3000; // after the first picture: while the charts load, controls do not answer for most of a second
@@ -10,7 +11,6 @@ const AT_LATEST_MS = 5000; // if no picture is live by then
 const MARGIN = { l: 58, r: 10, t: 6, b: 40 }; // px around the axes
 const LEAST_PX = 70; // Plotly cannot place the axes in a lower chart; the rest is clipped
 const BETWEEN_MS = 60; // from one chart to the next, to avoid long tasks
-const EARTH_M = 6371000;
 
 const visible = new Set();
 let isLoading = false;
@@ -61,26 +61,11 @@ function perCamera(traces) {
     traces(name, store.series.cameras[name], colourOf(names.indexOf(name)), name === store.selected ? 3 : 1.5));
 }
 
-/** Positions in metres east and north of the first one; on the scale of a drive the earth is flat. */
-function metres() {
-  const { lat, lon, actual_kbps } = store.series;
-  const known = lat.flatMap((each, i) => (each === null || lon[i] === null ? [] : [i]));
-  if (!known.length) return null;
-  const radians = Math.PI / 180;
-  const from = { lat: lat[known[0]] ?? 0, lon: lon[known[0]] ?? 0 };
-  return {
-    x: known.map((i) => ((lon[i] ?? 0) - from.lon) * radians * EARTH_M * Math.cos(from.lat * radians)),
-    y: known.map((i) => ((lat[i] ?? 0) - from.lat) * radians * EARTH_M),
-    kbps: known.map((i) => actual_kbps[i]),
-  };
-}
-
 function drive() {
-  const points = metres();
+  const points = metres(store.series);
   if (!points) return [];
   const { x, y, kbps } = points;
-  const known = kbps.flatMap((each) => each ?? []);
-  const ends = known.length ? [...new Set([Math.min(...known), Math.max(...known)])] : []; // more do not fit
+  const ends = [...new Set(rangeOf(kbps) ?? [])]; // more do not fit
   const bar = { title: { text: "kbit/s", side: "right" }, thickness: 10, outlinewidth: 0, ypad: 0, tickfont: { size: 12 },
     tickvals: ends, ticktext: ends.map((value) => value.toFixed()) };
   return [
@@ -119,7 +104,7 @@ function factorsAxis(high) {
 }
 
 function mapLayout() {
-  const empty = metres() === null;
+  const empty = metres(store.series) === null;
   const annotations = empty
     ? [{ text: "no position yet", showarrow: false, xref: "paper", yref: "paper", x: 0.5, y: 0.5, font: { size: 15 } }]
     : [];

@@ -10,7 +10,10 @@ import { linkFault } from "./header.js";
 import { reportAttention } from "./link.js";
 import { monitored, ownPictures } from "./monitored.js";
 import { showProblem } from "./requests.js";
+import { soundFault } from "./sound.js";
 import { SHAPES, showLines } from "./tiles.js";
+import { headingText } from "./track.js";
+import { fitPanels } from "./panels.js";
 import { limitReasons, pauseReason } from "./total.js";
 import { showUplinks, uplinkLines } from "./uplinks.js";
 import { byId, displayName, latency, setAttribute, setText, whole } from "./format.js";
@@ -24,13 +27,9 @@ const GUIDES = "tod-guides";
 const RETURNED_MS = 1000; // a press within this time belongs to the return
 const SETTLED_MS = 2500; // by then, pictures skipped while hidden no longer count
 
-const FITS = [1, 0.9, 0.8, 0.7, 0.6]; // of the usual size of text
+const STEERED_RAD = 0.6; // of the front wheels, at either end of the bar
+const DEGREES = 180 / Math.PI;
 
-/**
- * Parts of the band whose text is made smaller where it would be cut off, each with its text when its size was chosen.
- * @type {Map<HTMLElement, string>}
- */
-const fitted = new Map([...byId("drive").querySelectorAll(".figures, .words")].map((part) => [/** @type {HTMLElement} */ (part), ""]));
 const attention = new Attention();
 let isFocused = document.hasFocus();
 let returnedAt = -Infinity; // when the page was last shown again
@@ -43,13 +42,11 @@ function refresh() {
   if (store.view !== "drive") return;
   refreshLatency();
   refreshSpeed();
-  setText(byId("line"), [MODES[mode() ?? ""] ?? "no mode", totalWords(), linkWords()].join(" · "));
+  refreshMotion();
+  setText(byId("drive-vehicle"), store.hello?.vehicle ?? "");
+  setText(byId("line"), [MODES[mode() ?? ""] ?? "no mode", totalWords(), linkWords(), soundFault()].filter(Boolean).join(" · "));
   showUplinks(byId("drive-uplinks"), isOnline() ? uplinkLines(store.state, store.sample) : []);
-  for (const [part, before] of fitted) {
-    const text = (part.textContent ?? "").replace(/\d/g, "0"); // all digits are equally wide
-    if (text !== before) fit(part);
-    fitted.set(part, text);
-  }
+  fitPanels();
 }
 
 /** The worst latency of all pictures, in monitors as well. A picture that is not live has none, and is worse than any. */
@@ -80,6 +77,29 @@ function refreshSpeed() {
   setText(byId("advised"), Number.isFinite(factor) ? `advised: ${whole(100 * (factor ?? 0))} % of full speed` : "no speed advised");
   const level = (factor ?? 1) < 1 ? "near" : Number.isFinite(speed_mps) ? "fine" : "unknown";
   setAttribute(byId("speed-now"), "data-level", factor === 0 ? "late" : level);
+}
+
+/** Gear, heading and steering, each once the vehicle has reported it. */
+function refreshMotion() {
+  const { heading_deg } = (isOnline() && store.sample?.position) || {};
+  const { rad, gear } = (isOnline() && store.steering) || {};
+  const shift = `${Math.round(100 * Math.max(-1, Math.min(1, -(rad ?? 0) / STEERED_RAD)))}%`;
+  showFigure("heading", heading_deg === undefined ? null : headingText(heading_deg));
+  showFigure("gear", gear ?? null);
+  showFigure("steering", rad === undefined ? null : steeringText(rad));
+  byId("steering-mark").style.setProperty("--shift", shift);
+}
+
+/** @param {string} name  @param {string|null} text null: unknown, which is shown of what was known before */
+function showFigure(name, text) {
+  if (text !== null) byId(`${name}-now`).hidden = false;
+  setText(byId(name), text ?? "–");
+}
+
+/** @param {number} rad to the left */
+function steeringText(rad) {
+  const deg = Math.round(Math.abs(rad) * DEGREES);
+  return deg ? `${deg}° ${rad > 0 ? "left" : "right"}` : "straight";
 }
 
 function totalWords() {
@@ -125,14 +145,6 @@ function picturesOf(status, cameras) {
 /** @param {string} status  @param {string|undefined} than */
 const isWorse = (status, than) => !(than && than in ALARMS) || WORST_FIRST.indexOf(status) < WORST_FIRST.indexOf(than);
 
-/** Make the text of a part smaller where it would be cut off. @param {HTMLElement} part */
-function fit(part) {
-  for (const scale of FITS) {
-    part.style.setProperty("--fit", String(scale));
-    if (part.scrollHeight <= part.clientHeight && part.scrollWidth <= part.clientWidth) return;
-  }
-}
-
 // --- lines on the ground ----------------------------------------------------------------------------------------------
 
 /** @returns {import("./guides.js").Choice} */
@@ -149,8 +161,15 @@ function refreshGuides() {
   const guided = store.view !== "configure" ? cameras.filter((camera) => isGuided(camera, guidesChoice())).map(({ name }) => name) : [];
   showLines(guided);
   byId("guides").hidden = !cameras.length;
-  const isPartial = guidesChoice() === "calibrated" && guided.length < cameras.length;
-  setText(byId("guides"), guided.length ? `Guides on${isPartial ? ` (${guided.length})` : ""}` : "Guides off");
+  setText(byId("guides"), nextGuides(cameras, guided.length));
+}
+
+/** What the button does. @param {import("./store.js").Camera[]} cameras  @param {number} shown */
+function nextGuides(cameras, shown) {
+  const next = nextChoice(cameras, guidesChoice());
+  const more = cameras.filter((camera) => isGuided(camera, next)).length;
+  if (more <= shown) return "Hide guides";
+  return shown ? "Show all guides" : "Show guides";
 }
 
 // --- the driver's attention -------------------------------------------------------------------------------------------
@@ -196,9 +215,8 @@ export function startDrive() {
   });
   document.addEventListener("visibilitychange", updateAttention);
   for (const kind of ["pointerdown", "keydown"]) addEventListener(kind, onPress, true);
-  const resized = new ResizeObserver((entries) => entries.forEach(({ target }) => fit(/** @type {HTMLElement} */ (target))));
-  for (const part of fitted.keys()) resized.observe(part);
-  listen("hello state sample ages status monitored control socket requests view enlarged reminders", refresh);
+  listen("hello state sample ages status monitored control socket requests view enlarged reminders sound", refresh);
+  listen("toast", fitPanels);
   listen("control socket state view ages", updateAttention);
   listen("hello view", refreshGuides);
   addEventListener("storage", refreshGuides); // chosen in another window

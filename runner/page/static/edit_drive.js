@@ -2,9 +2,9 @@
 
 import { store } from "./store.js";
 import { rolesOf } from "./arrange.js";
-import { boxOf, moved, placeAt, placeOf, placesOf, placeText, shifted, stated } from "./placing.js";
-import { driveRoles, showDriveDraft } from "./tiles.js";
-import { byId, make } from "./format.js";
+import { moved, placeAt, placeOf, placesOf, placeText, shifted, stated } from "./placing.js";
+import { driveArrangement, driveRoles, showDriveDraft } from "./tiles.js";
+import { byId, make, setBox } from "./format.js";
 
 /** @type {Record<string, "front"|"left"|"right"|"rear"|"row">} */
 const PLACES = { ArrowLeft: "left", ArrowRight: "right", ArrowUp: "rear", ArrowDown: "row", Enter: "front" };
@@ -35,7 +35,7 @@ export const DRIVE = {
         target.hidden = !at;
         if (!at) return;
         const { box } = destination(draft, name, at);
-        for (const [side, length] of Object.entries(box)) target.style[{ x: "left", y: "top" }[side] ?? side] = `${length}px`;
+        setBox(target, box);
       },
       drop(at) {
         const { place, other } = destination(draft, name, at);
@@ -51,10 +51,10 @@ function destination(draft, name, { clientX, clientY }) {
   const tiles = document.elementsFromPoint(clientX, clientY).map((element) => /** @type {HTMLElement|null} */ (element.closest(".tile")));
   const tile = tiles.find((each) => each && each.dataset.camera !== name);
   const other = tile?.dataset.camera;
-  const [x, y, band] = [clientX - area.x, clientY - area.y, byId("drive").clientHeight];
+  const { slots } = driveArrangement();
   const at = other && placeOf(draft, other);
-  const place = at && at !== "front" ? at : placeAt(x, y, area, band);
-  if (!tile || !other || placeOf(draft, other) !== place) return { place, other: undefined, box: boxOf(place, area, band) };
+  const place = at && at !== "front" ? at : placeAt(clientX - area.x, clientY - area.y, slots);
+  if (!tile || !other || placeOf(draft, other) !== place) return { place, other: undefined, box: slots[place] };
   const { x: left, y: top, width, height } = tile.getBoundingClientRect();
   return { place, other, box: { x: left - area.x, y: top - area.y, width, height } };
 }

@@ -61,6 +61,11 @@ export function make(tag, attributes = {}, ...children) {
   return element;
 }
 
+/** Place an element, px of its container. @param {HTMLElement} element  @param {import("./arrange.js").Box} box */
+export function setBox({ style }, { x, y, width, height }) {
+  Object.assign(style, { left: `${x}px`, top: `${y}px`, width: `${width}px`, height: `${height}px` });
+}
+
 /** Set the text only if it differs: the page is updated four times a second, mostly with unchanged values. */
 export function setText(element, text) {
   if (element.textContent !== text) element.textContent = text;

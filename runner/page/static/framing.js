@@ -3,25 +3,24 @@
 /**
  * @typedef {object} View
  * @property {"contain"|"cover"} fit the whole picture, or the whole box
- * @property {number} align which part of a picture that is too wide is kept: 0 its left, 1 its right
  * @property {boolean} mirrored left and right are swapped on the screen
  * @typedef {{width: number, height: number}} Size
  * @typedef {{x: number, y: number, width: number, height: number}} Rectangle
  */
 
 /** @type {View} */
-export const WHOLE = { fit: "contain", align: 0.5, mirrored: false };
+export const WHOLE = { fit: "contain", mirrored: false };
 
 /**
  * The picture's rectangle, in px of the box; larger than the box where the picture is cropped.
  * @param {Size} box  @param {Size} picture  @param {View} view
  */
-export function placement(box, picture, { fit, align, mirrored }) {
+export function placement(box, picture, { fit }) {
   const ratios = [box.width / picture.width, box.height / picture.height];
   const scale = fit === "cover" ? Math.max(...ratios) : Math.min(...ratios);
   const width = picture.width * scale;
   const height = picture.height * scale;
-  return { scale, x: (box.width - width) * (mirrored ? 1 - align : align), y: (box.height - height) / 2, width, height };
+  return { scale, x: (box.width - width) / 2, y: (box.height - height) / 2, width, height };
 }
 
 /**
@@ -63,9 +62,8 @@ export function imageToBox(box, picture, view, region) {
  */
 export function framingText(box, picture, view) {
   const { width, height } = visible(box, picture, view);
-  const where = { 0: "left", 1: "right" }[view.align] ?? "middle";
   const percent = Math.round((100 * width) / picture.width);
-  const across = width < 0.995 * picture.width ? `${where} ${percent} % shown` : "";
+  const across = width < 0.995 * picture.width ? `middle ${percent} % shown` : "";
   const down = height < 0.995 * picture.height ? `middle ${Math.round((100 * height) / picture.height)} % of the height shown` : "";
   return [across, down, view.mirrored ? "mirrored" : ""].filter(Boolean).join(", ");
 }
@@ -78,5 +76,5 @@ export function visible(box, picture, view) {
   const { scale } = placement(box, picture, view);
   const width = Math.min(picture.width, box.width / scale);
   const height = Math.min(picture.height, box.height / scale);
-  return { x: (picture.width - width) * view.align, y: (picture.height - height) / 2, width, height };
+  return { x: (picture.width - width) / 2, y: (picture.height - height) / 2, width, height };
 }

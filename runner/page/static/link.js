@@ -26,12 +26,13 @@ const handlers = {
     store.refused[camera] = why;
     publish("status", { camera, status });
   },
-  ages({ ages, skew_ms, slow }) {
+  ages({ ages, skew_ms, slow, steering }) {
     reportedAt = performance.now();
     if (hung) onWorkerRecovered(ages);
     store.ages = ages;
     store.skew_ms = skew_ms;
     store.slow = slow;
+    store.steering = steering;
     publish("ages", ages);
   },
   asked: () => worker.postMessage({ order: "ready" }),

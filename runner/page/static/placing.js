@@ -2,13 +2,11 @@
 
 /** @typedef {"front"|"left"|"right"|"rear"} Single a place for one camera */
 /** @typedef {{front: string, left?: string|null, right?: string|null, rear?: string|null, row?: string[]}} Places names of cameras */
-/** @typedef {{width: number, height: number}} Size px */
 
 /** @type {Single[]} */
 const SINGLES = ["front", "left", "right", "rear"];
-const SIDE = 0.15; // share of the area's width at either side for the neighbours
-const BELOW = 0.12; // share of the height for the row
-const MIRROR = 0.3; // share of the width, in the middle of the band, for the mirror
+/** @type {("left"|"right"|"rear"|"row")[]} */
+const SLOTS = ["left", "right", "rear", "row"];
 
 /**
  * The places of the cameras by their roles.
@@ -57,28 +55,13 @@ export const shifted = (places, name, step) =>
   (placeOf(places, name) === "row" ? moved(places, name, "row", places.row.indexOf(name) + step) : places);
 
 /**
- * The place at a point where no picture is, or only the front camera's, whose edges stand for the places around it.
- * @param {number} x  @param {number} y  @param {Size} area  @param {number} band height of the band at the top
+ * The place at a point where no picture of another place is: the front camera's own wherever no slot is.
+ * @param {number} x  @param {number} y  @param {import("./arrange.js").Slots} slots
  * @returns {Single|"row"}
  */
-export function placeAt(x, y, { width, height }, band) {
-  if (y < band) return "rear";
-  if (y > height * (1 - BELOW)) return "row";
-  return x < width * SIDE ? "left" : x > width * (1 - SIDE) ? "right" : "front";
-}
-
-/**
- * The part of the area that stands for a place without a picture.
- * @param {Single|"row"} place  @param {Size} area  @param {number} band
- * @returns {import("./arrange.js").Box}
- */
-export function boxOf(place, { width, height }, band) {
-  const [side, below] = [width * SIDE, height * BELOW];
-  const middle = { y: band, height: height - band - below };
-  if (place === "rear") return { x: (width * (1 - MIRROR)) / 2, y: 0, width: width * MIRROR, height: band };
-  if (place === "row") return { x: 0, y: height - below, width, height: below };
-  if (place === "front") return { x: side, width: width - 2 * side, ...middle };
-  return { x: place === "left" ? 0 : width - side, width: side, ...middle };
+export function placeAt(x, y, slots) {
+  const isInside = (box) => x >= box.x && x < box.x + box.width && y >= box.y && y < box.y + box.height;
+  return SLOTS.find((place) => isInside(slots[place])) ?? "front";
 }
 
 /** What a place is called. @param {Required<Places>} places  @param {string} name */

@@ -95,17 +95,23 @@ export function toggleSound() {
   refresh();
 }
 
+const isBlocked = () => context?.state !== "running";
+
+/** Why this page's driver hears no tones; "": they are heard. */
+export const soundFault = () => (!isDriving ? "" : isMuted() ? "✕ tones muted" : isBlocked() ? "✕ tones blocked" : "");
+
 function refresh() {
-  const isBlocked = context?.state !== "running";
-  const words = isMuted() ? "✕ Muted" : isBlocked ? "✕ Sound blocked" : "Sound on";
-  const title = isMuted() || !isBlocked ? withKey("alarm tones on or off", "sound") : "the browser blocks sound until a click or key press";
+  const words = isMuted() ? "Unmute" : isBlocked() ? "Allow sound" : "Mute";
+  const isAllowed = isMuted() || !isBlocked();
+  const title = isAllowed ? withKey("alarm tones on or off", "sound") : "the browser blocks sound until a click or key press";
   for (const button of buttons) {
     setText(button, words);
-    setAttribute(button, "data-level", isMuted() || isBlocked ? "near" : "fine");
+    setAttribute(button, "data-level", isMuted() || isBlocked() ? "near" : "fine");
     button.title = title;
   }
   byId("sound").hidden = !isDriving;
-  byId("sound-configure").hidden = !isDriving || !(isMuted() || isBlocked);
+  byId("sound-configure").hidden = !isDriving || !(isMuted() || isBlocked());
+  publish("sound");
 }
 
 /** Say on a monitor what its key has changed on its page. @param {StorageEvent} event */

@@ -2,15 +2,22 @@
 
 const VALID_MS = 300; // an older angle is stale
 const KEPT_MS = 5000; // no picture is older
+const SHOWN_MS = 1000; // the driver is told the last one for this long
 
 export class Steering {
-  /** @type {{at: number, rad: number}[]} rising in time */
+  /** @type {{at: number, rad: number, gear?: string}[]} rising in time */
   reported = [];
 
-  /** @param {number} at when it was reported  @param {number} rad to the left */
-  onReport(at, rad) {
+  /** @param {number} at when it was reported  @param {number} rad to the left  @param {string} [gear] */
+  onReport(at, rad, gear) {
     this.reported = this.reported.filter((each) => each.at < at && at - each.at < KEPT_MS); // a clock may have been set back
-    this.reported.push({ at, rad });
+    this.reported.push({ at, rad, gear });
+  }
+
+  /** The last report, if it is recent. @param {number} now */
+  newest(now) {
+    const last = this.reported.at(-1);
+    return last && now - last.at <= SHOWN_MS ? last : null;
   }
 
   /**

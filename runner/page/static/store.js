@@ -78,6 +78,7 @@ let sampledAt = -Infinity; // page time of the last sample
  * @property {Record<string, {age_ms: number|null, bound_ms: number, parts_ms: {page: number, decode: number, draw: number}|null}>} ages
  * @property {number|null} skew_ms
  * @property {boolean} slow
+ * @property {{rad: number, gear?: string}|null} steering
  * @property {string|null} selected
  * @property {string|null} enlarged camera, or BIRDSEYE
  * @property {"configure"|"drive"|"monitor"} view
@@ -104,6 +105,7 @@ export const store = {
   refused: {}, // by camera, why there is no picture to show, or ""
   ages: {}, // by camera, latency from capture to drawing, its error bound, and its parts on the page
   slow: false, // whether too few of the received pictures are drawn
+  steering: null, // as last reported; null: not in the last second
   skew_ms: null, // between the capture times of the oldest and the newest picture shown
   selected: null,
   enlarged: null,

@@ -9,6 +9,7 @@ import { zoomRegion } from "./zoom.js";
 import { bandsOf, boxesOf, gridOf, heightsOf } from "./layout.js";
 import { arrange, BIRDSEYE, rolesOf, viewOf } from "./arrange.js";
 import { birdseyeSize, placeBirdseye } from "./birdseye.js";
+import { placePanels } from "./panels.js";
 import { framingText, WHOLE } from "./framing.js";
 import { isStraight } from "./straighten.js";
 import { straightOptics } from "./straight.js";
@@ -168,6 +169,7 @@ function layOut() {
   drawFirst(store.enlarged ?? driveRoles().front?.name ?? null);
   if (store.view === "drive") return layOutDrive();
   placeBirdseye(undefined);
+  placePanels(null);
   for (const [name, { element }] of tiles) {
     const info = camera(name);
     element.hidden = false;
@@ -197,14 +199,17 @@ function layOutBands() {
   }
 }
 
+/** The Drive view as it is arranged now. */
+export function driveArrangement() {
+  const birdseye = driveDraft ? null : birdseyeSize(); // it would hide the top views
+  const { clientWidth, clientHeight } = area;
+  return arrange(store.hello?.cameras ?? [], clientWidth, clientHeight, store.enlarged, birdseye, drivePlaces());
+}
+
 /** Place each camera by its direction; the enlarged one swaps places with the front camera. */
 function layOutDrive() {
-  const birdseye = driveDraft ? null : birdseyeSize(); // it would hide the top views
-  const cameras = store.hello?.cameras ?? [];
-  const { clientWidth, clientHeight } = area;
-  const { band, mirror, pictures } = arrange(cameras, clientWidth, clientHeight, store.enlarged, birdseye, drivePlaces());
-  byId("drive").style.height = `${band.height}px`;
-  byId("drive").style.setProperty("--mirror", `${mirror.width}px`);
+  const { panels, pictures } = driveArrangement();
+  placePanels(panels);
   placeBirdseye(pictures.get(BIRDSEYE));
   for (const [name, { element }] of tiles) element.hidden = !pictures.has(name);
   for (const [name, { x, y, width, height, view }] of pictures) {
@@ -223,7 +228,7 @@ function setView(name, view) {
   const part = tiles.get(name);
   part.view = view;
   const transform = view.mirrored ? "scaleX(-1)" : "";
-  Object.assign(part.canvas.style, { objectFit: view.fit, objectPosition: `${100 * view.align}% 50%`, transform });
+  Object.assign(part.canvas.style, { objectFit: view.fit, transform });
   part.frame.element.style.transform = transform;
   reportFrame(name);
 }

@@ -147,7 +147,7 @@ function send(message) {
 
 function onText(message) {
   if (message.kind === "clock") return station.clock.onEcho(message.page_ms, message.server_ms);
-  if (message.kind === "steering") return station.steering.onReport(message.at_ms, message.rad);
+  if (message.kind === "steering") return station.steering.onReport(message.at_ms, message.rad, message.gear);
   if (message.kind === "hello") onHello(message);
   if (message.kind === "state") onState(message);
   if (message.kind === "control") holder = message.holder;
@@ -248,7 +248,7 @@ function reportAges() {
   const ages = Object.fromEntries(streams.map(({ name, drawn, status }) => [name, { ...ageOf(drawn.stages, bound_ms), bound_ms, status }]));
   const skew_ms = skewOf(streams.map(({ status, shown }) => ({ status, captured: shown?.meta.captured ?? NaN })));
   const slow = streams.filter((stream) => stream.isSlow()).length > 0; // not some(): every stream counts its pictures
-  toPage({ kind: "ages", ages, skew_ms, slow });
+  toPage({ kind: "ages", ages, skew_ms, slow, steering: station.steering.newest(station.clock.toStation(now())) });
   askPage();
   unanswered++;
   reportAttention();

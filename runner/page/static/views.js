@@ -50,6 +50,7 @@ function setDrawer(open) {
   if (open) document.body.dataset.drawer = "open";
   else delete document.body.dataset.drawer;
   byId("drawer").setAttribute("aria-expanded", String(open));
+  byId("drawer").textContent = open ? "Close drawer" : "Open drawer";
 }
 
 // --- full screen ------------------------------------------------------------------------------------------------------
@@ -69,7 +70,7 @@ async function enterFullScreen() {
   await /** @type {any} */ (navigator).keyboard?.lock?.(["Escape"]).catch(() => {});
 }
 
-const showFullScreen = () => byId("full-screen").setAttribute("aria-pressed", String(document.fullscreenElement !== null));
+const showFullScreen = () => (byId("full-screen").textContent = document.fullscreenElement ? "Leave full screen" : "Fill the screen");
 
 // --- the offer --------------------------------------------------------------------------------------------------------
 
