@@ -111,7 +111,7 @@ export class GuideLines {
   place({ region, rad, picture, display }) {
     const { width, height, ratio, view } = display;
     const { x, y, width: wide, height: high } = region;
-    const where = [x, y, wide, high, picture.width, picture.height, width, height, ratio, view.fit, view.align, view.mirrored].join();
+    const where = [x, y, wide, high, picture.width, picture.height, width, height, ratio, view.fit, view.mirrored].join();
     const rounded = rad === null ? null : STEERING_STEP_RAD * Math.round(rad / STEERING_STEP_RAD);
     const moved = where !== this.placed.where;
     if (!moved && rounded === this.placed.rad) return false;
