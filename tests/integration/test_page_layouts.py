@@ -657,8 +657,8 @@ def wide(cameras):
 
 INSIDE = """() => [...document.querySelectorAll("#drive > :not(#drive-map), #messages")].every((panel) => {
   const { top, bottom } = panel.getBoundingClientRect();
-  const seen = [...panel.children].filter((each) => each.checkVisibility());
-  return seen.map((each) => each.getBoundingClientRect()).every((each) => each.top >= top - 1 && each.bottom <= bottom + 1);
+  const seen = [...panel.children].filter((each) => each.checkVisibility()).map((each) => each.getBoundingClientRect());
+  return seen.every((each) => each.top >= top - 1 && each.bottom <= bottom + 1);
 })"""
 
 

@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-import { bandsOf, boxesOf, heightsOf } from "../../runner/page/static/layout.js";
+import { bandsOf, boxesOf, heightsOf, narrowBands } from "../../runner/page/static/layout.js";
 
 const GAP = 8;
 const CHROME = 66;
@@ -113,4 +113,12 @@ test("a picture that spans two rows and columns is twice as large, and fills the
   assert.equal(column, 600);
   assert.deepEqual(boxes[0], { width: 1208, height: 2 * height + GAP });
   assert.ok(Math.abs(boxes[1].width / boxes[1].height - 16 / 9) < 0.02);
+});
+
+test("a narrow page has as many tiles in a row as can be read, in the order of the layout, as wide as it is", () => {
+  const bands = bandsOf(cameras("rear", "left", "right", "top"), { left: at(0, 0), right: at(0, 1), rear: at(1, 0, 1, 2) });
+  assert.deepEqual(names(narrowBands(bands, 396)), [["left"], ["right"], ["rear"], ["top"]]);
+  assert.deepEqual(names(narrowBands(bands, 899)), [["left", "right"], ["rear", "top"]]);
+  const one = narrowBands(bands, 396);
+  assert.deepEqual(heightsOf(one, 396, Infinity, CHROME), [222, 222, 222, 222]);
 });

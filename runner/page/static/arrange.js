@@ -8,7 +8,8 @@ const DOWN_DEG = 25; // a camera tipped down by this much is a top view
 const GAP = 4;
 // Shares of the area's width or height.
 const COLUMN = { usual: 0.17, birdseye: 0.25 }; // beside the front picture, at least; with a bird's-eye view where there is height
-const STRIP = { min: 0.12, max: 0.3 }; // above it
+const STRIP = { mirror: 0.14, sides: 0.23, max: 0.3 }; // above it: at least, with a free place; at most
+const SHARED = 0.38; // of the strip's width, for each picture in it next to free places
 const SMALL = { usual: 0.45, birdseye: 0.6 }; // of the column: small pictures, at most
 const FRONT = 0.5; // the front picture in a tall area, at most
 const BELOW = 0.2; // what a tall area keeps for the panels
@@ -137,7 +138,7 @@ function beside(roles, width, height) {
   const end = y + high + below(low) + GAP;
   const rest = height - end < LEAST_PX ? [] : [{ x: 0, y: end, width: wide, height: height - end }];
   const panels = panelsIn([...strip.free, ...rest], { ...column, height: height - below(small) });
-  const head = { width: wide, height: Math.max(strip.height, STRIP.min * height) };
+  const head = { width: wide, height: Math.max(strip.height, STRIP.mirror * height) };
   return { pictures, panels, slots: slotsOf(roles, pictures, head, column) };
 }
 
@@ -156,17 +157,20 @@ function frontWidth(roles, row, widest, height) {
 /** The parts of a tall area below each other: strip, front picture, small pictures, panels. */
 function stacked(roles, width, height) {
   const { front, left, rear, right, others } = roles;
-  const isFull = left && rear && right;
-  const strip = isFull ? stripOf(roles, width, height, STRIP.max * height) : { height: 0, pictures: new Map() };
-  const { pictures } = strip;
+  const sides = [left, rear, right].filter((camera) => camera !== null);
+  const strip = sides.length > 1 ? sides : [];
+  const stripHigh = Math.floor(Math.min(rowHeight(strip, width), STRIP.sides * height));
+  /** @type {Map<string, Framed>} */
+  const pictures = new Map();
+  put(pictures, strip, { x: 0, y: 0, width, height: stripHigh });
   const wide = front ? Math.floor(Math.min(width, FRONT * height * aspectOf(front))) : 0;
-  const [y, high] = [below(strip.height), heightOf(front, wide)];
+  const [y, high] = [below(stripHigh), heightOf(front, wide)];
   if (front) pictures.set(front.name, { x: Math.floor((width - wide) / 2), y, width: wide, height: high, view: viewOf(front) });
-  const small = [...(isFull ? [] : [left, rear, right].filter((camera) => camera !== null)), ...others];
+  const small = [...(strip.length ? [] : sides), ...others];
   const from = y + high + GAP;
   const used = putRows(pictures, small, { x: 0, y: from, width, height: 0 }, height - from - GAP - BELOW * height);
   const rest = { x: 0, y: from + below(used), width, height: height - from - below(used) };
-  const head = { width, height: Math.max(strip.height, STRIP.min * height) };
+  const head = { width, height: Math.max(stripHigh, STRIP.mirror * height) };
   return { pictures, panels: panelsIn([], rest), slots: slotsOf(roles, pictures, head, rest) };
 }
 
@@ -175,7 +179,7 @@ function stacked(roles, width, height) {
 /** Height of the strip at which it is as wide as the front picture, or where places in it are free, at least. */
 function leastStrip({ left, rear, right }, wide, height) {
   const taken = [left, rear, right].filter((camera) => camera !== null);
-  if (taken.length < 3) return taken.length ? Math.floor(STRIP.min * height) : 0;
+  if (taken.length < 3) return Math.floor(height * (left || right ? STRIP.sides : rear ? STRIP.mirror : 0));
   return Math.floor(Math.min(rowHeight(taken, wide), STRIP.max * height));
 }
 
@@ -183,9 +187,10 @@ function leastStrip({ left, rear, right }, wide, height) {
 function stripOf(roles, wide, height, most) {
   const slots = [roles.left, roles.rear, roles.right];
   const taken = slots.filter((camera) => camera !== null);
-  const least = leastStrip(roles, wide, height);
-  const high = taken.length === 3 ? least : taken.length || most >= LEAST_PX ? Math.floor(most) : 0;
-  const own = Math.floor(Math.min(high, STRIP.max * height, taken.length < 3 ? (0.6 * wide) / sum(taken.map(aspectOf)) : high));
+  const shared = taken.length < 3 ? (SHARED * taken.length * wide) / sum(taken.map(aspectOf)) : leastStrip(roles, wide, height);
+  const own = Math.floor(Math.min(most, STRIP.max * height, shared));
+  const isLow = taken.length < 3 && (taken.length ? most - own <= LEAST_PX : most > LEAST_PX); // the rest is too low for a panel
+  const high = isLow ? Math.floor(most) : taken.length ? own : 0;
   const widths = taken.map((camera) => Math.floor(own * aspectOf(camera)));
   const isShort = taken.length === 3 && wide - sum(widths) > 2 * LEAST_PX;
   const places = isShort ? [null, ...slots, null] : slots.filter((camera, i) => camera || i === 0 || slots[i - 1]);
@@ -264,10 +269,12 @@ const ALL = /** @type {Panel[]} */ (Object.keys(PANELS));
 /** The panels: what a driver reads most often in free places next to the front picture, if there are any. */
 function panelsIn(free, column) {
   if (!free.length) return column.width > 1.5 * column.height ? abreast(column) : piled(column, ALL);
-  const [first, second = null] = free;
-  const half = Math.floor((first.width - GAP) / 2);
-  const [figures, messages] = second ? [first, second] : [{ ...first, width: half }, { ...first, x: first.x + half + GAP, width: half }];
-  return { figures, messages, ...piled(column, ["words", "map", "buttons"]) };
+  const half = Math.floor((free[0].width - GAP) / 2);
+  const isWide = free.length === 1 && half > 1.2 * free[0].height;
+  const boxes = isWide ? [0, 1].map((i) => ({ ...free[0], x: free[0].x + i * (half + GAP), width: half })) : free;
+  const freed = ALL.slice(0, boxes.length);
+  const others = ALL.filter((name) => !freed.includes(name));
+  return { ...Object.fromEntries(freed.map((name, i) => [name, boxes[i]])), ...piled(column, others) };
 }
 
 /** Panels below each other. */

@@ -9,6 +9,7 @@
 export const GAP = 8;
 const EVEN = 1.25; // a row is at most this many times as high as the highest row limited by the width
 const MIN_HEIGHT = 24; // of a picture
+const READABLE_PX = 300; // width of a tile on a narrow page
 
 /** @typedef {{row: number, column: number, row_span: number, column_span: number}} Place */
 /** @typedef {Record<string, Place|null>} Places by camera; null: none */
@@ -29,6 +30,18 @@ export function bandsOf(cameras, places) {
   for (let i = 0; i < others.length; i += longest)
     bands.push(bandOf(others.slice(i, i + longest).map((camera, column) => ({ camera, row: 0, column, row_span: 1, column_span: 1 }))));
   return bands;
+}
+
+/**
+ * The bands of a page that scrolls: rows of as many tiles as are wide enough to be read, in the order of a layout.
+ * @param {Band[]} bands  @param {number} width of the area
+ * @returns {Band[]}
+ */
+export function narrowBands(bands, width) {
+  const cameras = bands.flatMap(({ tiles }) => tiles.map(({ camera }) => camera));
+  const length = Math.max(1, Math.floor(width / READABLE_PX));
+  const rows = Array.from({ length: Math.ceil(cameras.length / length) }, (_, i) => cameras.slice(i * length, (i + 1) * length));
+  return rows.map((row) => bandOf(row.map((camera, column) => ({ camera, row: 0, column, row_span: 1, column_span: 1 }))));
 }
 
 /** Tiles by band, from the top: those in the same row, or in rows that a tile joins. */

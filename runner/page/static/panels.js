@@ -19,8 +19,8 @@ export function placePanels(panels) {
       element.removeAttribute("style");
       continue;
     }
-    const isFixed = name === "messages"; // other views show messages elsewhere
-    setBox(element, isFixed ? { ...box, x: area.x + box.x, y: area.y + box.y } : box);
+    const isOnPage = name === "messages"; // other views show messages elsewhere
+    setBox(element, isOnPage ? { ...box, x: area.x + scrollX + box.x, y: area.y + scrollY + box.y } : box);
     element.style.setProperty("--unit", `${Math.max(LEAST_PX, Math.min(0.037 * box.width, 0.14 * box.height))}px`);
   }
   if (panels) for (const panel of shown.keys()) fit(panel);

@@ -6,7 +6,7 @@ import { pending, request, whyNoControl } from "./requests.js";
 import { dragRegion, shownRegion } from "./roi.js";
 import { RegionFrame, showsPart } from "./region_frame.js";
 import { zoomRegion } from "./zoom.js";
-import { bandsOf, boxesOf, gridOf, heightsOf } from "./layout.js";
+import { bandsOf, boxesOf, gridOf, heightsOf, narrowBands } from "./layout.js";
 import { arrange, BIRDSEYE, rolesOf, viewOf } from "./arrange.js";
 import { birdseyeSize, placeBirdseye } from "./birdseye.js";
 import { placePanels } from "./panels.js";
@@ -31,6 +31,7 @@ const NO_AGE = { age_ms: undefined, bound_ms: undefined };
 const UNCERTAIN_MS = 20; // a latency with a larger error bound is marked
 const TOGETHER_MS = 100; // a timer, since no animation frame comes while the page is hidden
 const BORDERS = 2; // of a tile, as in the style sheet
+const narrow = matchMedia("(max-width: 999px)"); // the Configure view is one column then, as in the style sheet
 
 const { canShowVideo } = globalThis.boot;
 const area = byId("tiles");
@@ -87,6 +88,7 @@ const drivePlaces = () => driveDraft ?? store.hello?.layout.drive ?? null;
 function groupTiles() {
   const cameras = store.hello?.cameras ?? [];
   bands = draft ? [gridOf(cameras, draft)] : bandsOf(cameras, store.hello?.layout.places ?? {});
+  if (isColumn()) bands = narrowBands(bands, area.clientWidth);
   const key = JSON.stringify(bands);
   if (key === bandsKey) return layOut();
   bandsKey = key; // only if changed: moving a tile drops the focus
@@ -95,6 +97,8 @@ function groupTiles() {
   area.replaceChildren(...bands.map(row));
   layOut();
 }
+
+const isColumn = () => narrow.matches && store.view === "configure";
 
 /** Height of a tile without its picture, as in the style sheet. */
 function chromeHeight() {
@@ -183,7 +187,7 @@ function layOut() {
 /** The bands of the layout. */
 function layOutBands() {
   const rest = chromeHeight();
-  const heights = heightsOf(bands, area.clientWidth, area.clientHeight, rest);
+  const heights = heightsOf(bands, area.clientWidth, isColumn() ? Infinity : area.clientHeight, rest);
   for (const [i, band] of bands.entries()) {
     const { column, boxes } = boxesOf(band, heights[i], area.clientWidth, rest);
     const repeated = (count, px) => `repeat(${count}, ${px}px)`;
@@ -261,7 +265,8 @@ function layOutEnlarged() {
     if (!large) continue;
     element.style.width = "";
     // What is below stays visible: it may say that sound is blocked, and which other pictures are lost.
-    box.style.height = `${area.clientHeight - chromeHeight()}px`;
+    box.style.height = `${isColumn() ? Math.round(0.6 * area.clientWidth) : area.clientHeight - chromeHeight()}px`;
+    if (isColumn()) element.scrollIntoView({ block: "nearest" });
   }
   area.classList.toggle("has-enlarged", tiles.has(store.enlarged));
 }
@@ -382,7 +387,7 @@ export function startTiles() {
   listen("layout", () => draft || groupTiles());
   listen("state sample requests control socket theme selected straight", refreshAll);
   listen("status", onStatus);
-  listen("view birdseye", layOut);
+  listen("view birdseye", groupTiles);
   listen("selected", moveFocus);
   listen("enlarged", (name) => {
     layOut();
@@ -390,7 +395,7 @@ export function startTiles() {
     wasHinted = true;
   });
   if (!canShowVideo) showNoVideo();
-  const resized = new ResizeObserver(layOut);
+  const resized = new ResizeObserver(groupTiles);
   for (const element of [scene, area]) resized.observe(element); // alarms below the area may need a second line
   watchPixelRatio();
 }

@@ -51,6 +51,7 @@ function setDrawer(open) {
   else delete document.body.dataset.drawer;
   byId("drawer").setAttribute("aria-expanded", String(open));
   byId("drawer").textContent = open ? "Close drawer" : "Open drawer";
+  byId(open ? "side" : "scene").scrollIntoView({ block: "nearest" }); // on a narrow page it is below the pictures
 }
 
 // --- full screen ------------------------------------------------------------------------------------------------------
