@@ -31,7 +31,7 @@ INPUTS: Mapping[str, Callable[[int, str], str]] = {  # by source, what a camera 
     "test": lambda *_: "",
 }
 HINTS = {
-    "v4l2": "`v4l2-ctl --list-devices` shows yours",
+    "v4l2": "`tod-runner doctor cameras` shows yours",
     "rtsp": "with `credentials: FILE`, one line user:password, if it asks for a login",
     "ros": "of type sensor_msgs/Image or sensor_msgs/CompressedImage",
 }
