@@ -166,7 +166,7 @@ def test_automatic_the_drop_of_the_map_lowers_factors(fresh):
     assert "front_center" not in lower
     sizes = {name: (low["cameras"][name]["height"], low["cameras"][name]["width"]) for name in lower}
     until(lambda: state(page)["total_kbps"] > 4000 or all(luma(page, name)[0].shape == sizes[name] for name in lower))
-    note = r"Prediction \d+ kbit/s: .*front_left, front_right 0\.5 -> 0\.25"
+    note = r"Prediction \d+ kbit/s: .*front_left, front_right smaller, at quarter size"
     until(lambda: re.search(note, page.evaluate("document.querySelector('#news').innerText")))
 
 

@@ -36,7 +36,7 @@ function totals() {
   return [
     line(x, predicted_kbps, "predicted", themed("predicted"), { dash: "dash", shape: "hv" }),
     line(x, allocated_kbps, "allocated", themed("allocated"), { shape: "hv" }),
-    line(x, actual_kbps, "actual", themed("actual")),
+    line(x, actual_kbps, "received", themed("actual")),
   ];
 }
 
@@ -44,7 +44,7 @@ function cameras() {
   const x = relativeTimes();
   return perCamera((name, columns, colour, width) => [
     line(x, columns.allocated_kbps, `${displayName(name)} allocated`, colour, { dash: "dot", width: width * 0.7, shape: "hv" }),
-    line(x, columns.kbps, displayName(name), colour, { width }),
+    line(x, columns.kbps, `${displayName(name)} received`, colour, { width }),
   ]);
 }
 
@@ -103,12 +103,13 @@ function factorsAxis(high) {
   return axis("factor", { range, tickvals: ticks, ticktext: ticks.map(factor) });
 }
 
-function mapLayout() {
+/** @param {number} high px of its axis */
+function mapLayout(high) {
   const empty = metres(store.series) === null;
   const annotations = empty
     ? [{ text: "no position yet", showarrow: false, xref: "paper", yref: "paper", x: 0.5, y: 0.5, font: { size: 15 } }]
     : [];
-  return base(axis("m east"), axis("m north", { scaleanchor: "x" }), { annotations });
+  return base(axis("m east"), axis("m north", { scaleanchor: "x", nticks: ticksWithin(high) }), { annotations });
 }
 
 const charts = [

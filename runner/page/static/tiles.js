@@ -325,7 +325,7 @@ function refreshCaption(name, { rates, form, reason }) {
   const repair = sample?.buffer_ms ? `; the jitter buffer waits up to ${sample.buffer_ms} ms for retransmissions` : "";
   const shape = `${size(sample?.width, sample?.height)} · ×${factor(now?.scaling)}`;
   const of = now?.slow_fps && !isSilent ? ` of ${whole(camera(name)?.fps)}` : "";
-  caption(rates, bitrate, `${whole(sample?.fps)}${of} fps · ${kbps} kbit/s`, "frames per second · kbit/s: actual / allocated / demand");
+  caption(rates, bitrate, `${whole(sample?.fps)}${of} fps · ${kbps} kbit/s`, "pictures a second · kbit/s: received / allocated / demanded");
   const lost = sample?.lost ? ` · ${sample.lost} lost` : "";
   const wire = `${whole(sample?.lost)} packets lost, receiver rebuilt ${whole(sample?.rebuilt)} times`;
   const why = `received size · scaling factor · latency from capture to drawing ± error bound; ${wire}${repair}`;

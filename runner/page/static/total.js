@@ -85,7 +85,7 @@ function commonReasons(beginning) {
 
 export function startTotal() {
   const unit = make("span", { class: "muted" }, " kbit/s");
-  const predicted = make("div", { class: "prediction" }, make("span", {}, "Prediction "), prediction, unit);
+  const predicted = make("div", { class: "prediction" }, make("span", {}, "Predicted "), prediction, unit);
   const inForce = make("div", {}, make("span", {}, "Total "), figure, requested, make("span", { class: "muted" }, " kbit/s"));
   byId("total-panel").append(make("div", { class: "figures" }, inForce, predicted), slider.element, why, believed, uplinks);
   listen("hello state sample control requests socket", refresh);
