@@ -227,7 +227,7 @@ def _prepare_run(
 
 def _calibrated(config: Configuration) -> list[str]:
     """Overrides that state what the demo knows of both sides: a rendered clip has its camera's very pose and lens."""
-    rendered = [camera.name for camera in config.setup().vehicle.cameras.values() if camera.source.render]
+    rendered = [camera.name for camera in config.vehicle().cameras.values() if camera.source.render]
     return [f"++cameras.{name}.calibrated=true" for name in rendered]
 
 
