@@ -7,8 +7,9 @@
 export const RED = "#e01b24";
 export const AMBER = "#ffb000";
 const MARKS = { lost: "✕", frozen: "■", damaged: "◪", late: "▲" };
-const THICK = 0.05; // of the shorter side: an alarm's frame
-const THIN = 0.03; // a warning's
+// Shares of the shorter side, and CSS px at most: of frames and of words.
+const ALARM = { thick: [0.05, 24], text: [0.15, 64] };
+const WARNING = { thick: [0.03, 14], text: [0.1, 34] };
 const HEAD_PX = 24; // CSS px at the upper edge that a picture's name may cover
 const SOLID = [];
 
@@ -47,27 +48,25 @@ function drawStatus(context, { width, height }, status, text, css) {
     return drawLabel(context, width, height / 2, side * 0.13, text, "#2b333c", "#e6ebf0");
   }
   const isStalled = status === "frozen" || status === "lost";
-  const size = side * (isStalled ? 0.15 : 0.1);
+  const [thick, size] = Object.values(isStalled ? ALARM : WARNING).map(([share, most]) => Math.min(share * side, most * css));
   if (isStalled) dim(context, width, height, 0.5);
-  FRAMES[status](context, width, height, side);
+  FRAMES[status](context, width, height, thick);
   const y = Math.min(HEAD_PX * css, 0.35 * height) + 0.8 * size;
   drawLabel(context, width, y, size, `${MARKS[status]} ${text}`, isStalled ? RED : AMBER, isStalled ? "#fff" : "#000");
 }
 
 const FRAMES = {
-  lost(context, width, height, side) {
-    const thick = THICK * side;
+  lost(context, width, height, thick) {
     frame(context, width, height, thick, RED, SOLID);
     for (const x of [1.5 * thick, width - 1.5 * thick]) for (const y of [1.5 * thick, height - 1.5 * thick]) cross(context, x, y, thick);
   },
-  frozen(context, width, height, side) {
-    const thick = 1.3 * THICK * side;
-    frame(context, width, height, thick, "#000", SOLID);
-    hatch(context, width, height, thick);
-    frame(context, width, height, 0.25 * thick, RED, SOLID);
+  frozen(context, width, height, thick) {
+    frame(context, width, height, 1.3 * thick, "#000", SOLID);
+    hatch(context, width, height, 1.3 * thick);
+    frame(context, width, height, 0.3 * thick, RED, SOLID);
   },
-  damaged: (context, width, height, side) => frame(context, width, height, THIN * side, AMBER, [THIN * side, THIN * side]),
-  late: (context, width, height, side) => frame(context, width, height, THIN * side, AMBER, [side * 0.16, side * 0.08]),
+  damaged: (context, width, height, thick) => frame(context, width, height, thick, AMBER, [thick, thick]),
+  late: (context, width, height, thick) => frame(context, width, height, thick, AMBER, [5 * thick, 2.5 * thick]),
 };
 
 /**
