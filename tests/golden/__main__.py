@@ -129,7 +129,7 @@ def links(pool: ProcessPoolExecutor) -> Texts:
 
 
 class Story(NamedTuple):
-    """Generated events, shared evenly by the vehicles and modes files.
+    """Generated events, shared evenly by the vehicles with several cameras and by the modes files.
 
     steps      s between two events
     overrides  by vehicle
@@ -143,7 +143,7 @@ class Story(NamedTuple):
 
 
 def _decisions(pool: ProcessPoolExecutor, story: Story) -> Texts:
-    runs = list(product(_files("vehicle"), story.modes))
+    runs = list(product((name for name in _files("vehicle") if len(_cameras(name)) > 1), story.modes))
     chance = random.Random(SEED)
     inputs = {run: _events(chance, run[0], story.count // len(runs), story) for run in runs}
     with tempfile.TemporaryDirectory() as directory:
