@@ -80,7 +80,7 @@ def test_invalid_commands(tod: Command, words: list[str], expected: str) -> None
         (["model", "metrc=psnr"], "metrc: unknown name, did you mean metric?"),
         (
             ["print", "vehicle=mine"],
-            "vehicle: mine: no such file in conf/vehicle/; expected one of delivery_robot, tum_q7; ",
+            "vehicle: mine: no such file in conf/vehicle/; expected one of delivery_robot, one_camera, tum_q7; ",
         ),
     ],
 )

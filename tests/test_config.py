@@ -531,7 +531,7 @@ def test_a_base_that_does_not_exist(conf: UserConf, tod: Command) -> None:
         (["pqos=none"], f"pqos: none: no such file in conf/pqos/; expected one of constant, live, map, trace; {OWN}"),
         (
             ["vehicle=null"],
-            f"vehicle: null: no such file in conf/vehicle/; expected one of delivery_robot, tum_q7; {OWN}",
+            f"vehicle: null: no such file in conf/vehicle/; expected one of delivery_robot, one_camera, tum_q7; {OWN}",
         ),
         (["+graph@cameras.front_left.graph=h264_srtt"], "no such file in conf/graph/, did you mean h264_srt?"),
         (["vehicle=a,b"], f"vehicle=a,b: {SWEEP}"),
