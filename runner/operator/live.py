@@ -98,7 +98,8 @@ class LiveOperator:
         self.station.connect()
         if not self._demand:
             self._await_vehicle()
-        self._side = self._build(on_unit)
+        with self._announcing():
+            self._side = self._build(on_unit)
         self._log.begin()
         self._duration_s = inf if duration_s is None else duration_s
         self._latest_start = time.monotonic() + START_S
@@ -111,6 +112,23 @@ class LiveOperator:
         deadline = time.monotonic() + CONTROL_FIRST_S
         while not self.station.state and time.monotonic() < deadline and not self._stopped.wait(POLL_S):
             pass
+
+    @contextmanager
+    def _announcing(self) -> Iterator[None]:
+        """Within the block the vehicle hears of this operator: building takes seconds on a busy machine."""
+        is_built = threading.Event()
+
+        def announce() -> None:
+            while not is_built.wait(SAMPLE_S):
+                self.station.announce()
+
+        thread = threading.Thread(target=announce, name="announcing", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            is_built.set()
+            thread.join()
 
     def show(self, cameras: Collection[str], is_open: bool) -> None:
         """Receive these cameras, and drive while a page is open. From any thread; for a side that follows a demand."""

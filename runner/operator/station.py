@@ -225,9 +225,9 @@ class Station:
         if presence is Presence.ABSENT:
             self.link.publish(self._to_request, of_run(SIGNED_OFF, self._run))
         else:
-            self._announce()
+            self.announce()
 
-    def _announce(self) -> None:
+    def announce(self) -> None:
         """Announce this operator as present, also to a vehicle that is temporarily silent."""
         if self._presence is Presence.ABSENT:
             return
@@ -275,7 +275,7 @@ class Station:
         self._check_link()
         if not_found := self._known.lacking(self._vehicle.name, now):
             self.note(not_found)
-        self._announce()  # the heartbeat
+        self.announce()  # the heartbeat
         if (why := self.latency.compare_clocks(now)) and self.state:
             self.note(f"{why}: latencies are unknown")
         samples, cameras = self.latency.confirm(samples, now), self._cameras()
@@ -376,7 +376,7 @@ class Station:
                 self.note(text)
         else:
             self.note(f"the vehicle is online, mode {state.mode}")
-            self._announce()
+            self.announce()
 
     def _set_state(self, state: VehicleState | None) -> None:
         self.state = state
