@@ -66,7 +66,7 @@ class Driving:
     present: Annotated[Mapping[str, Role], "roles of the operators that are connected, by id"] = field(
         default_factory=dict
     )
-    released: Annotated[str | None, "who has released control, and does not get it again without asking"] = None
+    released: Annotated[str | None, "who has released control last, and does not get it again without asking"] = None
     stop: Annotated[str | None, "id of the operator that has asked the vehicle to stop; None: nobody has"] = None
     stop_since: Annotated[float | None, "t from which that stands, s; None: nobody has asked"] = None
     standing: Annotated[bool, "whether the vehicle is known to stand, so that control may be released"] = False
@@ -118,7 +118,7 @@ class Motion:
 def advance(driving: Driving, motion: Motion, event: Event, sent: Set[str]) -> Driving:
     """Who drives after an event; motion is as known then.
 
-    sent    the cameras that are being sent: an operator that takes over has to see them
+    sent    the cameras that are being sent: an operator that takes over has to see them, unless the vehicle stands
     raises  Refused
     """
     after = _changed(driving, motion, event, sent)
@@ -145,7 +145,8 @@ def _changed(driving: Driving, motion: Motion, event: Event, sent: Set[str]) -> 
             return _offered(driving, name, to, event.t)
         case ControlAccepted(operator=name, live=live):
             _may(driving, name, event)
-            return _accepted(driving, name, sent - frozenset(live), event.t)
+            unseen = frozenset() if motion.stands(event.t) else sent - frozenset(live)
+            return _accepted(driving, name, unseen, event.t)
         case ControlReleased(operator=name):
             _may(driving, name, event)
             return _released(driving, motion, name, event.t)
@@ -278,7 +279,8 @@ def _held(driving: Driving, name: str, t: float, why: str) -> Driving:
     if driving.in_control == name:
         return driving
     asking = tuple(other for other in driving.requested if other != name)
-    now = replace(driving, state=Control.HELD, holder=name, since=t, requested=asking, released=None, why=why)
+    released = None if driving.released == name else driving.released
+    now = replace(driving, state=Control.HELD, holder=name, since=t, requested=asking, released=released, why=why)
     return _without_offer(now, why)
 
 

@@ -244,7 +244,7 @@ class ControlOffered(_Event):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControlAccepted(_Event):
-    """An operator accepts the offer made to it: it is in control once it sees every camera that is sent."""
+    """An operator accepts the offer made to it; unless the vehicle stands, it has to see every camera that is sent."""
 
     operator: Asker
     live: Annotated[tuple[str, ...], "the cameras whose pictures have been live at its station for 1 s or longer"]

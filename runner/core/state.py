@@ -41,6 +41,7 @@ class State:
     operator_since: float | None = None  # t of its side's connection, or of control of an unmeasured link; None: gone
     operator_lost: float | None = None  # t at which the operator's side disconnected
     attention: ev.Attention | None = None  # of the driver, as the operator in control states it
+    attention_since: float | None = None  # t of its last change
     link: ev.LinkMeasured | None = None  # None: no operator measures it, or uplinks have names
     links: Mapping[str, ev.LinkMeasured] = field(default_factory=lambda: NOTHING)  # by uplink with a name
     position: ev.PositionReported | None = None
@@ -131,11 +132,12 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
             return {"links": _of_uplink(vehicle, state.links, event)} if vehicle.uplinks else {"link": event}
         case ev.ControlPassed(operator=operator):
             # Another place, network path and person. If the link is not measured, it is as if they had just connected.
+            unstated = {"attention": None, "attention_since": event.t}
             is_new = bool(operator) and state.link is None and state.operator_since is not None
             since = event.t if is_new else state.operator_since
-            return {"link": None, "links": NOTHING, "attention": None, "operator_since": since}
+            return {"link": None, "links": NOTHING, "operator_since": since, **unstated}
         case ev.AttentionChanged(attention=attention):
-            return {"attention": attention}
+            return {"attention": attention, "attention_since": event.t}
         case ev.CopiesCounted(copies=copies):
             for name in copies:
                 _known(vehicle, name)
@@ -147,7 +149,7 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
             changes = _driving(state, event)
             if changes["driving"].present or state.operator_lost is not None:
                 return changes
-            gone = {"operator_since": None, "operator_lost": event.t, "attention": None}
+            gone = {"operator_since": None, "operator_lost": event.t, "attention": None, "attention_since": event.t}
             return {**changes, **gone, "link": None, "links": NOTHING}
         case ev.PositionReported():
             motion = state.motion.after(event)

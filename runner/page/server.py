@@ -315,13 +315,18 @@ class PageServer(Listener):
 
 
 def _stated(state: VehicleState | None, station: Station) -> dict[str, Any]:
-    """The vehicle's state, and since when its holder is in control and a stop was asked for, s since 1970."""
-    driving = state.driving if state else UNSET
-    if driving is UNSET:
+    """The vehicle's state, and since when its holder is in control, its page is closed, and a stop was asked for.
+
+    s since 1970
+    """
+    if state is None or state.driving is UNSET:
         return state_to_json(state)
+    driving = state.driving
     since = station.own_time(driving.since) if driving.holder else None
     stop = None if driving.stop_since is None else station.own_time(driving.stop_since)
-    return {**state_to_json(state), "held_since": since, "stop_since": stop}
+    changed = state.attention_since if state.attention is Attention.ABSENT else UNSET
+    absent = None if changed is UNSET else station.own_time(changed)
+    return {**state_to_json(state), "held_since": since, "stop_since": stop, "absent_since": absent}
 
 
 def _recent(camera: Camera) -> RecentUnits:

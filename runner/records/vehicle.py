@@ -88,6 +88,7 @@ class VehicleState:
     fault: Annotated[str | None, "why the rules could not decide, so that an earlier decision stays in force"] = None
     online: Annotated[bool, "false: the vehicle is offline, and its state unknown"] = True
     attention: Annotated[Attention | UnsetType, "of the driver; absent: the operator in control states none"] = UNSET
+    attention_since: Annotated[Time | UnsetType, "t from which on; absent: none is stated"] = UNSET
     driving: Annotated[Driving | UnsetType, "absent: by an earlier version"] = UNSET
     certificate_ends: Annotated[
         float | UnsetType, "when the certificate of the vehicle expires, s since 1970; absent: it has none"

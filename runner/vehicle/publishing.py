@@ -150,7 +150,7 @@ class Publisher:
 
 def vehicle_state(run: Run, cameras: Mapping[str, CameraReading], t: float, cause: str) -> VehicleState:
     """The state as the vehicle publishes it."""
-    decision = run.decision
+    decision, since = run.decision, run.state.attention_since
     states = {
         name: CameraState.at(decision.settings[name], plain(run.state.weights[name]), name, camera)
         for name, camera in cameras.items()
@@ -164,6 +164,7 @@ def vehicle_state(run: Run, cameras: Mapping[str, CameraReading], t: float, caus
         states,
         run.fault,
         attention=run.state.attention or UNSET,
+        attention_since=UNSET if not run.state.attention or since is None else since,
         driving=run.state.driving,
         believed=decision.believed or UNSET,
         uplinks=uplinks_decided(decision),

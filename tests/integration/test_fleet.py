@@ -113,7 +113,7 @@ def test_opening_a_vehicle_drives_it_and_switching_ends_its_pictures(fleet, page
     until(lambda: heard.encoding("courier-3") == {"front"})
     left = card(page, "courier-1")
     until(lambda: "You drive" in left.inner_text(), every_s=0.1)  # leaving a page releases nothing
-    until(lambda: "the driver's page is absent" in left.inner_text(), every_s=0.1)
+    until(lambda: "your page is closed" in left.inner_text(), every_s=0.1)
     left.locator("button.release").click()
     until(lambda: heard.driver("courier-1") is None)
     until(lambda: "Nobody drives" in left.inner_text(), every_s=0.1)

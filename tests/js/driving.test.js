@@ -43,8 +43,10 @@ test("an operator who does not drive asks, waits for the pictures, and accepts",
   assert.deepEqual(texts(seen()), ["Take control"]);
   assert.deepEqual(texts(seen(held("bob"))), ["Request control"]);
   assert.deepEqual(texts(seen(held("bob", { requested: ["anna"] }))), ["Withdraw request"]);
-  const offered = held("bob", { offered: "anna" });
+  const offered = held("bob", { offered: "anna", standing: false });
   assert.deepEqual(texts(seen(offered, { unseen: ["front left", "rear"] })), ["Accept control: waiting for pictures: front left, rear", "Decline"]);
+  const standing = seen({ ...offered, standing: true }, { unseen: ["rear"] });
+  assert.deepEqual(texts(standing), ["Accept control: waiting for pictures: rear", "Accept without pictures", "Decline"]);
   assert.deepEqual(texts(seen(offered, { page: "another" })), ["Accept control", "Decline"], "any page of the station may act");
 });
 
@@ -76,6 +78,10 @@ test("everybody is told who asks and to whom control is offered", () => {
     [held("bob", { offered: "carol" }), "bob offers control to carol"],
   ];
   for (const [driving, words] of table) assert.equal(handOverWords(seen(driving)), words);
+  const closed = { absentAt: "12:03" };
+  assert.equal(handOverWords(seen(held("anna"), closed)), "");
+  const asked = handOverWords(seen(held("bob", { requested: ["anna"] }), closed));
+  assert.equal(asked, "bob's page has been closed since 12:03: nobody answers there. You ask for control");
   const view = seen(held("bob", { offered: "anna", requested: ["anna"] }), { unseen: ["rear"] });
   assert.equal(handOverWords(view), "bob offers control to you; waiting for pictures: rear");
 });

@@ -29,8 +29,8 @@ function unseen() {
   return (store.hello?.cameras ?? []).map(({ name }) => name).filter((name) => decisionOf(name)?.sending && !seen.includes(name));
 }
 
-const view = () => ({ ...driverView(), unseen: unseen().map(displayName) });
 const timeOf = (time) => (time ? clockTime(time).slice(0, 5) : "");
+const view = () => ({ ...driverView(), unseen: unseen().map(displayName), absentAt: timeOf(store.state?.absent_since) });
 
 /** Whether the vehicle hears nothing from this station, and has had time to. */
 export const isUnheard = () => who() === "unheard" && holding.isSettled(performance.now());
@@ -43,15 +43,15 @@ function watch() {
   const given = now === "operator" && driving?.holder === offeredTo ? "offered" : driving?.released === own ? "released" : null;
   const change = holding.update(now, given, performance.now());
   if (driving?.state === "held" && driving.holder === own) offeredTo = driving.offered;
+  if (change === "passed" || (change === "gained" && store.view !== "monitor")) onPassed(change);
   if (store.view === "monitor") return;
   if (change === "lost") reportLoss(lossWords());
-  else if (change) onPassed(change);
   watchRequests();
 }
 
 function onPassed(change) {
   const { driving } = store;
-  const text = change === "gained" ? "You are in control" : `${driving?.holder} is in control now`;
+  const text = change === "gained" ? "You are in control" : `${driving?.holder} drives now`;
   publish("toast", { text, level: "hint" });
   if (!driving?.standing) publish("passed");
 }
@@ -112,7 +112,6 @@ function carryOut({ event, text }) {
   if (!event) return;
   const { event: name } = event;
   const live = name === "control_accepted" ? { live: pictures.seen(performance.now()) } : {};
-  if (name === "control_released" && inControl()) holding.onRelease(true);
   submit("control", { ...event, ...live }, text.toLowerCase());
 }
 
@@ -195,7 +194,7 @@ function showButtons(group, choices, keyed, id) {
   buttons[focused]?.focus({ preventScroll: true });
 }
 
-const ASIDE = ["Release", "Decline", "Lift stop"];
+const ASIDE = ["Release", "Accept without pictures", "Decline", "Lift stop"];
 /** Whether a button is what its person most likely wants next. @param {Choice} choice */
 const isMain = ({ text, why, takers, from }) => !why && !ASIDE.includes(text) && !takers && from !== "operator";
 
@@ -205,8 +204,5 @@ export function startControl() {
   listen("hello control state ages socket", watch);
   listen("hello control state ages socket requests link view", refresh);
   listen("sample", refreshConfirm);
-  listen("answered", ({ event, result }) => {
-    if (event.event === "control_released" && result !== "applied") holding.onRelease(false);
-  });
   refresh();
 }

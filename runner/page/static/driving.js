@@ -17,7 +17,7 @@
  * @property {string} page which of the station's pages acts for it: you, another or nobody; unknown: there is no connection
  * @property {boolean} [online] whether the vehicle is
  * @property {string[]} [unseen] cameras that are sent but have not been live here for long enough
- * @property {string} [stopAt] time of day at which somebody asked to stop
+ * @property {string} [absentAt] time of day at which the page of the operator in control was closed; "": it is open
  *
  * @typedef {object} Choice
  * @property {string} text of the button
@@ -61,11 +61,22 @@ export function stopWords(driving, own, at) {
   return `${driving.stop === own ? "You" : driving.stop} asked to stop${at ? ` at ${at}` : ""}: advised speed 0`;
 }
 
+/** That nobody sees the pictures of another operator who is in control, in words; "": somebody does. @param {View} view */
+function absentWords({ driving, own, absentAt }) {
+  if (!absentAt || driving?.state !== "held" || driving.holder === own) return "";
+  return `${driving.holder}'s page has been closed since ${absentAt}: nobody answers there`;
+}
+
 /**
  * What operators have asked or offered, in words; "": nothing. Those that only watch are told, too.
  * @param {View} view
  */
-export function handOverWords({ driving, own, unseen = [] }) {
+export function handOverWords(view) {
+  return [absentWords(view), askedWords(view)].filter(Boolean).join(". ");
+}
+
+/** @param {View} view */
+function askedWords({ driving, own, unseen = [] }) {
   if (!driving) return "";
   const named = (name) => (name === own ? "you" : name);
   const { holder, offered } = driving;
@@ -131,10 +142,11 @@ function whileDriving({ driving, own }) {
 }
 
 /** @param {View} view @returns {Choice[]} */
-function whenOffered({ unseen = [] }) {
+function whenOffered({ driving, unseen = [] }) {
   const why = unseen.length ? waiting(unseen) : null;
-  const accept = { text: "Accept control", isAnswer: true, why, event: { event: "control_accepted" } };
-  return [accept, { text: "Decline", isAnswer: true, event: RELEASED }];
+  const [isAnswer, event] = [true, { event: "control_accepted" }];
+  const blind = why && driving?.standing ? [{ text: "Accept without pictures", isAnswer, event }] : [];
+  return [{ text: "Accept control", isAnswer, why, event }, ...blind, { text: "Decline", isAnswer, event: RELEASED }];
 }
 
 /** @param {View} view @returns {Choice[]} */

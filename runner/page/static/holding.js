@@ -6,15 +6,9 @@ const RETURN_MS = 2000; // by then a vehicle that comes online, perhaps newly st
 export class Holding {
   /** @type {boolean|null} whether this page had control; null: it has just opened */
   #had = null;
-  #isReleasing = false; // whether its person has given it up
   #excusedUntil = Infinity; // ms
   /** Whether this page has lost control without releasing it, and has not got it back. */
   isLost = false;
-
-  /** This page's person gives up control, or does not any more. @param {boolean} isReleasing */
-  onRelease(isReleasing) {
-    this.#isReleasing = isReleasing;
-  }
 
   /** Whether the vehicle has had time to hear of its operators since it came online. @param {number} now ms */
   isSettled = (now) => now >= this.#excusedUntil;
@@ -35,11 +29,10 @@ export class Holding {
     if (who === "you") return this.#onGained(now);
     this.#had ??= false;
     if (!this.#had || (["free", "unheard"].includes(who) && !given && !this.isSettled(now))) return null;
-    const isGivenUp = this.#isReleasing || given !== null;
-    this.#had = this.#isReleasing = false;
-    this.isLost = !isGivenUp;
-    if (!isGivenUp) return "lost";
-    return given === "offered" ? "passed" : null;
+    this.#had = false;
+    this.isLost = given === null;
+    if (this.isLost) return "lost";
+    return who === "operator" ? "passed" : null;
   }
 
   #onGained(now) {

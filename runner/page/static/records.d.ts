@@ -63,7 +63,7 @@ export interface Driving {
   requested: (string)[];
   /** roles of the operators that are connected, by id */
   present: Record<string, "vehicle" | "broker" | "controller" | "supervisor" | "watcher" | "predictor" | "positioner">;
-  /** who has released control, and does not get it again without asking */
+  /** who has released control last, and does not get it again without asking */
   released: string | null;
   /** id of the operator that has asked the vehicle to stop; null: nobody has */
   stop: string | null;
@@ -124,6 +124,8 @@ export interface VehicleState {
   online: boolean;
   /** of the driver; absent: the operator in control states none */
   attention?: "watching" | "unfocused" | "slow" | "hidden" | "absent";
+  /** t from which on; absent: none is stated */
+  attention_since?: number;
   /** absent: by an earlier version */
   driving?: Driving;
   /** when the certificate of the vehicle expires, s since 1970; absent: it has none */

@@ -13,9 +13,9 @@ let sampledAt = -Infinity; // page time of the last sample
  * The part of the station's messages that the page uses.
  * @typedef {import("./records.js").CameraState & {applied: Applied}} Decision
  * @typedef {import("./records.js").VehicleState & {cameras: Record<string, Decision>} & Since} State
- * @typedef {{held_since: number|null, stop_since: number|null}} Since
+ * @typedef {{held_since: number|null, stop_since: number|null, absent_since: number|null}} Since
  *   held_since: since when its holder is in control, or was until it was lost; stop_since: since when a stop that was asked
- *   for stands; s since 1970
+ *   for stands; absent_since: since when the page of the holder is closed; s since 1970
  * @typedef {import("./records.js").Sample & {time: number}} Sample time: s since 1970
  * @typedef {object} Camera of hello
  * @property {string} name
