@@ -10,6 +10,7 @@ import pytest
 from helpers import Drive
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec import UNSET
 
 from runner.core import rules
 from runner.core import step as step_module
@@ -17,6 +18,7 @@ from runner.core.commands import wanted
 from runner.core.events import Attention, parse
 from runner.core.model import Mode
 from runner.core.step import Run, start, step
+from runner.simulation.control import vehicle_state
 
 PAPER = ("modes=paper",)
 LINK = {"kbps": 500, "queue_ms": 300, "loss": 0.5, "state": "filling", "rtt_ms": 30}
@@ -398,6 +400,15 @@ def test_a_rule_may_give_whole_numbers() -> None:
     drive.accept("bitrate_predicted", t=1, kbps=4001)
     assert drive.accept("copies_counted", copies={"front_left": 2}).fault is None
     assert drive.accept("clock_advanced", t=9).fault is None
+
+
+def test_the_published_state_says_how_many_copies_share_the_total() -> None:
+    drive = Drive("modes=paper")
+    assert vehicle_state(drive.run, 0.0, "start").copies is UNSET
+    drive.accept("copies_counted", copies={"front_left": 3})
+    assert vehicle_state(drive.run, 0.0, "start").copies == {"front_left": 3}
+    drive.accept("copies_counted", copies={})
+    assert vehicle_state(drive.run, 0.0, "start").copies is UNSET
 
 
 def test_rules_may_read_the_attention_of_the_person_who_drives() -> None:

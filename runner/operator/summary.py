@@ -47,7 +47,7 @@ class Summary:
     speed_mps: float | None
     latency_ms: float | None
     bound_ms: float | None
-    total_kbps: float | None
+    allocated_kbps: float | None
     actual_kbps: float
     believed_kbps: float | None
     alarms: tuple[str, ...]
@@ -77,7 +77,7 @@ def summary(station: Station) -> Summary:
         speed_mps=position.speed_mps if position and position.speed_mps is not UNSET else None,
         latency_ms=max(known) if known and len(known) == len(latencies) else None,
         bound_ms=1000 * clock.bound_s if clock else None,
-        total_kbps=float(state.total_kbps) if state else None,
+        allocated_kbps=sum(camera.kbps for camera in state.cameras.values()) if state else None,
         actual_kbps=sum(row.rates.kbps for row in received),
         believed_kbps=float(state.believed.kbps) if state and state.believed is not UNSET else None,
         alarms=tuple(_alarms(state, station.identity)) if state else (),

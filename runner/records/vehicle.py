@@ -95,6 +95,10 @@ class VehicleState:
     ] = UNSET
     believed: Annotated[Believed | UnsetType, "of the uplink; absent: nothing"] = UNSET
     uplinks: UplinkDecisions = UNSET
+    copies: Annotated[
+        Mapping[str, int] | UnsetType,
+        "by camera, how many leave the vehicle, if more than one: together they have the total; absent: one of each",
+    ] = UNSET
 
     @property
     def total_words(self) -> str:

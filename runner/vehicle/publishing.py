@@ -168,6 +168,7 @@ def vehicle_state(run: Run, cameras: Mapping[str, CameraReading], t: float, caus
         driving=run.state.driving,
         believed=decision.believed or UNSET,
         uplinks=uplinks_decided(decision),
+        copies=dict(run.state.copies) or UNSET,
     )
 
 

@@ -32,10 +32,10 @@ const TABLE = [
   [{}, { asked_kbps: 3000 }, `${SHARE} the link carries.`], // more than was predicted
   [{}, { mode: "collective" }, `${SHARE} were set.`],
   [{}, { mode: "collective", asked_kbps: 9000 }, `${SHARE} the link carries.`],
-  [{}, { mode: "single" }, "Half size: 1.2 of 6.0 Mbit/s, as set in mode S or left by the mode before."],
+  [{}, { mode: "single" }, "Half size: 1.2 of 6.0 Mbit/s."],
   [{}, { mode: "single", asked_kbps: 9000 }, "Half size: 1.2 of 6.0 Mbit/s, less than was set: the link carries no more."],
   [{ kbps: 6000, scaling: 1 }, {}, "Full size: 6.0 of 6.0 Mbit/s, all that it can use."],
-  [{ kbps: 7000 }, { mode: "single" }, "Half size: 7.0 of 7.0 Mbit/s, as set in mode S or left by the mode before."],
+  [{ kbps: 7000 }, { mode: "single" }, "Half size: 7.0 of 7.0 Mbit/s."],
   [{ roi: { x: 0, y: 0, width: 960, height: 520 }, demand_kbps: 1500, kbps: 300, scaling: 0.25 }, {}, "Quarter size of 25 % of the image: 0.3 of 1.5 Mbit/s, its share of the 6.5 Mbit/s that are predicted."],
   [{ uplinks: ["a", "b"] }, {}, `${SHARE} are predicted, over a and b.`],
   [{ on: false, sending: false, scaling: null, reason: "switched off" }, {}, "Switched off."],

@@ -7,7 +7,7 @@ import { alarmsOf, driverOf, figuresOf, isHeldHere, pictureOf, stateOf } from ".
 
 const ONLINE = {
   online: true, fault: null, mode: "automatic", control: "free", holder: null, held_s: 0, offered: null, requested: [], is_own: false,
-  speed_mps: null, latency_ms: null, bound_ms: null, total_kbps: 900, actual_kbps: 0, believed_kbps: null, alarms: [],
+  speed_mps: null, latency_ms: null, bound_ms: null, allocated_kbps: 900, actual_kbps: 0, believed_kbps: null, alarms: [],
   cameras: ["rear", "front_left", "front_center"], received: [],
 };
 const row = (summary, rest = {}) => ({ name: "courier-1", fault: null, answer: "", summary: summary && { ...ONLINE, ...summary }, ...rest });

@@ -15,6 +15,7 @@ import { SHAPES, showLines } from "./tiles.js";
 import { headingText } from "./track.js";
 import { fitPanels } from "./panels.js";
 import { limitReasons, pauseReason } from "./total.js";
+import { copiesWords, ofWords, totalsOf } from "./totals.js";
 import { showUplinks, uplinkLines } from "./uplinks.js";
 import { byId, displayName, latency, setAttribute, setText, whole } from "./format.js";
 
@@ -103,9 +104,8 @@ function steeringText(rad) {
 }
 
 function totalWords() {
-  const { total_kbps, asked_kbps } = (isOnline() ? store.state : null) ?? {};
-  const isLimited = total_kbps !== undefined && total_kbps < (asked_kbps ?? 0);
-  return `${whole(total_kbps)}${isLimited ? ` of ${whole(asked_kbps)}` : ""} kbit/s`;
+  const totals = isOnline() ? totalsOf(store.state) : null;
+  return `${whole(totals?.total)}${ofWords(totals)} kbit/s${copiesWords(totals)}`;
 }
 
 /** The state of the connection, why nothing is sent, or what limits the total. */

@@ -10,6 +10,7 @@ import { EXPLAINED, SHAPES, STALE, switchCamera, unapplied } from "./tiles.js";
 import { canStraighten } from "./straight.js";
 import { isStraight, toggleStraight } from "./straighten.js";
 import { withKey } from "./hints.js";
+import { Kept } from "./kept.js";
 import { reasonWords } from "./reasons.js";
 import { colourOf } from "./colours.js";
 import { byId, factor, latency, make, region, setAttribute, setText, size, tenth, whole } from "./format.js";
@@ -70,6 +71,7 @@ const STAGES = {
 };
 const latencies = new Map(); // by stage
 const age = make("td", { class: "sum" });
+const origin = new Kept();
 let edited = new Set(); // inputs that the operator is editing: not to be overwritten
 
 function number(control, label, limits) {
@@ -183,7 +185,7 @@ function refreshHead(now) {
 
 function refreshSettings(info, now) {
   const why = whyNotByHand();
-  setText(byHand, why ?? "Set by you in mode S.");
+  setText(byHand, why ?? (now ? origin.words(name(), now) : ""));
   bitrate.update({ value: now?.kbps, max: info.b_full_kbps, why });
   refreshFactors(info, now, why);
   fill(free, now?.scaling ?? "", why, pending(`scaling:${name()}`));
@@ -275,6 +277,7 @@ export function startPanel() {
   const why = make("details", { class: "why-decided" }, make("summary", {}, reason, more), formula);
   byId("camera-panel").append(head, why, controls, comparison(), differing);
   byId("latency-panel").append(stageTable());
+  listen("state", (state) => state.online && origin.update(state));
   listen("hello state sample control requests socket status theme straight aspect", refresh);
   listen("selected", onSelected);
 }

@@ -42,7 +42,7 @@ export function reasonWords(camera, state, full, predicted) {
   const over = camera.uplinks?.length ? `, over ${camera.uplinks.join(" and ")}` : "";
   const words = sizeWords(camera.scaling);
   const most = Math.max(camera.kbps, camera.demand_kbps);
-  const cause = `${rateWords(camera.kbps, most)}, ${causeWords(camera, state, predicted)}`;
+  const cause = `${rateWords(camera.kbps, most)}${causeWords(camera, state, predicted)}`;
   return `${words[0].toUpperCase()}${words.slice(1)}${part}: ${cause}${over}.`;
 }
 
@@ -55,9 +55,9 @@ function pauseWords({ weight }, { mode }, common) {
 /** What limits its bitrate. */
 function causeWords({ kbps, demand_kbps }, { mode, total_kbps, asked_kbps }, predicted) {
   const isLimited = total_kbps < asked_kbps;
-  if (mode === "single") return isLimited ? "less than was set: the link carries no more" : "as set in mode S or left by the mode before";
-  if (kbps >= Math.floor(demand_kbps)) return "all that it can use";
-  const total = `its share of the ${(total_kbps / 1000).toFixed(1)} Mbit/s that`;
+  if (mode === "single") return isLimited ? ", less than was set: the link carries no more" : "";
+  if (kbps >= Math.floor(demand_kbps)) return ", all that it can use";
+  const total = `, its share of the ${(total_kbps / 1000).toFixed(1)} Mbit/s that`;
   if (mode === "collective") return `${total} ${isLimited ? "the link carries" : "were set"}`;
   return `${total} ${total_kbps !== asked_kbps ? "the link carries" : predicted ? "are predicted" : "it starts with"}`;
 }

@@ -134,6 +134,8 @@ export interface VehicleState {
   believed?: Believed;
   /** by uplink; absent: no rule shares the total among several */
   uplinks?: Record<string, UplinkDecision>;
+  /** by camera, how many leave the vehicle, if more than one: together they have the total; absent: one of each */
+  copies?: Record<string, number>;
 }
 
 /** Position of the vehicle; None: unknown */

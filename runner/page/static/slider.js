@@ -13,15 +13,16 @@ const HAND_MS = 400;
 /**
  * @param {object} options label, data (value of data-control), id of the number field, target() of the value, send(kbps, target),
  *   control() name of the request
- * @returns {{element, update({value, max, why}), reset()}}
+ * @returns {{element: HTMLElement, update: (now: {value: any, inForce?: any, max: any, why: any}) => void, reset: () => void}}
+ *   value: as set; inForce: what rules have left of it
  */
 export function makeSlider({ label, data, id, target, send, control }) {
   const named = (what, key) => ({ "aria-label": `${label}, ${what}`, "data-control": key });
   const range = make("input", { type: "range", min: 0, max: STEPS, step: 1, ...named("slider", `${data}-slider`) });
   const number = make("input", { type: "number", min: 1, step: 1, id: id ?? false, ...named("kbit/s", data) });
   const tick = make("i", { class: "tick", "aria-hidden": "true" });
-  const inForce = make("span", { class: "in-force" });
-  const element = make("div", { class: "slider" }, make("div", { class: "track" }, range, tick), number, inForce);
+  const words = make("span", { class: "in-force" });
+  const element = make("div", { class: "slider" }, make("div", { class: "track" }, range, tick), number, words);
   let max = 1;
   let isEdited = false;
   let touchedAt = -Infinity;
@@ -55,7 +56,7 @@ export function makeSlider({ label, data, id, target, send, control }) {
   return {
     element,
     reset: () => (isEdited = isHeld = false),
-    update({ value, max: limit, why }) {
+    update({ value, inForce = value, max: limit, why }) {
       max = limit || 1;
       shown = Number.isFinite(value) ? String(Math.round(value)) : "";
       setAttribute(number, "max", max);
@@ -63,10 +64,10 @@ export function makeSlider({ label, data, id, target, send, control }) {
       range.title = number.title = why ?? "";
       const isPending = Boolean(pending(control()));
       setAttribute(element, "data-pending", isPending ? "" : null);
-      tick.hidden = !Number.isFinite(value);
-      tick.style.setProperty("--at", String(toStep(value || 1, max) / STEPS));
-      setText(inForce, isPending ? `◌ now ${whole(value)}` : `now ${whole(value)}`);
-      setAttribute(range, "aria-valuetext", `${chosen()} kbit/s, in force ${whole(value)}`);
+      tick.hidden = !Number.isFinite(inForce);
+      tick.style.setProperty("--at", String(toStep(inForce || 1, max) / STEPS));
+      setText(words, isPending ? `◌ now ${whole(inForce)}` : `now ${whole(inForce)}`);
+      setAttribute(range, "aria-valuetext", `${chosen()} kbit/s, in force ${whole(inForce)}`);
       if (isHeld || isPending || performance.now() - touchedAt < HAND_MS) return;
       range.value = String(toStep(value || 1, max));
       if (!isEdited) number.value = shown;

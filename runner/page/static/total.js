@@ -4,6 +4,7 @@ import { inControl, listen, mode, store } from "./store.js";
 import { pending, request, showProblem, whyNoControl } from "./requests.js";
 import { makeSlider } from "./slider.js";
 import { believedWords, furtherReasons } from "./believed.js";
+import { copiesWords, ofWords, sliderValue, totalsOf } from "./totals.js";
 import { showUplinks, uplinkLines } from "./uplinks.js";
 import { byId, make, setText, whole } from "./format.js";
 
@@ -14,6 +15,7 @@ const WHY = {
 
 const figure = make("b", { class: "large" });
 const requested = make("span", { class: "muted" }); // the total before rules lowered it
+const copies = make("span", { class: "muted" });
 const prediction = make("b", { class: "large" });
 const why = make("p", { class: "why" });
 const believed = make("p", { class: "why", id: "believed" });
@@ -26,9 +28,9 @@ const slider = makeSlider({
   send,
 });
 
-/** The total as set, which a rule may lower. */
-const requestedTotal = () => (mode() ? store.state?.asked_kbps : undefined);
-const maxTotal = () => (store.hello?.cameras ?? []).reduce((sum, { b_full_kbps }) => sum + b_full_kbps, 0);
+/** What all cameras could use, in all copies. */
+const maxTotal = () =>
+  (totalsOf(store.state)?.copies ?? 1) * (store.hello?.cameras ?? []).reduce((sum, { b_full_kbps }) => sum + b_full_kbps, 0);
 
 /** Why the operator cannot set the total; null: they can. */
 function whyNot() {
@@ -44,27 +46,27 @@ function send(kbps) {
 export function scaleTotal(scale) {
   const reason = whyNot();
   if (reason) return showProblem(reason);
-  const from = pending("total")?.event.kbps ?? (scale < 1 ? store.state?.total_kbps : requestedTotal());
+  const totals = totalsOf(store.state);
+  const from = pending("total")?.event.kbps ?? (scale < 1 ? totals?.total : totals?.wanted);
   send(Math.max(1, Math.min(maxTotal(), Math.round(scale * from))));
 }
 
 function refresh() {
-  const total = mode() ? store.state?.total_kbps : undefined;
-  const wanted = requestedTotal();
+  const totals = totalsOf(store.state);
   const reason = whyNot();
-  const isLimited = total !== undefined && wanted !== undefined && total < wanted;
-  setText(figure, whole(total));
-  setText(requested, isLimited ? ` of ${whole(wanted)}` : "");
+  setText(figure, whole(totals?.total));
+  setText(requested, ofWords(totals));
+  setText(copies, copiesWords(totals));
   setText(prediction, whole(store.sample?.predicted_kbps));
   const words = believedWords(mode() ? store.state?.believed : undefined);
   const lines = uplinkLines(store.state, store.sample);
   const unlimited = mode() === "automatic" && (words || lines.length) ? "" : reason ?? "shared among the cameras by demand and weight";
   const reasons = limitReasons();
   const limit = lines.length ? "limited by the uplinks" : "limited by a rule";
-  show(why, !isLimited ? unlimited : reasons.length ? furtherReasons(reasons, words).join("; ") : limit);
+  show(why, !ofWords(totals) ? unlimited : reasons.length ? furtherReasons(reasons, words).join("; ") : limit);
   show(believed, words);
   showUplinks(uplinks, lines);
-  slider.update({ value: wanted, max: maxTotal(), why: reason });
+  slider.update({ value: sliderValue(totals, mode()), inForce: totals?.total, max: maxTotal(), why: reason });
 }
 
 function show(line, text) {
@@ -86,7 +88,7 @@ function commonReasons(beginning) {
 export function startTotal() {
   const unit = make("span", { class: "muted" }, " kbit/s");
   const predicted = make("div", { class: "prediction" }, make("span", {}, "Predicted "), prediction, unit);
-  const inForce = make("div", {}, make("span", {}, "Total "), figure, requested, make("span", { class: "muted" }, " kbit/s"));
+  const inForce = make("div", {}, make("span", {}, "Total "), figure, requested, make("span", { class: "muted" }, " kbit/s"), copies);
   byId("total-panel").append(make("div", { class: "figures" }, inForce, predicted), slider.element, why, believed, uplinks);
   listen("hello state sample control requests socket", refresh);
   refresh();

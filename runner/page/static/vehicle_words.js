@@ -16,7 +16,7 @@ import { latency, whole } from "./format.js";
  * @property {number|null} speed_mps
  * @property {number|null} latency_ms
  * @property {number|null} bound_ms
- * @property {number|null} total_kbps
+ * @property {number|null} allocated_kbps
  * @property {number} actual_kbps
  * @property {number|null} believed_kbps
  * @property {string[]} alarms
@@ -67,8 +67,8 @@ export function figuresOf({ summary }) {
 }
 
 /** What arrives here, of what the vehicle sends, or would. @param {Summary} summary */
-function linkWords({ received, actual_kbps, total_kbps, believed_kbps }) {
-  const rate = received.length ? `${whole(actual_kbps)} of ${whole(total_kbps)}` : whole(total_kbps);
+function linkWords({ received, actual_kbps, allocated_kbps, believed_kbps }) {
+  const rate = received.length ? `${whole(actual_kbps)} of ${whole(allocated_kbps)}` : whole(allocated_kbps);
   return `${rate} kbit/s${believed_kbps === null ? "" : `, can carry ${whole(believed_kbps)}`}`;
 }
 
