@@ -70,6 +70,12 @@ def test_the_others_get_the_share_of_a_camera_that_is_lost() -> None:
 
 REFUSED: list[tuple[str, str, dict[str, Any], str]] = [
     ("automatic", "roi_set", LEFT | ROI, "roi_set is accepted in mode single only, the mode is automatic"),
+    (
+        "collective",
+        "roi_set",
+        {"camera": "x", **ROI},
+        "roi_set is accepted in mode single only, the mode is collective",
+    ),
     ("collective", "roi_set", LEFT | ROI, "roi_set is accepted in mode single only, the mode is collective"),
     (
         "automatic",
@@ -174,6 +180,16 @@ def test_rois_stay_in_automatic_and_collective() -> None:
         drive.accept("mode_selected", mode=mode)
         assert drive["front_left"].roi == Roi(0, 0, 960, 520)
         assert drive["front_left"].demand == 1500
+
+
+def test_the_full_image_can_be_had_back_in_every_mode() -> None:
+    for mode in ("automatic", "collective", "single"):
+        drive = Drive("modes=paper", "mode=single")
+        drive.accept("roi_set", **LEFT, **ROI)
+        drive.accept("mode_selected", mode=mode)
+        drive.accept("roi_set", **LEFT, x=0, y=0, width=1920, height=1040)
+        assert drive["front_left"].roi == Roi(0, 0, 1920, 1040)
+        assert drive["front_left"].demand == 6000
 
 
 def test_changes_while_off_apply_when_switched_on_again() -> None:

@@ -104,7 +104,7 @@ class CameraSwitched(_Event):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RoiSet(_Event):
-    """The operator sets the region of interest of a camera, mode single.
+    """The operator sets the region of interest of a camera, mode single; the full image in every mode.
 
     It must lie inside the full image and be at least 16x16; otherwise the event is refused.
     """

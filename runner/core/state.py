@@ -117,7 +117,9 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
             lost = others if works else {**others, name: reason or "its source does not open"}
             return {"lost": lost, "manual": _manual(state, in_force, name, works)}
         case ev.RoiSet(camera=name, roi=roi):
-            _only_in(Mode.SINGLE, state, event)
+            known = vehicle.cameras.get(name)
+            if known is None or roi != known.full_roi:  # what a region leaves out can be had back at any time
+                _only_in(Mode.SINGLE, state, event)
             _check_roi(_known(vehicle, name), roi)
             return {"rois": {**state.rois, name: roi}}
         case ev.CameraConfigured(camera=name):

@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-import { percent, rateWords, reasonWords, sizeWords } from "../../runner/page/static/reasons.js";
+import { percent, rateWords, reasonWords, regionWords, sizeWords } from "../../runner/page/static/reasons.js";
 
 const FULL = { width: 1920, height: 1040 };
 const CAMERA = /** @type {any} */ ({
@@ -48,3 +48,11 @@ for (const [camera, { predicted = true, ...state }, words] of /** @type {any[]} 
   test(words, () => assert.equal(reasonWords({ ...CAMERA, ...camera }, { ...STATE, ...state }, FULL, predicted), words));
 
 test("nothing is said of a vehicle that is offline", () => assert.equal(reasonWords(undefined, null, FULL, false), "–"));
+
+test("a region of interest says what it costs", () => {
+  const camera = { ...CAMERA, roi: { x: 0, y: 0, width: 960, height: 520 } };
+  const begin = "Only 25 % of the image is sent, nobody sees the rest.";
+  assert.equal(regionWords(camera, true, FULL, "Full image (f)"), `${begin} Its bitrate stays as it is. Full image (f) ends this.`);
+  const automatic = `${begin} It gets no sharper: the camera asks for 25 % of its bitrate. Full image (f) ends this.`;
+  assert.equal(regionWords(camera, false, FULL, "Full image (f)"), automatic);
+});

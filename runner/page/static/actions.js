@@ -63,7 +63,7 @@ export const ACTIONS = {
   monitors: { description: "pictures in additional windows, for other monitors", run: listMonitors },
   switch: { description: "switch the selected camera on or off", run: () => store.selected && switchCamera(store.selected) },
   keep: { description: "keep the last 60 s: mark them, and protect the drive that is logged", run: keepMoment },
-  full_image: { description: "full image of the selected camera (mode S)", run: sendFull },
+  full_image: { description: "full image of the selected camera, or of all", run: sendFull },
   control: { description: "take, request, offer, accept or release control: the first of its buttons", run: toggleControl },
   stop: { description: "ask the vehicle to stop; whoever drives lifts it by a button", run: askToStop },
   theme: { description: "night or day theme", run: toggleTheme },

@@ -2,7 +2,7 @@
 
 import { camera, decisionOf, inControl, listen, mode, store, whyUndecided } from "./store.js";
 import { pending, request, showProblem, whyNoControl } from "./requests.js";
-import { fullRegion, isLocked, sendRegion, toggleLocked } from "./roi.js";
+import { fullRegion, isLocked, isPart, sendRegion, toggleLocked } from "./roi.js";
 import { RegionFrame } from "./region_frame.js";
 import { SMALLEST } from "./region.js";
 import { makeSlider } from "./slider.js";
@@ -11,7 +11,7 @@ import { canStraighten } from "./straight.js";
 import { isStraight, toggleStraight } from "./straighten.js";
 import { withKey } from "./hints.js";
 import { Kept } from "./kept.js";
-import { reasonWords } from "./reasons.js";
+import { reasonWords, regionWords } from "./reasons.js";
 import { colourOf } from "./colours.js";
 import { byId, factor, latency, make, region, setAttribute, setText, size, tenth, whole } from "./format.js";
 
@@ -57,6 +57,7 @@ const full = make("button", { "data-control": "roi-full", onclick: () => sendFul
 const locked = make("button", {
   "data-control": "roi-aspect", onclick: toggleLocked, title: "dragged regions keep the aspect ratio of the full image",
 }, "Lock aspect");
+const part = make("p", { class: "why", id: "region-part" });
 const frame = new RegionFrame();
 const differing = make("p", { class: "differing" });
 const rows = new Map();
@@ -141,12 +142,14 @@ function sendSides() {
   edited = new Set();
 }
 
-/** Request the full image of the selected camera. */
+/** Request the full image of the selected camera, or, if that sends it anyway, of every camera that sends a part. */
 export function sendFull() {
-  if (!store.selected) return;
-  const why = whyNotByHand();
+  const why = whyNot();
   if (why) return showProblem(why);
-  sendRegion(name(), fullRegion(name()));
+  const others = (store.hello?.cameras ?? []).map((each) => each.name).filter(isPart);
+  const names = others.includes(name()) ? [name()] : others;
+  if (!names.length) return showProblem("every camera sends its full image");
+  for (const each of names) sendRegion(each, fullRegion(each));
   edited = new Set();
 }
 
@@ -191,8 +194,10 @@ function refreshSettings(info, now) {
   fill(free, now?.scaling ?? "", why, pending(`scaling:${name()}`));
   for (const side of SIDES) fill(sides[side], now?.roi[side] ?? "", why, pending(`roi:${name()}`));
   setAttribute(locked, "aria-pressed", isLocked());
-  apply.disabled = full.disabled = Boolean(why);
-  full.title = why ?? withKey("full image", "full_image");
+  apply.disabled = Boolean(why);
+  full.disabled = Boolean(whyNot()) || !isPart(name());
+  full.title = whyNot() ?? withKey("full image", "full_image");
+  setText(part, now && isPart(name()) ? regionWords(now, mode() === "single", info, withKey("Full image", "full_image")) : "");
   apply.title = why ?? "send these numbers; a rectangle dragged on the picture does the same";
   fill(weight, now?.weight ?? info.weight, whyNot(), pending(`weight:${name()}`));
   setText(weightNote, whyNot() ?? (mode() === "single" ? "used in modes A and C only" : "scales this camera's share of the total"));
@@ -270,6 +275,7 @@ export function startPanel() {
     field("Factor", choices, free),
     field("ROI", make("div", { class: "sides" }, ...numbers)),
     make("div", { class: "field" }, apply, full, locked),
+    part,
     make("div", { class: "beside" }, field("Weight", weight, weightNote), frame.element),
   );
   const head = make("div", { class: "head" }, swatch, title, status, straight, on);

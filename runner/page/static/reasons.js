@@ -25,6 +25,19 @@ export const shareOf = (roi, full) => (roi.width * roi.height) / (full.width * f
 export const percent = (share) => `${share < 0.01 ? "less than 1" : whole(100 * share)} %`;
 
 /**
+ * What a region of interest costs.
+ * @param {import("./records.js").CameraState} camera its decision
+ * @param {boolean} isSingle whether the mode is S
+ * @param {import("./framing.js").Size} full image
+ * @param {string} end how to end it
+ */
+export function regionWords({ roi }, isSingle, full, end) {
+  const share = percent(shareOf(roi, full));
+  const bitrate = isSingle ? "Its bitrate stays as it is" : `It gets no sharper: the camera asks for ${share} of its bitrate`;
+  return `Only ${share} of the image is sent, nobody sees the rest. ${bitrate}. ${end} ends this.`;
+}
+
+/**
  * Half size: 1.2 of 6.0 Mbit/s, its share of the 6.5 Mbit/s that are predicted.
  * @param {import("./records.js").CameraState|undefined} camera its decision
  * @param {import("./store.js").State|null} state of the vehicle

@@ -62,6 +62,12 @@ export function fullRegion(name) {
   return { x: 0, y: 0, width: full.width, height: full.height };
 }
 
+/** Whether a camera is to send, or may still send, a part of its image only. */
+export function isPart(name) {
+  const [full, decided] = [fullRegion(name), decisionOf(name)?.roi];
+  return [decided, pendingRegion(name)].some((region) => region && !sameRegion(region, full));
+}
+
 /** Why a region cannot be chosen on a camera's picture; null: it can. */
 export function whyNoRegion(name) {
   if (!inControl()) return whyNoControl();

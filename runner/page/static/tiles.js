@@ -3,7 +3,7 @@
 import { alertStatus, camera, decisionOf, enlarge, inControl, listen, publish, select, store, whyUndecided } from "./store.js";
 import { drawFirst, reportSize, showGuides, transferCanvases } from "./link.js";
 import { pending, request, whyNoControl } from "./requests.js";
-import { dragRegion, shownRegion } from "./roi.js";
+import { dragRegion, isPart, shownRegion } from "./roi.js";
 import { RegionFrame, showsPart } from "./region_frame.js";
 import { zoomRegion } from "./zoom.js";
 import { bandsOf, boxesOf, gridOf, heightsOf, narrowBands } from "./layout.js";
@@ -15,7 +15,7 @@ import { isStraight } from "./straighten.js";
 import { straightOptics } from "./straight.js";
 import { withKey } from "./hints.js";
 import { ALARMS } from "./alarm.js";
-import { reasonWords } from "./reasons.js";
+import { percent, reasonWords, shareOf } from "./reasons.js";
 import { colourOf } from "./colours.js";
 import { announce, boxSize, byId, displayName, factor, latency, make, setAttribute, setText, size, whole } from "./format.js";
 
@@ -248,14 +248,20 @@ function reportFrame(name) {
 /** State which part of the picture is shown. To read the size from the box would lay out the page for each tile. */
 function refreshFraming(name, { measured, shown, view, frame }) {
   const info = camera(name);
-  const isPart = info && !isStraight(name) && showsPart(name);
-  frame.element.hidden = !isPart;
-  if (isPart) frame.refresh(name);
+  const hasFrame = info && !isStraight(name) && showsPart(name);
+  frame.element.hidden = !hasFrame;
+  if (hasFrame) frame.refresh(name);
   const picture = (isStraight(name) ? null : shownRegion(name)) ?? info;
   const isLaidOut = info && picture && measured.width && measured.height;
   const framing = isLaidOut ? framingText(measured, picture, view) : "";
   const straight = info && isStraight(name) ? `straight, ${straightOptics(info).fov_deg}° of ${info.fov_deg}°` : "";
-  setText(shown, [framing, straight].filter(Boolean).join(", "));
+  setText(shown, [framing, straight, partText(name)].filter(Boolean).join(", "));
+}
+
+/** That a camera sends a part of its image only, and how to end that. @param {string} name */
+function partText(name) {
+  const [info, now] = [camera(name), decisionOf(name)];
+  return info && now && isPart(name) ? withKey(`only ${percent(shareOf(now.roi, info))} of its image sent`, "full_image") : "";
 }
 
 function layOutEnlarged() {
@@ -323,7 +329,8 @@ function refreshCaption(name, { rates, form, reason }) {
   const region = differs.includes("size") || differs.includes("ROI");
   const kbps = [sample?.kbps, now?.kbps, now?.demand_kbps].map(whole).join(`${THIN}/${THIN}`);
   const repair = sample?.buffer_ms ? `; the jitter buffer waits up to ${sample.buffer_ms} ms for retransmissions` : "";
-  const shape = `${size(sample?.width, sample?.height)} · ×${factor(now?.scaling)}`;
+  const part = now && isPart(name) ? ` of ${percent(shareOf(now.roi, camera(name) ?? now.roi))} of the image` : "";
+  const shape = `${size(sample?.width, sample?.height)} · ×${factor(now?.scaling)}${part}`;
   const of = now?.slow_fps && !isSilent ? ` of ${whole(camera(name)?.fps)}` : "";
   caption(rates, bitrate, `${whole(sample?.fps)}${of} fps · ${kbps} kbit/s`, "pictures a second · kbit/s: received / allocated / demanded");
   const lost = sample?.lost ? ` · ${sample.lost} lost` : "";
