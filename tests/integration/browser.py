@@ -241,7 +241,12 @@ def boxes(page):
     return page.evaluate(BOXES)
 
 
-SCREENS = ((1280, 720), (1920, 1080), (2560, 1440), (3840, 2160), (1024, 768), (768, 1024))
+def overlap(a, b):
+    """Whether two boxes do, by more than a pixel."""
+    return all(a[at] < b[at] + b[of] - 1 and b[at] < a[at] + a[of] - 1 for at, of in (("x", "width"), ("y", "height")))
+
+
+SCREENS = ((1280, 720), (1920, 1080), (2560, 1440), (3840, 2160), (1024, 768))
 
 
 def sized(page, width, height):

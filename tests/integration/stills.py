@@ -156,6 +156,6 @@ def on_screen(locator, before, mode="L"):
     return np.asarray(image.open(io.BytesIO(png)).convert(mode), float), known
 
 
-def steering(served, rad):
-    """Report the steering angle 20 times a second."""
-    return repeating(lambda: served.on_steering(time.time(), rad), 0.05)
+def steering(served, rad, gear=None):
+    """Report the steering angle, and the gear, 20 times a second."""
+    return repeating(lambda: served.on_steering(time.time(), rad, gear), 0.05)

@@ -26,6 +26,7 @@ from browser import (
     luma,
     measure,
     opened,
+    overlap,
     send,
     shot,
     sized,
@@ -462,10 +463,6 @@ def test_every_control_has_a_name_for_screen_readers(page):
     page.locator("#tab-camera").click()
 
 
-def overlap(a, b):
-    return all(a[at] < b[at] + b[of] - 1 and b[at] < a[at] + a[of] - 1 for at, of in (("x", "width"), ("y", "height")))
-
-
 def whole(page):
     """Boxes of the pictures, after checking that none overlap and nothing is cut off."""
     pictures, wrong = boxes(page)
@@ -480,7 +477,7 @@ def test_drive_the_front_camera_is_large_and_nothing_is_cut_off(fresh):
     page.locator("#offer-drive").click()
     assert page.locator("#offer").is_hidden()
     assert page.evaluate("tod.view") == "drive"
-    for width, height in SCREENS[:2]:  # the others in test_both_views_fit_every_screen
+    for width, height in SCREENS[:2]:  # the others in test_a_view_fits_every_screen
         sized(page, width, height)
         front = whole(page)["front_center"]
         assert front["width"] * front["height"] >= 0.4 * width * height, (width, height)
@@ -498,6 +495,7 @@ def test_drive_shows_what_a_driver_must_not_miss(page):
     until(lambda: re.fullmatch(r"\d+ ± \d+ ms", page.inner_text("#worst")))
     until(lambda: page.inner_text("#worst-of").removeprefix("worst: ").replace(" ", "_") in TUM)
     until(lambda: page.inner_text("#driven") == "230 km/h")  # 64 m/s
+    until(lambda: re.fullmatch(r"[NESW]{1,2} \d+°", page.inner_text("#heading")))
     assert page.inner_text("#advised") == "no speed advised"
     shape = """level => {
       const figure = document.querySelector("#speed-now");

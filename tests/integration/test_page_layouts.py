@@ -25,6 +25,7 @@ from browser import (
     loaded,
     measure,
     opened,
+    overlap,
     send,
     shot,
     sized,
@@ -270,7 +271,7 @@ def test_places_of_the_drive_view_are_dragged_moved_by_keys_saved_and_reset(chro
         )
         page.keyboard.press("d")
         large = until(lambda: settled_edges(page))
-        assert large["front"]["x"] < large["mast"]["x"] and large["rear"]["y"] < large["mast"]["y"]
+        assert large["front"]["x"] < large["rear"]["x"] and large["front"]["y"] < large["mast"]["y"]
         assert large["mast"]["width"] > 2 * large["front"]["width"]
         page.keyboard.press("ArrowLeft")
         assert page.evaluate("document.querySelector('.tile.selected').dataset.camera") == "front"
@@ -682,8 +683,9 @@ TWO_UPLINKS = ("paper", "robot")  # those of the owners
 
 
 @pytest.mark.soak
+@pytest.mark.parametrize("view", ("configure", "drive"))
 @pytest.mark.parametrize("owner", OWNERS)
-def test_both_views_fit_every_screen(chromium, picture, tmp_path, owner):
+def test_a_view_fits_every_screen(chromium, picture, tmp_path, owner, view):
     (tmp_path / "vehicle").mkdir()
     (tmp_path / "vehicle" / "truck.yaml").write_text(TRUCK.lstrip())
     with (
@@ -697,35 +699,34 @@ def test_both_views_fit_every_screen(chromium, picture, tmp_path, owner):
         controlling(page)
         all_live(page)
         front = next(name for name in station.state.cameras if name in ("front_center", "front", "cab"))
-        for view in ("configure", "drive"):
-            viewing(page, view)
-            for width, height in SCREENS:
-                sized(page, width, height)
-                until(lambda view=view: has_wide_figures(page, view))
-                time.sleep(EVERY_S)  # for the picture of the screen
-                shot(page, f"{owner}-{view}-{width}")
-                pictures, wrong = boxes(page)
-                assert wrong == FITS, (view, width, height)
-                assert set(pictures) == set(station.state.cameras)
-                share = pictures[front]["width"] * pictures[front]["height"] / (width * height)
-                assert view == "configure" or width < height or share >= 0.4, (view, width, height)
-                for status in OTHERS:
-                    page.evaluate(ALL_AS, status)
-                    assert boxes(page)[1] == FITS, (status, view, width, height)
-                page.evaluate(ALL_AS, "live")
-                if view == "drive":
-                    page.click("#drawer")
-                    shot(page, f"{owner}-drawer-{width}")
-                for tab in ("latency", "charts", "map", "camera"):
-                    if page.locator(f"#tab-{tab}").is_visible():
-                        page.click(f"#tab-{tab}")
-                        assert boxes(page)[1] == FITS, (tab, view, width, height)
-                if view == "drive":
-                    page.click("#drawer")
-                page.keyboard.press("?")
-                shot(page, f"{owner}-help-{width}")
-                assert boxes(page)[1] == FITS, ("help", width, height)
-                page.keyboard.press("Escape")
+        viewing(page, view)
+        for width, height in SCREENS:
+            sized(page, width, height)
+            until(lambda: has_wide_figures(page, view))
+            time.sleep(EVERY_S)  # for the picture of the screen
+            shot(page, f"{owner}-{view}-{width}")
+            pictures, wrong = boxes(page)
+            assert wrong == FITS, (view, width, height)
+            assert set(pictures) == set(station.state.cameras)
+            share = pictures[front]["width"] * pictures[front]["height"] / (width * height)
+            assert view == "configure" or width < height or share >= 0.4, (view, width, height)
+            for status in OTHERS:
+                page.evaluate(ALL_AS, status)
+                assert boxes(page)[1] == FITS, (status, view, width, height)
+            page.evaluate(ALL_AS, "live")
+            if view == "drive":
+                page.click("#drawer")
+                shot(page, f"{owner}-drawer-{width}")
+            for tab in ("latency", "charts", "map", "camera"):
+                if page.locator(f"#tab-{tab}").is_visible():
+                    page.click(f"#tab-{tab}")
+                    assert boxes(page)[1] == FITS, (tab, view, width, height)
+            if view == "drive":
+                page.click("#drawer")
+            page.keyboard.press("?")
+            shot(page, f"{owner}-help-{width}")
+            assert boxes(page)[1] == FITS, ("help", width, height)
+            page.keyboard.press("Escape")
 
 
 OTHERS = ("synchronising", "late", "damaged", "frozen", "lost", "refused", "unsupported", "off", "paused")
@@ -1114,3 +1115,42 @@ def test_every_text_is_readable_by_day_and_by_night(chromium, picture, tmp_path)
         all_live(monitor)
         look("monitor", on=monitor)
         assert sorted(set(found)) == []
+
+
+def test_no_message_moves_a_picture_of_the_drive_view(chromium, picture):
+    """Alarms, warnings and toasts have a place of their own."""
+    with served(picture, None) as (server, _), opened(chromium, server.url, 1920, 1080) as page:
+        controlling(page)
+        page.click("#offer-drive")
+        all_live(page)
+        before = until(lambda: settled_edges(page))
+        panel = page.locator("#messages").bounding_box()
+        server.on_state(None)
+        until(lambda: "VEHICLE OFFLINE" in page.inner_text("#banner"))
+        until(lambda: page.inner_text("#alarms").startswith("✕ LOST"))
+        page.evaluate("dispatchEvent(new Event('blur'))")
+        page.evaluate('import("/static/requests.js").then(({ showProblem }) => showProblem("words ".repeat(20)))')
+        until(lambda: page.locator(".toast").count() == 1)
+        shot(page, "drive-offline")
+        assert until(lambda: settled_edges(page)) == before
+        assert page.locator("#messages").bounding_box() == panel
+        assert page.locator("#banner").is_visible()
+        assert [name for name in CAMERAS if overlap(panel, before[name])] == []
+
+
+@pytest.mark.parametrize("size", [(412, 915), (915, 412), (768, 1024)])
+def test_a_narrow_page_has_one_column(chromium, picture, size):
+    with served(picture, None, vehicle=["vehicle=tum_q7"]) as (server, _), opened(chromium, server.url, *size) as page:
+        all_live(page)
+        page.click("#offer-no")
+        tiles = [page.locator(".tile").nth(i).bounding_box() for i in range(8)]
+        *above, side = (page.locator(each).bounding_box() for each in ("#header", "#scene", "#below", "#side"))
+        assert [(a, b) for i, a in enumerate(tiles) for b in tiles[:i] if overlap(a, b)] == []
+        assert all(each["y"] + each["height"] <= side["y"] + 1 for each in above)
+        assert all(each["width"] >= 290 and each["x"] + each["width"] <= size[0] for each in tiles)
+        _, wrong = boxes(page)
+        assert (wrong["cut"], wrong["scrolls"]) == ([], True)
+        page.locator("#tab-news").click()  # at its end
+        shot(page, f"narrow-{size[0]}")
+        viewing(page, "drive")
+        assert boxes(page)[1] == FITS

@@ -12,6 +12,7 @@ from painted import CAMERAS, SIZE, STEERED, STEERED_RAD, WITHIN_PX, ends_of, fou
 from stills import MARKS, Station, on_screen, serving, steering
 
 from browser import PADS, all_live, measure, opened, shot, until
+from runner.core.events import Gear
 from runner.records.operator import Sample
 
 pytestmark = MARKS
@@ -273,6 +274,17 @@ def test_the_path_follows_the_steering_and_disappears_with_it(page, served):
         drawn = [is_drawn(on - off, piece) for line in lines if line["kind"] == "path" for piece in line["pieces"]]
         assert drawn and all(drawn)
     until(lambda: kinds() == {"width", "distance"})
+
+
+def test_a_driver_sees_steering_and_gear_once_they_are_reported(page, served):
+    figures = {name: page.locator(f"#{name}-now") for name in ("steering", "gear", "heading")}
+    assert page.locator("#speed-now").is_visible()
+    assert not any(figure.is_visible() for figure in figures.values())
+    with steering(served, -0.1, Gear.REVERSE):
+        until(lambda: page.inner_text("#steering") == "6° right" and page.inner_text("#gear") == "R")
+        shot(page, "drive-steering")
+    until(lambda: page.inner_text("#steering") == page.inner_text("#gear") == "–")
+    assert not figures["heading"].is_visible(), "nobody reports it"
 
 
 def test_the_path_passes_the_marks_where_the_wheels_will_go(page, served):

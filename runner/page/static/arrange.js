@@ -13,9 +13,10 @@ const SHARED = 0.38; // of the strip's width, for each picture in it next to fre
 const SMALL = { usual: 0.45, birdseye: 0.6 }; // of the column: small pictures, at most
 const FRONT = 0.5; // the front picture in a tall area, at most
 const BELOW = 0.2; // what a tall area keeps for the panels
-const TALL = 0.95; // width / height below which an area is tall
+const TALL = 1.1; // width / height below which an area is tall
 const ROW = 0.95; // of the front picture's width; a row below it may cost the rest
 const LEAST_PX = 56; // a lower rest of the area stays empty
+const COLUMN_PX = 165; // at least
 /** Share of the height that panels have in common; and the height at most: a share of the width, and px. The map gets the rest. */
 const PANELS = { figures: [26, 0.35, 60], messages: [20, 0.3, 60], words: [16, 0.25, 50], map: [18, 0, 0], buttons: [26, 0.3, 90] };
 const LEAST_MAP_PX = 90;
@@ -122,7 +123,8 @@ function swap(pictures, front, main) {
 function beside(roles, width, height) {
   const { front, others } = roles;
   const isHigh = others[0]?.name === BIRDSEYE && width < 1.5 * height;
-  const widest = Math.floor(width * (1 - (isHigh ? COLUMN.birdseye : COLUMN.usual))) - GAP;
+  const column = Math.max(COLUMN_PX, width * (isHigh ? COLUMN.birdseye : COLUMN.usual));
+  const widest = Math.floor(width - column) - GAP;
   const [alone, withRow] = [[], others].map((row) => frontWidth(roles, row, widest, height));
   const row = others.length > 1 && withRow >= ROW * alone ? others : [];
   const wide = row.length ? withRow : alone;
@@ -132,14 +134,14 @@ function beside(roles, width, height) {
   const y = below(strip.height);
   if (front) pictures.set(front.name, { x: 0, y, width: wide, height: high, view: viewOf(front) });
   put(pictures, row, { x: 0, y: y + high + GAP, width: wide, height: low });
-  const column = { x: wide + GAP, y: 0, width: width - wide - GAP, height };
+  const side = { x: wide + GAP, y: 0, width: width - wide - GAP, height };
   const share = others[0]?.name === BIRDSEYE ? SMALL.birdseye : SMALL.usual;
-  const small = putRows(pictures, row.length ? [] : others, column, share * height);
+  const small = putRows(pictures, row.length ? [] : others, side, share * height);
   const end = y + high + below(low) + GAP;
   const rest = height - end < LEAST_PX ? [] : [{ x: 0, y: end, width: wide, height: height - end }];
-  const panels = panelsIn([...strip.free, ...rest], { ...column, height: height - below(small) });
+  const panels = panelsIn([...strip.free, ...rest], { ...side, height: height - below(small) });
   const head = { width: wide, height: Math.max(strip.height, STRIP.mirror * height) };
-  return { pictures, panels, slots: slotsOf(roles, pictures, head, column) };
+  return { pictures, panels, slots: slotsOf(roles, pictures, head, side) };
 }
 
 /** The largest width of the front picture at which all is inside the area. */

@@ -3,7 +3,7 @@
 import { byId, setBox } from "./format.js";
 
 const IDS = { figures: "drive-figures", messages: "messages", words: "drive-words", map: "drive-map", buttons: "drive-buttons" };
-const FITS = [1, 0.9, 0.8, 0.7, 0.6]; // of the usual size of text
+const FITS = [1, 0.9, 0.8, 0.7, 0.6, 0.5]; // of the usual size of text
 const LEAST_PX = 11; // of text at its usual size
 
 /** Panels with text, each with what it showed when the size of its text was chosen. @type {Map<HTMLElement, string>} */
@@ -37,8 +37,11 @@ export function fitPanels() {
 
 /** Make the text of a panel smaller where it would be cut off. @param {HTMLElement} panel */
 function fit(panel) {
+  const parts = [panel, ...panel.querySelectorAll("b, button")];
   for (const scale of FITS) {
     panel.style.setProperty("--fit", String(scale));
-    if (panel.scrollHeight <= panel.clientHeight && panel.scrollWidth <= panel.clientWidth) return;
+    if (!parts.some(isCut)) return;
   }
 }
+
+const isCut = ({ scrollHeight, clientHeight, scrollWidth, clientWidth }) => scrollHeight > clientHeight || scrollWidth > clientWidth;
