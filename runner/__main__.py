@@ -26,6 +26,7 @@ conf=DIR (or the environment variable TOD_CONF) names a directory of your own; i
 ~/.config/tod-runner/site.yaml (or TOD_SITE) states what belongs to this machine, below overrides.
 
   tod-runner demo                                    drive the paper's vehicle on this machine
+  tod-runner demo camera=/dev/video0                 drive with your webcam; doctor cameras lists yours
   tod-runner print total_kbps=3000                   what would run, and why
   tod-runner validate conf=my_vehicles               check your YAML, for example in CI
   tod-runner VERB --help                             one verb, with examples"""

@@ -155,7 +155,7 @@ VERBS = {
         choices={"rules": NO_YES},
     ),
     "doctor": Verb(
-        "list missing dependencies of this machine", "runner.verbs.doctor", ("registry",), "VERB or cameras", sited=True
+        "what this machine lacks, and its cameras", "runner.verbs.doctor", ("registry",), "VERB or cameras", sited=True
     ),
     "completion": Verb("the completion script for bash or zsh", "runner.verbs.completion", (), "SHELL", composes=False),
 }

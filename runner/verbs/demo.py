@@ -162,6 +162,9 @@ def _prepare_demo(arguments: Arguments, apply: ModuleType) -> _Demo:
 def _run_demo(demo: _Demo) -> None:
     for line in (*([demo.about] if demo.about else []), *demo.shown):
         say(line)
+    with progress_bar() as progress:
+        for one in demo.runs:
+            render_missing(one.setup.vehicle, progress)
     driven = list[Path]()
     for number, one in enumerate(demo.runs, 1):
         if one.name:
@@ -220,8 +223,6 @@ def _prepare_run(
         raise ArgumentError("link", link.kind, rule)
     duration_s = arguments.number("duration_s")
     duration_s = config.experiment().duration_s if duration_s is None else duration_s
-    with progress_bar() as progress:
-        render_missing(setup.vehicle, progress)
     return _Run(name, own, setup, directory, link, config.document, duration_s, keys)
 
 
