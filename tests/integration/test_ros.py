@@ -30,6 +30,7 @@ from rig import children_named, free_port, run, streaming, until, watching
 from runner.bag.pictures import ENCODINGS
 from runner.core.commands import Command
 from runner.operator.frames import live_frames
+from runner.ros.topics import picture_topics
 
 pytestmark = MARKS
 RATE = 15
@@ -267,6 +268,25 @@ def test_faults_of_a_topic_are_reported_once_and_others_continue(ros):
 def goes_on(client):
     before = len(client.sizes)
     until(lambda: len(client.sizes) > before + RATE)
+
+
+def test_topics_with_pictures_are_listed(ros):
+    """Those of ROS 2 with what arrives on them."""
+    picture = {"file": str(Path(__file__)), "format": "jpeg"}
+    with publishing(ros, front={}, rear=picture, quiet={"fps": 0}):
+        found = until(lambda: [*filter(None, [_listed(ros)])], seconds=60)[0]
+    front, rear = found
+    assert (front.name, front.kind) == ("/front/image", ros.type("sensor_msgs", "Image"))
+    assert (rear.name, rear.kind) == ("/rear/image", ros.type("sensor_msgs", "CompressedImage"))
+    if ros.version == 2:
+        assert (front.encoding, front.width, front.height) == ("bgr8", WIDTH, HEIGHT)
+        assert (rear.encoding, rear.width) == ("jpeg", 0)
+        assert front.hz > 1
+
+
+def _listed(ros):
+    found = picture_topics(ros.settings, insecure=False)
+    return found if len(found) == 2 and all(topic.hz for topic in found if ros.version == 2) else None
 
 
 def test_a_killed_node_is_restarted(ros):
