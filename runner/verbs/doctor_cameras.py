@@ -19,7 +19,8 @@ no V4L2 device captures pictures here: plug in a camera, or load its driver (`ls
 other sources, such as IP cameras, clips and bags: docs/sources.md"""
 GENERAL = re.compile(r"/(image(_raw|_color|_rect)*|compressed)\b")  # parts of a topic's name that name no camera
 HOW_TO = """\
-# paste the parts into the files of a vehicle of your own, which `tod-runner init NAME cameras=front` makes"""
+# Paste the parts into the files of a vehicle of your own:
+# `tod-runner init NAME cameras=front` makes one"""
 
 
 def list_cameras(setup: Setup) -> bool:

@@ -9,6 +9,8 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from runner.core.model import Camera, Capture
 from runner.errors import ArgumentError
 from runner.system.v4l2 import CLOSE, Device, device_problem, preferred
@@ -91,8 +93,8 @@ def stated(rate: Fraction) -> float | int:
 
 
 def as_yaml(values: Mapping[str, Any]) -> list[str]:
-    """Lines of YAML, one for each key; inner ones in braces."""
-    return [f"{key}: {_flow(value)}" for key, value in values.items()]
+    """Lines of YAML, as people write it: what has no further levels is in braces."""
+    return yaml.safe_dump(dict(values), default_flow_style=None, sort_keys=False, allow_unicode=True).splitlines()
 
 
 def _flow(value: Any) -> str:
