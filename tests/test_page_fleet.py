@@ -69,7 +69,7 @@ class Station:
 def served(use: Use) -> None:
     """Run something with the page of a list, at an address."""
     port = free_port()
-    server = FleetServer(Endpoint("127.0.0.1", port), None, print)
+    server = FleetServer(Endpoint("127.0.0.1", port), None, None, print)
     server.start()
 
     async def run() -> None:

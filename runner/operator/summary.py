@@ -80,17 +80,14 @@ def summary(station: Station) -> Summary:
         allocated_kbps=sum(camera.kbps for camera in state.cameras.values()) if state else None,
         actual_kbps=sum(row.rates.kbps for row in received),
         believed_kbps=float(state.believed.kbps) if state and state.believed is not UNSET else None,
-        alarms=tuple(_alarms(state, station.identity)) if state else (),
+        alarms=tuple(_alarms(state)) if state else (),
         cameras=tuple(name for name, camera in state.cameras.items() if camera.on) if state else (),
         received=tuple(row.name for row in received),
     )
 
 
-def _alarms(state: VehicleState, own: str) -> Iterator[str]:
-    """What is wrong on the vehicle, or with its driver.
-
-    own  this station's operator
-    """
+def _alarms(state: VehicleState) -> Iterator[str]:
+    """What is wrong on the vehicle, or with its driver."""
     driving = Driving() if state.driving is UNSET else state.driving
     if driving.stop:
         yield f"{driving.stop} asked to stop"
@@ -102,5 +99,4 @@ def _alarms(state: VehicleState, own: str) -> Iterator[str]:
         elif driving.in_control and camera.on and not camera.sending:
             yield f"{name}: paused"
     if driving.in_control and state.attention in UNSEEN:
-        whose = "your" if driving.holder == own else f"{driving.holder}'s"
-        yield f"{whose} page is {'closed' if state.attention is Attention.ABSENT else state.attention}"
+        yield f"the driver's page is {'closed' if state.attention is Attention.ABSENT else state.attention}"

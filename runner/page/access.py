@@ -11,7 +11,7 @@ from aiohttp import web
 
 from runner.mqtt.messages import read_message
 from runner.page.connections import Connections
-from runner.page.login import COOKIE, OPERATOR, PageLogin, Visitor
+from runner.page.login import COOKIE, OPERATOR, RELAYED, PageLogin, Visitor
 from runner.schema import shortened
 from runner.system.reports import LimitedReports
 
@@ -56,8 +56,14 @@ class Access:
         self.login, self._names, self._connections, self._report = login, names, connections, report
 
     def visitor(self, request: web.Request) -> Visitor | None:
-        """Whose request it is; None: this person has no access."""
-        return OPERATOR if self.login is None else self.login.visitor(request.cookies.get(COOKIE), time.monotonic())
+        """Whose request it is; None: this person has no access.
+
+        Without a login everybody here may do everything, except of whom a relay says otherwise.
+        """
+        if self.login is None:
+            relayed = request.headers.get(RELAYED)
+            return Visitor.of(relayed) if relayed else OPERATOR
+        return self.login.visitor(request.cookies.get(COOKIE), time.monotonic())
 
     @web.middleware
     async def add_headers(self, request: web.Request, handler: Any) -> web.StreamResponse:

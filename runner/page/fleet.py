@@ -53,13 +53,16 @@ class FleetServer:
 
     endpoint  where browsers reach it
     keyring   of the operator, to serve other machines over HTTPS if they have its token; None: loopback only
+    people    file of others who may log in; None: nobody
     note      called with a message for the operator
-    raises    RunError if the port is in use or plotly is not installed
+    raises    RunError if the port is in use or plotly is not installed, UserError if that file cannot be used
     """
 
-    def __init__(self, endpoint: Endpoint, keyring: Keyring | None, note: Callable[[str], None]) -> None:
-        self._endpoint, self._front = endpoint, Front(endpoint, keyring, None, note)
-        check_port_free(endpoint)
+    def __init__(
+        self, endpoint: Endpoint, keyring: Keyring | None, people: str | None, note: Callable[[str], None]
+    ) -> None:
+        self._endpoint, self._front = endpoint, Front(endpoint, keyring, people, note)
+        check_port_free(endpoint, "page.port")
         self._documents, self._page = Documents(), document("index.html")
         self._vehicles: dict[str, Listed] = {}
         self._lists, self._relayed = set[web.WebSocketResponse](), set[asyncio.Transport]()  # that are open
@@ -125,11 +128,13 @@ class FleetServer:
         vehicle = self._vehicle(request)
         if vehicle.socket is None:
             raise web.HTTPServiceUnavailable(text=f"{vehicle.fault}\n")
-        transport = request.transport
+        transport, whose = request.transport, self._front.access.visitor(request)
         assert isinstance(transport, asyncio.Transport)
+        if whose is None:  # since it was checked
+            raise web.HTTPUnauthorized(text="login required: see /login\n")
         self._relayed.add(transport)
         try:
-            return await relay(request, vehicle.socket, lambda: self._front.access.visitor(request) is not None)
+            return await relay(request, vehicle.socket, whose, lambda: self._front.access.visitor(request))
         finally:
             self._relayed.discard(transport)
 
@@ -145,10 +150,12 @@ class FleetServer:
         await ws.prepare(request)
         self._lists.add(ws)
         try:
-            while not ws.closed and self._front.access.visitor(request) is not None:
-                await ws.send_json({"vehicles": self.rows()})
+            while not ws.closed and (visitor := self._front.access.visitor(request)) is not None:
+                await ws.send_json({"vehicles": self.rows(), "may_drive": visitor.may_drive})
                 with suppress(TimeoutError):
-                    await self._on_message(await ws.receive(LIST_S))
+                    message = await ws.receive(LIST_S)
+                    if visitor.may_drive:
+                        await self._on_message(message)
             await ws.close()
         finally:
             self._lists.discard(ws)

@@ -35,8 +35,18 @@ class Visitor(NamedTuple):
     def may_drive(self) -> bool:
         return self.role is not Role.WATCHER
 
+    def words(self) -> str:
+        """As a relay states it to a station, which `of` reads."""
+        return f"{self.role} {self.name}"
+
+    @staticmethod
+    def of(words: str) -> Visitor:
+        role, _, name = words.partition(" ")
+        return Visitor(name, Role(role))
+
 
 OPERATOR = Visitor("", Role.CONTROLLER)
+RELAYED = "Tod-Visitor"  # header of a request that the page of several vehicles passes on: whose it is
 
 
 def people_of(

@@ -10,6 +10,7 @@ from socket import SO_SNDBUF, SOL_SOCKET
 from aiohttp import ClientSession, UnixConnector, web
 
 from runner.page.connections import abort
+from runner.page.login import RELAYED, Visitor
 
 RETRY_S = 0.1  # a station may be starting
 PATIENCE_S = 3.0  # for its start; the page connects again
@@ -24,9 +25,13 @@ def station_session(socket: Path) -> ClientSession:
     return ClientSession(connector=UnixConnector(str(socket)))
 
 
-async def relay(request: web.Request, socket: Path, is_granted: Callable[[], bool]) -> web.Response:
+async def relay(
+    request: web.Request, socket: Path, whose: Visitor, visitor: Callable[[], Visitor | None]
+) -> web.Response:
     """Relay until either side ends, or access does.
 
+    whose    who asks
+    visitor  returns who has access by this request now; None: nobody
     raises  HTTPServiceUnavailable if the station does not run
     """
     browser = request.transport
@@ -37,10 +42,12 @@ async def relay(request: web.Request, socket: Path, is_granted: Callable[[], boo
         connection.setsockopt(SOL_SOCKET, SO_SNDBUF, SEND_BUFFER_BYTES)
     to_browser.other, to_station.other = browser, station
     browser.set_protocol(to_station)  # the station answers the handshake
-    station.write(_handshake(request))
+    station.write(_handshake(request, whose))
     try:
         ended = {asyncio.create_task(end.ended.wait()) for end in (to_browser, to_station)}
-        while is_granted() and not (await asyncio.wait(ended, timeout=ACCESS_S, return_when="FIRST_COMPLETED"))[0]:
+        while (
+            visitor() == whose and not (await asyncio.wait(ended, timeout=ACCESS_S, return_when="FIRST_COMPLETED"))[0]
+        ):
             pass
     finally:
         for task in ended:
@@ -95,9 +102,9 @@ async def _connected(socket: Path, protocol: _End, browser: asyncio.Transport) -
     raise web.HTTPServiceUnavailable(text="the station of this vehicle is not running\n")
 
 
-def _handshake(request: web.Request) -> bytes:
+def _handshake(request: web.Request, visitor: Visitor) -> bytes:
     """The browser's request, as the station gets it."""
     given = [(name, request.headers[name]) for name in HANDSHAKE if name in request.headers]
-    headers = [("Host", "station"), *given]
+    headers = [("Host", "station"), (RELAYED, visitor.words()), *given]
     lines = [f"GET /live?{request.rel_url.raw_query_string} HTTP/1.1", *(f"{name}: {value}" for name, value in headers)]
     return "\r\n".join([*lines, "", ""]).encode("utf-8", "surrogateescape")

@@ -93,7 +93,7 @@ class Windows:
 
     def _state_shown(self) -> None:
         shown = {camera for viewer in self._viewers for camera in viewer.cameras}
-        self._on_shown(shown, not all(viewer.monitor for viewer in self._viewers))
+        self._on_shown(shown, any(not viewer.monitor and viewer.visitor.may_drive for viewer in self._viewers))
 
     def _attention(self) -> Attention | None:
         driving = [viewer for viewer in self._viewers if self.holder_for(viewer) == "you"]

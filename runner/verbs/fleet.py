@@ -110,7 +110,7 @@ def run(arguments: Arguments) -> int:
     duration = arguments.number("duration_s")
     with signals.stopping(END_S) as stop, ExitStack() as stack:
         directory = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tod-runner-")))
-        page = FleetServer(setup.page.endpoint, page_keyring(setup), say)
+        page = FleetServer(setup.page.endpoint, page_keyring(setup), setup.page.people, say)
         page.start()
         stack.callback(page.stop)
         if setup.control.embedded:

@@ -26,17 +26,19 @@ class Programs:
 
     words  of all of them
     log    directory of their output
+    keys   directory of the keys of the broker, the vehicles and alice, whose page is served by HTTPS; None: none
     """
 
-    def __init__(self, log: Path, words: Sequence[str] = SOURCE) -> None:
+    def __init__(self, log: Path, words: Sequence[str] = SOURCE, keys: Path | None = None) -> None:
         self.control, self.page = free_port(), free_port()
         self.words = (*words, f"control.port={self.control}")
         self.media = {name: free_port() for name in NAMES}
-        self._log, self._stack = log, ExitStack()
+        self._log, self._stack, self._keys = log, ExitStack(), keys
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
 
     def __enter__(self) -> Programs:
-        self._stack.enter_context(private_broker(Endpoint("127.0.0.1", self.control)))
+        own = self._keys and self._keys / "broker"
+        self._stack.enter_context(private_broker(Endpoint("127.0.0.1", self.control), own))
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -49,12 +51,14 @@ class Programs:
         return [f"name={name}", f"media.port={self.media[name]}", f"media.rtp_ports=[{first},{first + 199}]"]
 
     def vehicle(self, name: str, *words: str) -> None:
-        self.start(name, "vehicle", *self.of(name), *words)
+        keys = (f"keys={self._keys / name}",) if self._keys else ()
+        self.start(name, "vehicle", *self.of(name), *keys, *words)
 
-    def station(self, vehicles: str) -> None:
+    def station(self, vehicles: str, *words: str) -> None:
         of_vehicle = ("vehicle=", *(() if vehicles.endswith(".yaml") else ("cameras.", "~cameras.")))
         common = [word for word in self.words if not word.startswith(of_vehicle)]
-        self._run("station", "operator", *common, f"vehicles={vehicles}", f"page.port={self.page}")
+        keys = (f"keys={self._keys / 'alice'}", "page.host=0.0.0.0") if self._keys else ()
+        self._run("station", "operator", *common, f"vehicles={vehicles}", f"page.port={self.page}", *keys, *words)
 
     def end(self, *names: str) -> None:
         """End some of them."""

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import signal
-from contextlib import ExitStack
+from contextlib import AsyncExitStack, ExitStack
 
 import pytest
+from aiohttp import WSMsgType
 from fleet_rig import NAMES, Programs, await_page, card, leave, moving, pids_of, three
+from visitors import browsing
 
 from browser import shot, visit
 from rig import needs_browser, until
+from runner.core.roles import Role
 from runner.mqtt.link import ControlLink
 from runner.mqtt.messages import topic
+from runner.security.authority import Authority
+from runner.security.keyring import AUTHORITY, TOKEN
+from runner.security.page_people import change_people
 from runner.settings import Endpoint
 
 
@@ -113,7 +120,7 @@ def test_opening_a_vehicle_drives_it_and_switching_ends_its_pictures(fleet, page
     until(lambda: heard.encoding("courier-3") == {"front"})
     left = card(page, "courier-1")
     until(lambda: "You drive" in left.inner_text(), every_s=0.1)  # leaving a page releases nothing
-    until(lambda: "your page is closed" in left.inner_text(), every_s=0.1)
+    until(lambda: "the driver's page is closed" in left.inner_text(), every_s=0.1)
     left.locator("button.release").click()
     until(lambda: heard.driver("courier-1") is None)
     until(lambda: "Nobody drives" in left.inner_text(), every_s=0.1)
@@ -174,3 +181,77 @@ def test_all_vehicles_that_the_broker_knows_are_listed(tmp_path, chromium):
             assert "● online" in card(page, "delivery_robot").inner_text()
             until(lambda: card(page, "courier-1").count(), 60, 0.1)
             assert "no station: " in card(page, "courier-1").inner_text()
+
+
+def test_with_keys_people_open_the_list_and_watch_and_only_the_operator_drives(tmp_path):
+    authority, keys = Authority(tmp_path / "keys"), tmp_path / "keys"
+    with authority.opened():
+        for name, role in {"broker": Role.BROKER, **dict.fromkeys(NAMES, Role.VEHICLE)}.items():
+            authority.issue(name, role, [])
+        authority.issue("alice", Role.CONTROLLER, ["127.0.0.1"])
+    people = change_people(tmp_path / "people", {"dave": Role.WATCHER})
+    with Programs(tmp_path, keys=keys) as programs:
+        for name in NAMES[:2]:
+            programs.vehicle(name)
+        programs.station(programs.file(), f"page.people={tmp_path / 'people'}")
+        await_page(programs)
+        url, own = f"https://127.0.0.1:{programs.page}", keys / "alice"
+        asyncio.run(_watched(url, own / AUTHORITY, people["dave"].token.decode()))
+        asyncio.run(_driven(url, own / AUTHORITY, (own / TOKEN).read_text().strip()))
+
+
+async def _watched(url, ca, token):
+    async with asyncio.timeout(120), browsing(url, ca, token) as (session, origin):
+        shown = await session.ws_connect(f"{url}/list", origin=origin)
+        document = await _list(shown, lambda rows: [_online(row) for row in rows] == [True, True, False])
+        assert not document["may_drive"]
+        live = f"{url}/vehicle/courier-1/live?viewer=w"
+        async with session.ws_connect(live, origin=origin, max_msg_size=0) as page:
+            assert (await _message(page, "hello"))["visitor"] == {"name": "dave", "may_drive": False}
+            await page.send_json({"id": "1", "event": "stop_requested"})
+            assert (await _message(page, "reply"))["reason"] == "dave may only watch"
+            while (await page.receive()).type is not WSMsgType.BINARY:  # a picture
+                pass
+            document = await _list(shown, lambda rows: rows[0]["summary"]["received"])
+            assert document["vehicles"][0]["summary"]["control"] == "free", "who looks on does not drive"
+
+
+async def _driven(url, ca, token):
+    async with asyncio.timeout(120), browsing(url, ca, token) as (session, origin):
+        shown = await session.ws_connect(f"{url}/list", origin=origin)
+        async with asyncio.TaskGroup() as group, AsyncExitStack() as pages:
+            for name in NAMES[:2]:
+                live = f"{url}/vehicle/{name}/live?viewer=d"
+                page = await pages.enter_async_context(session.ws_connect(live, origin=origin, max_msg_size=0))
+                group.create_task(_read(page))
+            document = await _list(shown, lambda rows: [_holder(row) for row in rows] == ["alice", "alice", None])
+            assert document["may_drive"]
+        await shown.send_str("courier-2")
+        await _list(shown, lambda rows: "the vehicle must stand" in rows[1]["answer"])
+
+
+def _online(row):
+    return bool(row["summary"] and row["summary"]["online"])
+
+
+def _holder(row):
+    return row["summary"] and row["summary"]["holder"]
+
+
+async def _read(page):
+    async for _ in page:
+        pass
+
+
+async def _list(shown, is_right):
+    while not is_right((document := json.loads(await shown.receive_str()))["vehicles"]):
+        pass
+    return document
+
+
+async def _message(page, kind):
+    """The next of a kind."""
+    while True:
+        message = await page.receive()
+        if message.type is WSMsgType.TEXT and (document := json.loads(message.data))["kind"] == kind:
+            return document

@@ -44,6 +44,16 @@ Take = Callable[[float, float], object]
 @asynccontextmanager
 async def logged_in(url: str, ca: Path, token: str, viewer: str) -> AsyncIterator[aiohttp.ClientWebSocketResponse]:
     """The connection of a page that has logged in."""
+    async with (
+        browsing(url, ca, token) as (session, origin),
+        session.ws_connect(f"{origin}/live?viewer={viewer}", origin=origin, max_msg_size=0) as page,
+    ):
+        yield page
+
+
+@asynccontextmanager
+async def browsing(url: str, ca: Path, token: str) -> AsyncIterator[tuple[aiohttp.ClientSession, str]]:
+    """A browser that has logged in, and the origin of its WebSockets."""
     tls, own = ssl.create_default_context(cafile=ca), url.rstrip("/")
     jar = aiohttp.CookieJar(unsafe=True)  # of an address, not a name
     async with aiohttp.ClientSession(cookie_jar=jar, connector=aiohttp.TCPConnector(ssl=tls)) as session:
@@ -54,8 +64,7 @@ async def logged_in(url: str, ca: Path, token: str, viewer: str) -> AsyncIterato
         told = json.dumps({"challenge": challenge, "answer": answer})
         async with session.post(f"{own}/login", data=told, headers=origin) as response:
             assert response.status == 200, await response.text()
-        async with session.ws_connect(f"{own}/live?viewer={viewer}", origin=own, max_msg_size=0) as page:
-            yield page
+        yield session, own
 
 
 class Seen(NamedTuple):

@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-import { alarmsOf, driverOf, figuresOf, isHeldHere, pictureOf, stateOf } from "../../runner/page/static/vehicle_words.js";
+import { alarmsOf, driverOf, figuresOf, isHeldHere, pictureOf, stateOf, toWatcher } from "../../runner/page/static/vehicle_words.js";
 
 const ONLINE = {
   online: true, fault: null, mode: "automatic", control: "free", holder: null, held_s: 0, offered: null, requested: [], is_own: false,
@@ -29,6 +29,7 @@ test("who drives is the vehicle's word", () => {
   assert.equal(text({ control: "lost", holder: "alice", held_s: 3 }), "✕ alice was in control: LOST for 3 s");
   assert.equal(driverOf(row({ control: "lost", holder: "me", is_own: true })).level, "late");
   assert.equal(text({ online: false }), "–");
+  assert.equal(driverOf(toWatcher(row({ control: "held", holder: "alice", is_own: true, held_s: 3 }))).text, "alice drives, for 3 s");
   assert.deepEqual([row({ control: "held", is_own: true }), row({ control: "lost", is_own: true }), row({ control: "held" })].map(isHeldHere), [true, false, false]);
 });
 

@@ -76,6 +76,9 @@ function linkWords({ received, actual_kbps, allocated_kbps, believed_kbps }) {
 export const alarmsOf = ({ summary, answer }) =>
   [...(summary?.alarms ?? []), ...(answer ? [`control was not released: ${answer}`] : [])];
 
+/** A row as it is to somebody who only watches at this station, and is not its operator. @param {Row} row @returns {Row} */
+export const toWatcher = (row) => ({ ...row, summary: row.summary && { ...row.summary, is_own: false }, answer: "" });
+
 /** Whether control can be released here. @param {Row} row */
 export const isHeldHere = ({ summary }) => Boolean(summary?.online && summary.is_own && summary.control === "held");
 

@@ -1,7 +1,7 @@
 /** The vehicles of this station, each as a card: on the page that lists them, and beside the pictures of one of them. */
 
 import { make, setAttribute, setText } from "./format.js";
-import { alarmsOf, driverOf, figuresOf, isHeldHere, pictureOf, stateOf } from "./vehicle_words.js";
+import { alarmsOf, driverOf, figuresOf, isHeldHere, pictureOf, stateOf, toWatcher } from "./vehicle_words.js";
 
 const AGAIN_MS = 1000; // between two attempts to connect
 const SILENT_MS = 3000; // the server sends four lists a second
@@ -123,7 +123,8 @@ function follow(onList) {
     const own = new WebSocket(url);
     own.onmessage = ({ data }) => {
       heard = performance.now();
-      onList(JSON.parse(data).vehicles);
+      const { vehicles, may_drive } = JSON.parse(data);
+      onList(may_drive ? vehicles : vehicles.map(toWatcher));
     };
     own.onclose = () => own === socket && again();
     return own;
