@@ -98,7 +98,7 @@ class PageServer(Listener):
             vehicle, self._layouts, self._call_soon, lambda stated: self._windows.broadcast("layout", stated)
         )
         if socket is None:
-            check_port_free(setup.page.endpoint)
+            check_port_free(setup.page.endpoint, "page.port")
         self._documents = Documents()
         self._index = {name: number for number, name in enumerate(vehicle.cameras)}
         self._recent = [_recent(camera) for camera in vehicle.cameras.values()]

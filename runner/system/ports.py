@@ -14,9 +14,13 @@ def ip_address_of(host: str) -> str:
     return str(found[0][1])
 
 
-def check_port_free(endpoint: Endpoint) -> None:
-    """raises RunError if another process already listens there, or the address is not one of this machine"""
-    with os_errors_as(lambda why: RunError(f"cannot listen on {endpoint}: {why}; choose another port")):
+def check_port_free(endpoint: Endpoint, key: str = "port") -> None:
+    """Check that this process could listen there.
+
+    key     of the configuration that states the port
+    raises  RunError if another process already listens there, or the address is not one of this machine
+    """
+    with os_errors_as(lambda why: RunError(f"cannot listen on {endpoint}: {why}; choose another {key}")):
         address = ip_address_of(endpoint.host)
         with socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -155,13 +155,14 @@ function refresh() {
   for (const [words, group, first] of GROUPS) {
     setText(byId(words), isKnown ? driverText() : "");
     setAttribute(byId(words), "data-holder", LEVELS[who()] ?? "nobody");
+    setAttribute(byId(words), "title", now.own && `you are operator ${now.own}`);
     showButtons(group, usual, choices[0], first);
   }
   const stop = stopWords(now.driving, now.own, timeOf(store.state?.stop_since));
   const words = [stop, store.view === "monitor" ? "" : handOverWords(now)].filter(Boolean);
   const text = isKnown ? words.join(". ") : "";
   byId("hand-over").hidden = !text;
-  setAttribute(byId("hand-over"), "data-stop", stop && "true");
+  setAttribute(byId("hand-over"), "data-stop", stop ? "true" : null);
   setText(byId("hand-over-words"), text);
   showButtons("answers", choices.filter(({ isAnswer }) => isAnswer), choices[0], "answer");
 }
@@ -184,9 +185,9 @@ function showButtons(group, choices, keyed, id) {
   made.set(group, now);
   const focused = [...byId(group).children].findIndex((button) => button === document.activeElement);
   const buttons = choices.map((choice, i) => {
-    const { text, why = null } = choice;
+    const { text, why = null, hint = text } = choice;
     return make("button", {
-      id: i === 0 && id, class: isMain(choice) && "strong", title: why ?? (choice === keyed ? withKey(text, "control") : text),
+      id: i === 0 && id, class: isMain(choice) && "strong", title: why ?? (choice === keyed ? withKey(hint, "control") : hint),
       "aria-disabled": why && "true", "data-pending": requested === text.toLowerCase(), onclick: () => choose(choice),
     }, choice === keyed && choice.isAnswer ? withKey(text, "control") : text);
   });

@@ -23,6 +23,7 @@
  * @property {string} text of the button
  * @property {string|null} [why] it cannot be pressed now
  * @property {boolean} [isAnswer] whether it answers what an operator has asked or offered
+ * @property {string} [hint] what it does, in more words
  * @property {"page"|"operator"} [from] from whom control is taken without asking; its person has to confirm
  * @property {string[]} [takers] operators to choose from
  * @property {Record<string, any>} [event] to request of the vehicle; without one, this page is to act for its station
@@ -156,7 +157,8 @@ function whileWatching({ driving, own }) {
   let ask = { text: "Request control", event: { event: "control_requested" } };
   if (asks) ask = { text: "Withdraw request", isAnswer: true, event: RELEASED };
   if (driving?.present[own] !== "supervisor") return [ask];
-  return [ask, { text: "Take control", from: "operator", event: { event: "control_taken" } }];
+  const hint = "take control without asking, as a supervisor; the next window asks whether you are sure";
+  return [ask, { text: "Take control", hint, from: "operator", event: { event: "control_taken" } }];
 }
 
 const LIVE_MS = 1000; // a picture has to be live for this long before its driver takes over
