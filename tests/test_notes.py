@@ -52,6 +52,7 @@ PREDICTED = "bitrate_predicted kbps 900"
 LOW = "500 of 4000 kbit/s, range [0, 800) -> 0.25"
 RATE = "0.5 of 4.0 Mbit/s"
 STALE = "no prediction for 2 s"
+LIMIT = "total 900 -> 400: capacity of the link, believed to be 440"
 
 
 @pytest.mark.parametrize(
@@ -83,6 +84,10 @@ STALE = "no prediction for 2 s"
         (
             state(PREDICTED, rear=camera(0.375, kbps=99, demand_kbps=2000.5, reason=f"99 of 2000; {STALE}")),
             f"Prediction 900 kbit/s: rear smaller, at 3/8 size (99 of 2000 kbit/s; {STALE})",
+        ),
+        (
+            state("link_measured kbps 400", rear=camera(0.25, reason=f"500 of 4000 kbit/s; {LIMIT}")),
+            f"Link measured: rear smaller, at quarter size ({RATE}; capacity of the link, believed to be 440 kbit/s)",
         ),
         (
             state("source_reported camera rear works False", rear=camera(None, on=True, reason="lost: no /dev/video0")),

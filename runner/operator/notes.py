@@ -102,7 +102,7 @@ def decision_note(before: VehicleState, state: VehicleState) -> str | None:
         return None if before.mode == state.mode else f"{cause}: total {state.total_words} kbit/s{kept}"
     # Each has the camera's own reason first, then those of the whole decision.
     common = [cameras[name].reason.split("; ")[1:] for name in changed]
-    shared = [part for part in common[0] if all(part in parts for parts in common)]
+    shared = [_limit_words(part) for part in common[0] if all(part in parts for parts in common)]
     what = f"{len(changed)} of {len(cameras)} cameras, total {state.total_words} kbit/s"
     if len(changed) == 1:
         what = _rate(cameras[next(iter(changed))])
@@ -186,6 +186,12 @@ def size_words(factor: float) -> str:
     exact = Fraction(factor).limit_denominator(16)
     name = NAMED_SIZES.get(exact, str(exact))
     return f"{name} size" if exact == factor else f"{factor:.2g} of full size"
+
+
+def _limit_words(part: str) -> str:
+    """What limits the total, without the totals: total 3000 -> 1690: capacity of the link, believed to be 1690."""
+    words = part.partition(": ")[2] if part.startswith("total ") else part
+    return f"{words} kbit/s" if words[-1:].isdigit() else words
 
 
 def _rate(camera: CameraState) -> str:

@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-import { percent, rateWords, reasonWords, regionWords, sizeWords } from "../../runner/page/static/reasons.js";
+import { limitWords, percent, rateWords, reasonWords, regionWords, sizeWords } from "../../runner/page/static/reasons.js";
 
 const FULL = { width: 1920, height: 1040 };
 const CAMERA = /** @type {any} */ ({
@@ -55,4 +55,9 @@ test("a region of interest says what it costs", () => {
   assert.equal(regionWords(camera, true, FULL, "Full image (f)"), `${begin} Its bitrate stays as it is. Full image (f) ends this.`);
   const automatic = `${begin} It gets no sharper: the camera asks for 25 % of its bitrate. Full image (f) ends this.`;
   assert.equal(regionWords(camera, false, FULL, "Full image (f)"), automatic);
+});
+
+test("what limits the total is said without the totals, and with a unit", () => {
+  assert.equal(limitWords("total 3000 -> 1690: capacity of the link, believed to be 1690"), "capacity of the link, believed to be 1690 kbit/s");
+  assert.equal(limitWords("total 3000 -> 1500: nothing has arrived for 2.1 s"), "nothing has arrived for 2.1 s");
 });

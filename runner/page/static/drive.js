@@ -14,6 +14,7 @@ import { soundFault } from "./sound.js";
 import { SHAPES, showLines } from "./tiles.js";
 import { headingText } from "./track.js";
 import { fitPanels } from "./panels.js";
+import { limitWords } from "./reasons.js";
 import { limitReasons, pauseReason } from "./total.js";
 import { copiesWords, ofWords, totalsOf } from "./totals.js";
 import { showUplinks, uplinkLines } from "./uplinks.js";
@@ -114,7 +115,7 @@ function linkWords() {
   if (fault) return fault;
   const [pause, reason] = [pauseReason(), limitReasons().at(-1)];
   if (pause) return pause;
-  return reason ? `limited: ${reason.slice(reason.indexOf(": ") + 2)}` : "connected";
+  return reason ? `limited: ${limitWords(reason)}` : "connected";
 }
 
 /** The pictures that are not live, in monitors as well; of the page's own, in the Configure view, those that the enlarged one hides. */

@@ -18,6 +18,15 @@ export function rateWords(kbps, most) {
   return `${(kbps / 1000).toFixed(1)} of ${(most / 1000).toFixed(1)} Mbit/s`;
 }
 
+/**
+ * What limits the total, without the totals: "total 3000 -> 1690: capacity of the link, believed to be 1690".
+ * @param {string} reason
+ */
+export function limitWords(reason) {
+  const words = reason.slice(reason.indexOf(": ") + 2);
+  return /\d$/.test(words) ? `${words} kbit/s` : words;
+}
+
 /** How much of its image a camera sends, 0 to 1. @param {import("./framing.js").Size} roi  @param {import("./framing.js").Size} full */
 export const shareOf = (roi, full) => (roi.width * roi.height) / (full.width * full.height);
 

@@ -4,6 +4,7 @@ import { inControl, listen, mode, store } from "./store.js";
 import { pending, request, showProblem, whyNoControl } from "./requests.js";
 import { makeSlider } from "./slider.js";
 import { believedWords, furtherReasons } from "./believed.js";
+import { limitWords } from "./reasons.js";
 import { copiesWords, ofWords, sliderValue, totalsOf } from "./totals.js";
 import { showUplinks, uplinkLines } from "./uplinks.js";
 import { byId, make, setText, whole } from "./format.js";
@@ -63,7 +64,7 @@ function refresh() {
   const unlimited = mode() === "automatic" && (words || lines.length) ? "" : reason ?? "shared among the cameras by demand and weight";
   const reasons = limitReasons();
   const limit = lines.length ? "limited by the uplinks" : "limited by a rule";
-  show(why, !ofWords(totals) ? unlimited : reasons.length ? furtherReasons(reasons, words).join("; ") : limit);
+  show(why, !ofWords(totals) ? unlimited : reasons.length ? furtherReasons(reasons, words).map(limitWords).join("; ") : limit);
   show(believed, words);
   showUplinks(uplinks, lines);
   slider.update({ value: sliderValue(totals, mode()), inForce: totals?.total, max: maxTotal(), why: reason });
