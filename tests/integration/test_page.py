@@ -180,6 +180,18 @@ def test_eight_pictures_move(page):
     shot(page, "automatic")
 
 
+def test_a_page_that_opens_shows_no_alarm_in_its_first_seconds(chromium, demo):
+    with opened(chromium, demo) as page:
+        all_live(page)
+        log = page.evaluate("tod.measure()")["status_log"]
+        for camera in SIZES:
+            marks = [(ms, mark) for ms, name, mark in log if name == camera]
+            (began, first), live = marks[0], next(ms for ms, mark in marks if mark == "live")
+            assert first == "synchronising"
+            alarms = [(ms, mark) for ms, mark in marks if ms < live and mark in ("late", "damaged", "frozen")]
+            assert all(ms - began >= 2900 for ms, _ in alarms), marks  # a machine may be that busy
+
+
 def test_single_a_dragged_region_changes_the_received_picture(page):
     choose(page, "single")
     tile = page.locator("[data-camera=front_center] canvas[role=img]").bounding_box()
