@@ -246,6 +246,22 @@ def overlap(a, b):
     return all(a[at] < b[at] + b[of] - 1 and b[at] < a[at] + a[of] - 1 for at, of in (("x", "width"), ("y", "height")))
 
 
+AXE = rig.CHECKOUT / "node_modules" / "axe-core" / "axe.min.js"
+needs_axe = pytest.mark.skipif(not AXE.exists(), reason="needs axe-core: npm ci")
+SERIOUS = """async () => {
+  const { violations } = await axe.run(document);
+  const serious = violations.filter(({ impact }) => ["serious", "critical"].includes(impact));
+  return serious.flatMap(({ id, help, nodes }) => nodes.map(({ html }) => `${id}: ${help}: ${html.slice(0, 150)}`));
+}"""
+
+
+def barriers(page):
+    """What axe-core finds on a page that keeps people with a disability from using it."""
+    if not page.evaluate("'axe' in globalThis"):
+        page.evaluate(f"() => {{ {AXE.read_text()} }}")  # the page itself may load no other script
+    return page.evaluate(SERIOUS)
+
+
 SCREENS = ((1280, 720), (1920, 1080), (2560, 1440), (3840, 2160), (1024, 768))
 
 
