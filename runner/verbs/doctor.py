@@ -338,4 +338,6 @@ def _cores(vehicle: Vehicle) -> Diagnosis:
     load_mpx = sum(float(camera.fps) * camera.width * camera.height for camera in vehicle.cameras.values()) / 1e6
     cores = os.cpu_count() or 1
     need = load_mpx / CORE_MPX_S
-    return Diagnosis(True, f"{cores} cores; sending all cameras takes about {need:.1f} of them, receiving needs more")
+    return Diagnosis(
+        True, f"{cores} cores; sending all cameras at their own rates takes about {need:.1f} of them, receiving more"
+    )
