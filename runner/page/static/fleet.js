@@ -3,12 +3,30 @@
 import { startTheme } from "./theme.js";
 import { startVehicles } from "./vehicles.js";
 import { byId, setAttribute, setText } from "./format.js";
+import { OtherAlarms } from "./other_alarms.js";
+import { isBlocked, isMuted, play, setMuted, unlock } from "./tones.js";
 import { alarmsOf, stateOf } from "./vehicle_words.js";
 
 const LOST = "✕ NO CONNECTION TO THE STATION: this list is old; reconnecting";
 
+const alarms = new OtherAlarms();
+
+/** A press that allows sound does not mute it as well. */
+function toggleSound() {
+  if (isMuted() || !isBlocked()) setMuted(!isMuted());
+  unlock(refreshSound);
+  refreshSound();
+}
+
+function refreshSound() {
+  setText(byId("sound"), isMuted() ? "Unmute" : isBlocked() ? "Allow sound" : "Mute");
+  byId("sound").title = "Tones for alarms of vehicles that you drive or watch";
+}
+
 /** @param {import("./vehicle_words.js").Row[]|null} rows */
 function onRows(rows) {
+  const tone = rows && alarms.update(rows, null, performance.now()).tone;
+  if (tone) play(tone);
   byId("banner").hidden = rows !== null;
   setText(byId("banner"), rows ? "" : LOST);
   const online = (rows ?? []).filter(({ summary }) => summary?.online).length;
@@ -21,4 +39,7 @@ function onRows(rows) {
 }
 
 startTheme();
+byId("sound").addEventListener("click", toggleSound);
+addEventListener("storage", refreshSound); // muted in another window
+refreshSound();
 startVehicles(byId("fleet"), { current: null, mayLeave: () => true, onRows });

@@ -20,10 +20,11 @@ function refresh() {
   setText(latest, newest ? `${clockTime(newest.time)}  ${newest.text}` : "no events yet");
 }
 
-function showToast({ text, level }) {
+/** @param {{text: string, level: string, of?: string}} toast of: another vehicle that it is about */
+function showToast({ text, level, of }) {
   [...toasts.children].find((each) => each.getAttribute("data-text") === text)?.remove();
   const shape = level === "problem" ? "✕ " : "";
-  const element = make("div", { class: "toast", "data-level": level, "data-text": text }, make("span", {}, shape + text));
+  const element = make("div", { class: "toast", "data-level": level, "data-text": text }, make("span", { "data-of": of }, shape + text));
   element.append(make("button", { "aria-label": "close", onclick: () => element.remove() }, "×"));
   toasts.append(element);
   while (toasts.children.length > MAX_TOASTS) toasts.firstChild?.remove();

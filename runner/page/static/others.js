@@ -1,9 +1,10 @@
 /** The other vehicles of this station, beside the pictures of this one; there are none on a station for one vehicle. */
 
-import { inControl, store } from "./store.js";
+import { inControl, publish, store } from "./store.js";
 import { showProblem } from "./requests.js";
 import { byId } from "./format.js";
 import { startVehicles } from "./vehicles.js";
+import { OtherAlarms } from "./other_alarms.js";
 
 const STANDING_MPS = 0.3;
 const AGAIN_MS = 3000; // within which a second press counts
@@ -21,6 +22,12 @@ function mayLeave(name) {
   return false;
 }
 
+/** @param {ReturnType<OtherAlarms["update"]>} alarms */
+function tell({ tone, news }) {
+  for (const { name, text } of news) publish("toast", { text, level: "problem", of: name });
+  publish("other", tone);
+}
+
 export function startOthers() {
   const current = location.pathname.match(/^\/vehicle\/([^/]+)\/$/)?.[1];
   if (!current) return;
@@ -30,5 +37,6 @@ export function startOthers() {
   Object.assign(list, { href: "/", textContent: "All vehicles", className: "all" });
   list.addEventListener("click", (event) => mayLeave("the list") || event.preventDefault());
   element.append(list);
-  startVehicles(element, { current, mayLeave });
+  const alarms = new OtherAlarms();
+  startVehicles(element, { current, mayLeave, onRows: (rows) => rows && tell(alarms.update(rows, current, performance.now())) });
 }

@@ -6,40 +6,27 @@
 import { alertStatus, listen, publish, store, who } from "./store.js";
 import { Alarm, worstKind } from "./alarm.js";
 import { monitored } from "./monitored.js";
+import { isBlocked, isMuted, isOfMuting, play, setMuted, unlock } from "./tones.js";
 import { withKey } from "./hints.js";
 import { byId, setAttribute, setText } from "./format.js";
 
-const KEY = "tod-muted";
-/** Hz, one after the other */
-const TONES = { lost: [880, 587, 880, 587], late: [659], asked: [784, 784], passed: [523, 784, 1047], stop: [988, 988, 988] };
-const TONE_S = 0.15;
-const VOLUME = 0.3;
 const CHECK_MS = 250;
 
 const alarm = new Alarm();
 const buttons = ["sound", "sound-configure"].map((id) => byId(id));
-/** @type {AudioContext|null} */
-let context = null;
 let wasBlocked = true; // whether the browser blocked sound when the last press began
 let isDriving = false; // whether this page has control; kept while a connection is lost, when tones matter most
 
-const isMuted = () => localStorage.getItem(KEY) === "yes";
-
-/** Create or resume the audio context if needed; it stays blocked until a click or key press. */
-function unlock() {
-  if (!isDriving && store.holder !== "you") return; // its person may be offered control
-  if (!context) {
-    context = new AudioContext();
-    context.onstatechange = onAudioState;
-  }
-  if (context.state !== "running") context.resume().catch(() => refresh());
+/** To be called with each press: whoever acts for the station may be offered control. */
+function allow() {
+  if (isDriving || store.holder === "you") unlock(onAudioState);
 }
 
 /** @param {Event} event */
 function onPress(event) {
   if (event instanceof KeyboardEvent && event.repeat) return;
-  wasBlocked = context?.state !== "running";
-  unlock();
+  wasBlocked = isBlocked();
+  allow();
 }
 
 function onAudioState() {
@@ -48,18 +35,7 @@ function onAudioState() {
   refresh();
 }
 
-function play(kind) {
-  if (isMuted() || context?.state !== "running") return;
-  for (const [i, frequency] of TONES[kind].entries()) {
-    const from = context.currentTime + i * TONE_S;
-    const oscillator = new OscillatorNode(context, { type: "square", frequency });
-    oscillator.connect(new GainNode(context, { gain: VOLUME })).connect(context.destination);
-    oscillator.start(from);
-    oscillator.stop(from + 0.8 * TONE_S);
-  }
-}
-
-/** @param {keyof typeof TONES|null} kind */
+/** @param {import("./tones.js").Kind|null} kind */
 function sound(kind) {
   if (!kind) return;
   publish("alarm", kind);
@@ -82,20 +58,18 @@ function onStatus(picture, camera, status) {
 function onControl() {
   const before = isDriving;
   isDriving = who() === "you" || (isDriving && ["unknown", "unheard"].includes(who()));
-  unlock();
+  allow();
   if (isDriving && !before) soundCurrent();
   refresh();
 }
 
 /** Mute or unmute; a press that resumes blocked sound does not mute it as well. */
 export function toggleSound() {
-  if (isDriving && !isMuted() && context?.state !== "running") return;
-  localStorage.setItem(KEY, isMuted() ? "no" : "yes");
+  if (isDriving && !isMuted() && isBlocked()) return;
+  setMuted(!isMuted());
   if (!isMuted()) soundCurrent();
   refresh();
 }
-
-const isBlocked = () => context?.state !== "running";
 
 /** Why this page's driver hears no tones; "": they are heard. */
 export const soundFault = () => (!isDriving ? "" : isMuted() ? "✕ tones muted" : isBlocked() ? "✕ tones blocked" : "");
@@ -115,8 +89,8 @@ function refresh() {
 }
 
 /** Say on a monitor what its key has changed on its page. @param {StorageEvent} event */
-function showMuted({ key }) {
-  if (key === KEY) publish("toast", { text: `alarm tones of the page ${isMuted() ? "muted" : "on"}`, level: "hint" });
+function showMuted(event) {
+  if (isOfMuting(event)) publish("toast", { text: `alarm tones of the page ${isMuted() ? "muted" : "on"}`, level: "hint" });
 }
 
 export function startSound() {
@@ -131,6 +105,7 @@ export function startSound() {
   listen("deposed unseen unplugged", () => sound("lost"));
   listen("passed", () => sound("passed"));
   listen("asked", () => sound("asked"));
+  listen("other", sound);
   listen("stopping", () => store.holder === "you" && sound("stop"));
   addEventListener("storage", refresh); // muted in another window
   setInterval(() => {
