@@ -13,7 +13,7 @@ from aiohttp import WSMsgType
 from fleet_rig import NAMES, Programs, await_page, card, leave, moving, pids_of, three
 from visitors import browsing
 
-from browser import shot, visit
+from browser import barriers, needs_axe, shot, visit
 from rig import needs_browser, until
 from runner.core.roles import Role
 from runner.mqtt.link import ControlLink
@@ -74,6 +74,13 @@ def page(fleet, chromium):
 
 
 @needs_browser
+@needs_axe
+def test_the_list_has_no_serious_barrier(fleet, page):
+    for theme in ("day", "night"):
+        page.evaluate("theme => (document.documentElement.dataset.theme = theme)", theme)
+        assert barriers(page) == [], theme
+
+
 def test_a_vehicle_that_is_only_listed_costs_its_uplink_nothing(fleet, page):
     _, heard = fleet
     until(lambda: set(heard.telemetry) == set(NAMES))
