@@ -217,7 +217,6 @@ export function startDrive() {
   document.addEventListener("visibilitychange", updateAttention);
   for (const kind of ["pointerdown", "keydown"]) addEventListener(kind, onPress, true);
   listen("hello state sample ages status monitored control socket requests view enlarged reminders sound", refresh);
-  listen("toast", fitPanels);
   listen("control socket state view ages", updateAttention);
   listen("hello view", refreshGuides);
   addEventListener("storage", refreshGuides); // chosen in another window

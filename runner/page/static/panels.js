@@ -35,6 +35,12 @@ export function fitPanels() {
   }
 }
 
+/** A message changes the text of its panel at any time. */
+const messages = byId(IDS.messages);
+new MutationObserver(() => messages.style.width && fit(messages)).observe(messages, {
+  subtree: true, childList: true, characterData: true, attributeFilter: ["hidden"],
+});
+
 /** Make the text of a panel smaller where it would be cut off. @param {HTMLElement} panel */
 function fit(panel) {
   const parts = [panel, ...panel.querySelectorAll("b, button")];
