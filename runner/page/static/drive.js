@@ -89,7 +89,7 @@ function refreshMotion() {
   showFigure("heading", heading_deg === undefined ? null : headingText(heading_deg));
   showFigure("gear", gear ?? null);
   showFigure("steering", rad === undefined ? null : steeringText(rad));
-  byId("steering-mark").style.setProperty("--shift", shift);
+  setAttribute(byId("steering-mark"), "style", `--shift: ${shift}`);
 }
 
 /** @param {string} name  @param {string|null} text null: unknown, which is shown of what was known before */
