@@ -197,6 +197,7 @@ function refreshSettings(info, now) {
   apply.disabled = Boolean(why);
   full.disabled = Boolean(whyNot()) || !isPart(name());
   full.title = whyNot() ?? withKey("full image", "full_image");
+  part.hidden = !(now && isPart(name()));
   setText(part, now && isPart(name()) ? regionWords(now, mode() === "single", info, withKey("Full image", "full_image")) : "");
   apply.title = why ?? "send these numbers; a rectangle dragged on the picture does the same";
   fill(weight, now?.weight ?? info.weight, whyNot(), pending(`weight:${name()}`));

@@ -47,7 +47,7 @@ export function regionWords({ roi }, isSingle, full, end) {
 }
 
 /**
- * Half size: 1.2 of 6.0 Mbit/s, its share of the 6.5 Mbit/s that are predicted.
+ * Half size: 1.2 of 6.0 Mbit/s, its share of the 6.5 Mbit/s predicted.
  * @param {import("./records.js").CameraState|undefined} camera its decision
  * @param {import("./store.js").State|null} state of the vehicle
  * @param {import("./framing.js").Size} full image
@@ -61,11 +61,10 @@ export function reasonWords(camera, state, full, predicted) {
   if (!camera.sending) return `Paused: ${pauseWords(camera, state, common)}.`;
   const image = { x: 0, y: 0, width: full.width, height: full.height };
   const part = sameRegion(camera.roi, image) ? "" : ` of ${percent(shareOf(camera.roi, full))} of the image`;
-  const over = camera.uplinks?.length ? `, over ${camera.uplinks.join(" and ")}` : "";
   const words = sizeWords(camera.scaling);
   const most = Math.max(camera.kbps, camera.demand_kbps);
   const cause = `${rateWords(camera.kbps, most)}${causeWords(camera, state, predicted)}`;
-  return `${words[0].toUpperCase()}${words.slice(1)}${part}: ${cause}${over}.`;
+  return `${words[0].toUpperCase()}${words.slice(1)}${part}: ${cause}.`;
 }
 
 function pauseWords({ weight }, { mode }, common) {
@@ -79,7 +78,7 @@ function causeWords({ kbps, demand_kbps }, { mode, total_kbps, asked_kbps }, pre
   const isLimited = total_kbps < asked_kbps;
   if (mode === "single") return isLimited ? ", less than was set: the link carries no more" : "";
   if (kbps >= Math.floor(demand_kbps)) return ", all that it can use";
-  const total = `, its share of the ${(total_kbps / 1000).toFixed(1)} Mbit/s that`;
-  if (mode === "collective") return `${total} ${isLimited ? "the link carries" : "were set"}`;
-  return `${total} ${total_kbps !== asked_kbps ? "the link carries" : predicted ? "are predicted" : "it starts with"}`;
+  const total = `, its share of the ${(total_kbps / 1000).toFixed(1)} Mbit/s`;
+  if (mode === "collective") return `${total} ${isLimited ? "the link carries" : "set"}`;
+  return `${total} ${total_kbps !== asked_kbps ? "the link carries" : predicted ? "predicted" : "at the start"}`;
 }
