@@ -585,18 +585,18 @@ def test_a_driver_is_alerted_to_a_monitor_that_crashed(chromium, picture):
 
 
 def test_keys_act_on_the_cameras_after_a_button_was_clicked(chromium, picture):
-    remapped = ("inputs.keys.view=x", "inputs.keys.theme=null", "inputs.keys.camera_3=j")
+    remapped = ("inputs.keys.view=z", "inputs.keys.theme=null", "inputs.keys.camera_3=j")
     with served(picture, None, *remapped) as (server, _), opened(chromium, server.url) as page:
         all_live(page)
         controlling(page)
-        assert page.inner_text("#offer-drive") == "Drive view (x)"
+        assert page.inner_text("#offer-drive") == "Drive view (z)"
         titles = [page.get_attribute(f"#{name}", "title") for name in ("to-drive", "theme", "take-control")]
-        assert titles == ["Drive view: pictures first (x)", "Day or night", "Release (t)"]
+        assert titles == ["Drive view: pictures first (z)", "Day or night", "Release (t)"]
         for key, camera in (("j", "mast"), ("ArrowDown", "rear"), ("1", "front"), ("3", "front")):
             page.keyboard.press(key)
             assert page.evaluate("tod.selected") == camera, key
         page.dblclick("[data-camera=mast] .picture")
-        page.keyboard.press("x")
+        page.keyboard.press("z")
         usual = edges(page)
         assert usual["front"]["width"] > 2 * usual["mast"]["width"], "the enlarged picture stayed large"
         for holder in ("free", "you"):

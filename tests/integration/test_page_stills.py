@@ -29,7 +29,7 @@ def station(tmp_path_factory):
         pictures,
         SIZE,
         ["fisheye"],
-        ["inputs.keys.view=x", "inputs.buttons.view=7", "inputs.buttons.help=6"],
+        ["inputs.keys.view=z", "inputs.buttons.view=7", "inputs.buttons.help=6"],
     )
 
 
@@ -45,7 +45,7 @@ def page(chromium, served):
     with opened(chromium, served.url, 1920, 1080) as page:
         all_live(page)
         until(lambda: page.evaluate("tod.control") == "you")
-        page.locator("body").press("x")
+        page.locator("body").press("z")
         yield page
 
 
