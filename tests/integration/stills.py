@@ -61,8 +61,16 @@ class Station(SimpleNamespace):
             if camera.roi:
                 roi = dict(zip(("x", "y", "width", "height"), camera.roi, strict=True))
                 self.step(event="roi_set", camera=name, **roi)
+        self.step(event="operator_connected", operator="anna", role="controller")
         self.units = {name: self.encoded(name, picture) for name, picture in pictures.items()}
-        told = {"note": print, "identity": "anna", "answer_s": 1.0, "attention": None, "link_state": LinkState()}
+        told = {
+            "note": print,
+            "own_time": float,
+            "identity": "anna",
+            "answer_s": 1.0,
+            "attention": None,
+            "link_state": LinkState(),
+        }
         latency = SimpleNamespace(captured=lambda camera, at: at)  # both clocks are one
         super().__init__(state=self.published(), latency=latency, **told)
 
@@ -77,7 +85,7 @@ class Station(SimpleNamespace):
             for name, setting in run.decision.settings.items()
         }
         totals = (plain(run.decision.total), plain(run.decision.asked))
-        return VehicleState(1.0, "", run.decision.mode, *totals, cameras)
+        return VehicleState(1.0, "", run.decision.mode, *totals, cameras, driving=run.state.driving)
 
     def encoded(self, name, picture):
         """An H.264 keyframe of a native picture, cropped and scaled as the vehicle would send it."""

@@ -363,7 +363,7 @@ def test_keys_follow_the_configuration(page, station):
         assert until(lambda: station.last_request) == {"event": "mode_selected", "mode": expected}
     page.keyboard.press("?")
     page.wait_for_selector("dialog[open]")
-    assert "Drive or Configure view" in page.locator("#help tr", has=page.locator("th", has_text="x")).inner_text()
+    assert "Drive or Configure view" in page.locator("#help tr", has=page.locator("th", has_text="z")).inner_text()
     page.keyboard.press("Escape")
     page.wait_for_selector("dialog[open]", state="hidden")
 
