@@ -757,7 +757,7 @@ def test_refused_pictures_say_why_and_are_no_failure(chromium, picture):
     with served(picture, None) as (server, station), opened(chromium, server.url) as page:
         controlling(page)
         driving = replace(station.state.driving, holder="bert")
-        server.on_state(replace(station.state, operator="bert", driving=driving))
+        server.on_state(replace(station.state, driving=driving))
         server.silent.update(CAMERAS)
         sample = wide(station.state.cameras)
         refused = {name: replace(camera, refused=NO_PLACE) for name, camera in sample.cameras.items()}
