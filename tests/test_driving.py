@@ -70,6 +70,8 @@ class Drive:
                 return self.take("control_offered", operator=name, to=other)
             case [name, "withdraws"]:
                 return self.take("control_offered", operator=name, to="")
+            case [name, "denies", other]:
+                return self.take("control_denied", operator=name, to=other)
             case [name, "accepts"]:
                 return self.take("control_accepted", operator=name, live=CAMERAS)
             case [name, "accepts", "blind"]:
@@ -90,6 +92,9 @@ class Drive:
         parts += [f"offered to {now.offered}"] if now.offered else []
         parts += [f"requested by {' '.join(now.requested)}"] if now.requested else []
         return ", ".join(parts + ([f"stop by {now.stop}"] if now.stop else []))
+
+
+THREE = "ann connects; bob connects; sue connects"
 
 
 @pytest.mark.parametrize(
@@ -150,6 +155,10 @@ class Drive:
         ("ann connects; bob connects; sue connects; sue asks; bob asks; sue asks", "held by ann, requested by sue bob"),
         ("ann connects; bob connects; bob asks; bob releases", "held by ann"),
         ("ann connects; bob connects; bob asks; bob silent", "held by ann"),
+        ("ann connects; bob connects; bob asks; ann denies bob", "held by ann"),
+        ("ann connects; bob connects; bob asks; ann denies bob; bob asks", "held by ann, requested by bob"),
+        ("ann connects; bob connects; bob asks; ann offers bob; ann denies bob", "held by ann"),
+        (f"{THREE}; sue asks; bob asks; ann denies sue", "held by ann, requested by bob"),
         # offered
         ("ann connects; bob connects; moves; ann offers bob", "held by ann, offered to bob"),
         ("ann connects; bob connects; moves; ann offers bob; bob accepts", "held by bob"),
@@ -221,12 +230,14 @@ BOTH = "ann connects; bob connects; eve connects; sue connects"
         (BOTH, "bob accepts", "control is not offered to bob: ann is in control"),
         (f"{BOTH}; ann offers bob", "sue accepts", "control is not offered to sue: ann is in control"),
         (f"{BOTH}; moves; ann offers bob", "bob accepts blind", f"live for 1 s at the station of bob: {CAMERAS[0]}"),
+        (BOTH, "ann denies bob", "bob does not ask for control"),
+        (f"{BOTH}; sue asks", "bob denies sue", "the operator in control may decline a request: ann is in control"),
         (BOTH, "bob releases", "bob has nothing to release: ann is in control"),
         (f"{BOTH}; moves; ann silent", "bob releases", "bob has nothing to release: ann is lost"),
-        (f"{BOTH}; moves", "ann releases", "before its control is released: it moves at 8.0 m/s"),
+        (f"{BOTH}; moves", "ann releases", "before its control is released: it moves at 29 km/h"),
         (f"{BOTH}; hides", "ann releases", "its speed is not known, which counts as moving"),
-        (f"{BOTH}; moves; sue takes", "sue releases", "it moves at 8.0 m/s; or offer control"),
-        (f"{BOTH}; moves; ann silent", "sue releases", "it moves at 8.0 m/s; or offer control"),
+        (f"{BOTH}; moves; sue takes", "sue releases", "it moves at 29 km/h; or offer control"),
+        (f"{BOTH}; moves; ann silent", "sue releases", "it moves at 29 km/h; or offer control"),
         (f"{BOTH}; moves; stands; moves; ann silent; bob asks", "bob offers ann", "may offer it: ann is lost"),
         ("eve connects; ann connects; stands; ann releases", "ann offers eve", "may offer it: nobody is in control"),
         ("ann connects", "eve stops", "eve is not connected"),
@@ -314,7 +325,9 @@ def replayed(drive: Drive) -> Run:
 def happens(drive: Drive, chance: random.Random) -> tuple[str, str | None]:
     """Something, in words, and why it was refused."""
     kind, name = chance.random(), chance.choice(NAMES)
-    if kind < 0.15:
+    if kind < 0.02 and drive.driving.requested:
+        words = f"{drive.driving.holder or name} denies {drive.driving.requested[0]}"
+    elif kind < 0.15:
         words = chance.choice(("0.5 s", "1 s", "3 s"))
     elif kind < 0.2 and drive.driving.stop:
         words = f"{chance.choice((name, drive.driving.in_control or name))} lifts"

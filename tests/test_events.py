@@ -39,6 +39,7 @@ EXAMPLES: list[dict[str, Any]] = [
     {"t": 0.8, "event": "control_offered", "operator": "me", "to": "you"},
     {"t": 0.8, "event": "control_offered", "operator": "me", "to": ""},
     {"t": 0.8, "event": "control_accepted", "operator": "you", "live": ["front_left", "rear_center"]},
+    {"t": 0.8, "event": "control_denied", "operator": "me", "to": "you"},
     {"t": 0.8, "event": "control_released", "operator": "you"},
     {"t": 0.8, "event": "control_taken", "operator": "you"},
     {"t": 0.8, "event": "stop_requested", "operator": "you"},

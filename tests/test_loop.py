@@ -251,6 +251,7 @@ EXAMPLES: tuple[dict[str, Any], ...] = (
     {"event": "control_requested"},
     {"event": "control_offered", "to": "a-watcher"},
     {"event": "control_accepted", "live": []},
+    {"event": "control_denied", "to": "a-watcher"},
     {"event": "control_released"},
     {"event": "control_taken"},
     {"event": "stop_requested"},

@@ -367,6 +367,7 @@ EVENTS: dict[str, dict[str, st.SearchStrategy[Any]]] = {
     **{f"control_{kind}": {"operator": st.just("a")} for kind in ("requested", "released", "taken", "restored")},
     **{f"stop_{kind}": {"operator": st.just("a")} for kind in ("requested", "lifted")},
     "control_offered": {"operator": st.just("a"), "to": st.sampled_from(["b", ""])},
+    "control_denied": {"operator": st.just("a"), "to": st.just("b")},
     "control_accepted": {"operator": st.just("b"), "live": st.just([])},
     "attention_changed": {"attention": st.sampled_from(list(map(str, Attention)))},
     "operator_connected": {},

@@ -24,6 +24,7 @@ from runner.core.events import (
     NAMES,
     ClockAdvanced,
     ControlAccepted,
+    ControlDenied,
     ControlOffered,
     ControlReleased,
     ControlRequested,
@@ -111,7 +112,7 @@ class Motion:
         if not self.is_known(t):
             return "its speed is not known, which counts as moving"
         if self.slow_since is None:
-            return f"it moves at {self.speed_mps:.1f} m/s"
+            return f"it moves at {3.6 * self.speed_mps:.0f} km/h"
         return f"it has stood for less than {SLOW_S:g} s"
 
 
@@ -147,6 +148,9 @@ def _changed(driving: Driving, motion: Motion, event: Event, sent: Set[str]) -> 
             _may(driving, name, event)
             unseen = frozenset() if motion.stands(event.t) else sent - frozenset(live)
             return _accepted(driving, name, unseen, event.t)
+        case ControlDenied(operator=name, to=to):
+            _may(driving, name, event)
+            return _denied(driving, name, to)
         case ControlReleased(operator=name):
             _may(driving, name, event)
             return _released(driving, motion, name, event.t)
@@ -244,6 +248,16 @@ def _accepted(driving: Driving, name: str, unseen: Collection[str], t: float) ->
     if unseen:
         raise Refused(f"not yet live for 1 s at the station of {name}: {', '.join(sorted(unseen))}")
     return _held(driving, name, t, f"{name} has accepted control from {driving.holder}")
+
+
+def _denied(driving: Driving, name: str, to: str) -> Driving:
+    if driving.in_control != name:
+        raise Refused(f"only the operator in control may decline a request: {_who(driving)}")
+    if to not in driving.requested:
+        raise Refused(f"{to} does not ask for control")
+    asking = tuple(other for other in driving.requested if other != to)
+    now = _without_offer(driving, "") if driving.offered == to else driving
+    return replace(now, requested=asking, why=f"{name} has declined the request of {to}")
 
 
 def _released(driving: Driving, motion: Motion, name: str, t: float) -> Driving:

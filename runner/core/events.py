@@ -251,6 +251,14 @@ class ControlAccepted(_Event):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ControlDenied(_Event):
+    """The operator in control declines the request of another one, which may ask again."""
+
+    operator: Asker
+    to: Annotated[str, "id of the other"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ControlReleased(_Event):
     """An operator gives up what it has: control of a vehicle that stands, an offer made to it, or its request."""
 
@@ -365,6 +373,7 @@ Event = (
     | ControlRequested
     | ControlOffered
     | ControlAccepted
+    | ControlDenied
     | ControlReleased
     | ControlTaken
     | StopRequested

@@ -23,7 +23,8 @@ DRIVER_EVENTS = frozenset(
 )
 STOP_REQUESTED = "stop_requested"  # by whoever sees what happens
 CONTROL_EVENTS = frozenset(
-    {"control_requested", "control_offered", "control_accepted", "control_released", STOP_REQUESTED, "stop_lifted"}
+    {f"control_{what}" for what in ("requested", "offered", "accepted", "denied", "released")}
+    | {STOP_REQUESTED, "stop_lifted"}
 )
 MAY_REQUEST: dict[Role, frozenset[str]] = {
     Role.CONTROLLER: PRESENCE | DRIVER_EVENTS | CONTROL_EVENTS,

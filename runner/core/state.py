@@ -161,6 +161,7 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
         case (
             ev.ControlRequested()
             | ev.ControlOffered()
+            | ev.ControlDenied()
             | ev.ControlReleased()
             | ev.ControlTaken()
             | ev.StopRequested()

@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-import { choicesOf, driverWords, handOverWords, LivePictures, speedWords, stopWords, whoDrives } from "../../runner/page/static/driving.js";
+import { choicesOf, driverWords, endedWords, handOverWords, LivePictures, speedWords, stopWords, whoDrives } from "../../runner/page/static/driving.js";
 
 const NONE = { state: "free", holder: null, since: 0, offered: null, offer_ends: null, requested: [], stop: null, stop_since: null, released: null, standing: true, why: "" };
 const PRESENT = { anna: "controller", bob: "controller", eve: "watcher" };
@@ -35,7 +35,7 @@ test("the driver offers control to those who ask before others", () => {
   assert.deepEqual(texts(seen(held("anna", { present: { anna: "controller" } }))), ["Release"]);
   assert.deepEqual(texts(seen(held("anna"))), ["Release", "Offer …"]);
   assert.deepEqual(choicesOf(seen(held("anna")))[1].takers, ["bob"], "not to a watcher");
-  assert.deepEqual(texts(seen(held("anna", { requested: ["bob"] }))), ["Offer control to bob", "Release"]);
+  assert.deepEqual(texts(seen(held("anna", { requested: ["bob"] }))), ["Offer control to bob", "Decline bob", "Release"]);
   assert.deepEqual(texts(seen(held("anna", { offered: "bob", requested: ["bob"] }))), ["Withdraw offer", "Release"]);
 });
 
@@ -44,10 +44,21 @@ test("an operator who does not drive asks, waits for the pictures, and accepts",
   assert.deepEqual(texts(seen(held("bob"))), ["Request control"]);
   assert.deepEqual(texts(seen(held("bob", { requested: ["anna"] }))), ["Withdraw request"]);
   const offered = held("bob", { offered: "anna", standing: false });
-  assert.deepEqual(texts(seen(offered, { unseen: ["front left", "rear"] })), ["Accept control: waiting for pictures: front left, rear", "Decline"]);
+  assert.deepEqual(texts(seen(offered, { unseen: ["front left", "rear"] })), ["Accept control: not live for 1 s yet: front left, rear", "Decline"]);
   const standing = seen({ ...offered, standing: true }, { unseen: ["rear"] });
-  assert.deepEqual(texts(standing), ["Accept control: waiting for pictures: rear", "Accept without pictures", "Decline"]);
+  assert.deepEqual(texts(standing), ["Accept control: not live for 1 s yet: rear", "Accept without pictures", "Decline"]);
   assert.deepEqual(texts(seen(offered, { page: "another" })), ["Accept control", "Decline"], "any page of the station may act");
+});
+
+test("who waited for control is told when nothing comes of it", () => {
+  const bob = (more = {}) => seen(held("bob", more)).driving;
+  const [offered, asked] = [bob({ offered: "anna" }), bob({ requested: ["anna"] })];
+  assert.equal(endedWords(offered, bob(), "anna"), "The offer of control has ended: bob drives");
+  assert.equal(endedWords(offered, bob(), "bob"), "anna has not taken control: you drive");
+  assert.equal(endedWords(asked, bob(), "anna"), "Your request for control has ended: bob drives");
+  assert.equal(endedWords(asked, bob({ offered: "anna" }), "anna"), "");
+  assert.equal(endedWords(offered, seen(held("anna")).driving, "anna"), "");
+  assert.equal(endedWords(null, bob(), "anna"), "");
 });
 
 test("a supervisor may take control, after confirming", () => {
@@ -83,7 +94,7 @@ test("everybody is told who asks and to whom control is offered", () => {
   const asked = handOverWords(seen(held("bob", { requested: ["anna"] }), closed));
   assert.equal(asked, "bob's page has been closed since 12:03: nobody answers there. You ask for control");
   const view = seen(held("bob", { offered: "anna", requested: ["anna"] }), { unseen: ["rear"] });
-  assert.equal(handOverWords(view), "bob offers control to you; waiting for pictures: rear");
+  assert.equal(handOverWords(view), "bob offers control to you; not live for 1 s yet: rear");
 });
 
 test("whoever drives, or a supervisor, lifts a stop that somebody has asked for", () => {
@@ -92,8 +103,8 @@ test("whoever drives, or a supervisor, lifts a stop that somebody has asked for"
   assert.deepEqual(texts(seen(held("bob", stop))), ["Request control"]);
   assert.deepEqual(texts(seen(held("bob", { ...stop, present: { ...PRESENT, anna: "supervisor" } }))), ["Request control", "Take control", "Lift stop"]);
   assert.deepEqual(texts(seen(stop)), ["Take control"], "then it can be lifted");
-  assert.equal(stopWords(seen(stop).driving, "anna", "14:03"), "eve asked to stop at 14:03: advised speed 0");
-  assert.equal(stopWords(seen(stop).driving, "eve"), "You asked to stop: advised speed 0");
+  assert.equal(stopWords(seen({ ...stop, standing: false }).driving, "anna", "14:03"), "eve asked to stop at 14:03: advised speed 0, it still moves");
+  assert.equal(stopWords(seen(stop).driving, "eve"), "You asked to stop: advised speed 0, it stands");
   assert.equal(stopWords(seen().driving, "eve"), "");
 });
 

@@ -54,6 +54,7 @@ function drawing() {
   const calls = [];
   const context = {
     canvas: { width: 640, height: 360 },
+    ...Object.fromEntries(["save", "beginPath", "rect", "clip", "restore"].map((name) => [name, () => {}])),
     measureText: () => ({ width: 10 }),
     strokeText: () => {},
     clearRect: () => calls.push(["clear"]),

@@ -65,7 +65,7 @@ export const ACTIONS = {
   keep: { description: "keep the last 60 s: mark them, and protect the drive that is logged", run: keepMoment },
   full_image: { description: "full image of the selected camera, or of all", run: sendFull },
   control: { description: "take, request, offer, accept or release control: the first of its buttons", run: toggleControl },
-  stop: { description: "ask the vehicle to stop; whoever drives lifts it by a button", run: askToStop },
+  stop: { description: "ask the vehicle to stop; whoever drives, or a supervisor, lifts it by a button", run: askToStop },
   theme: { description: "night or day theme", run: toggleTheme },
   help: { description: "show this list", run: () => publish("help") },
 };

@@ -5,7 +5,7 @@ import { pending, reportProblem, showProblem, submit, whyNoControl } from "./req
 import { send } from "./link.js";
 import { withKey } from "./hints.js";
 import { Holding } from "./holding.js";
-import { choicesOf, driverWords, handOverWords, LivePictures, speedWords, stopWords } from "./driving.js";
+import { choicesOf, driverWords, endedWords, handOverWords, LivePictures, speedWords, stopWords } from "./driving.js";
 import { byId, clockTime, displayName, make, setAttribute, setText } from "./format.js";
 
 /** @typedef {import("./driving.js").Choice} Choice */
@@ -16,6 +16,8 @@ const UNHEARD = "the vehicle receives nothing from this station";
 const holding = new Holding();
 const pictures = new LivePictures();
 let asked = ""; // by operators of this one, at the last look
+/** @type {import("./driving.js").Driving|null} */
+let known = null; // who drove then
 /** @type {string|null} */
 let offeredTo = null; // to whom this station's operator offered control when it last had it
 const confirmed = byId("confirm", HTMLDialogElement);
@@ -63,6 +65,9 @@ function watchRequests() {
   const now = [...to, ...from].join("; ");
   if (now && now !== asked && store.holder === "you") publish("asked");
   asked = now;
+  const ended = endedWords(known, driving, own);
+  if (ended && store.holder === "you") publish("toast", { text: ended, level: "hint" });
+  known = driving;
 }
 
 function reportLoss(why) {
@@ -195,9 +200,10 @@ function showButtons(group, choices, keyed, id) {
   buttons[focused]?.focus({ preventScroll: true });
 }
 
-const ASIDE = ["Release", "Accept without pictures", "Decline", "Lift stop"];
+const ASIDE = ["Release", "Accept without pictures", "Lift stop"];
 /** Whether a button is what its person most likely wants next. @param {Choice} choice */
-const isMain = ({ text, why, takers, from }) => !why && !ASIDE.includes(text) && !takers && from !== "operator";
+const isMain = ({ text, why, takers, from }) =>
+  !why && !ASIDE.includes(text) && !text.startsWith("Decline") && !takers && from !== "operator";
 
 export function startControl() {
   confirmed.addEventListener("close", onConfirmed);

@@ -59,7 +59,8 @@ export const driverWords = (who, driving) =>
  */
 export function stopWords(driving, own, at) {
   if (!driving?.stop) return "";
-  return `${driving.stop === own ? "You" : driving.stop} asked to stop${at ? ` at ${at}` : ""}: advised speed 0`;
+  const still = driving.standing ? "it stands" : "it still moves";
+  return `${driving.stop === own ? "You" : driving.stop} asked to stop${at ? ` at ${at}` : ""}: advised speed 0, ${still}`;
 }
 
 /** That nobody sees the pictures of another operator who is in control, in words; "": somebody does. @param {View} view */
@@ -91,8 +92,23 @@ function askedWords({ driving, own, unseen = [] }) {
   return [offers.filter(Boolean).join("; "), asks].filter(Boolean).map(sentence).join(". ");
 }
 
+/**
+ * What has come to nothing since, in words; "": nothing.
+ * @param {Driving|null} before  @param {Driving|null} now  @param {string} own
+ */
+export function endedWords(before, now, own) {
+  if (!before || now?.state !== "held" || before.holder !== now.holder) return "";
+  const drives = now.holder === own ? "you drive" : `${now.holder} drives`;
+  if (before.offered && !now.offered) {
+    if (now.holder === own) return `${before.offered} has not taken control: ${drives}`;
+    if (before.offered === own) return `The offer of control has ended: ${drives}`;
+  }
+  const asked = before.requested.includes(own) && !now.requested.includes(own) && now.offered !== own;
+  return asked ? `Your request for control has ended: ${drives}` : "";
+}
+
 const sentence = (text) => text.replace(/^you/, "You"); // an operator's name is left as it is
-const waiting = (unseen) => `waiting for pictures: ${unseen.join(", ")}`;
+const waiting = (unseen) => `not live for 1 s yet: ${unseen.join(", ")}`;
 
 /** At what speed the vehicle goes, in words. @param {number|null|undefined} speed_mps */
 export const speedWords = (speed_mps) =>
@@ -131,6 +147,7 @@ function aboutControl(view) {
 
 const RELEASED = { event: "control_released" };
 const offerTo = (name) => ({ text: `Offer control to ${name}`, isAnswer: true, event: { event: "control_offered", to: name } });
+const decline = (name) => ({ text: `Decline ${name}`, isAnswer: true, event: { event: "control_denied", to: name } });
 
 /** @param {View} view @returns {Choice[]} */
 function whileDriving({ driving, own }) {
@@ -139,7 +156,7 @@ function whileDriving({ driving, own }) {
   const able = Object.entries(driving?.present ?? {}).filter(([name, role]) => name !== own && DRIVERS.includes(role));
   const asking = driving?.requested ?? [];
   const takers = able.map(([name]) => name).filter((name) => !asking.includes(name)).sort();
-  return [...asking.map(offerTo), release, ...(takers.length ? [{ text: "Offer …", takers }] : [])];
+  return [...asking.flatMap((name) => [offerTo(name), decline(name)]), release, ...(takers.length ? [{ text: "Offer …", takers }] : [])];
 }
 
 /** @param {View} view @returns {Choice[]} */

@@ -96,8 +96,13 @@ export class GuideLines {
     this.clear(context);
     this.drawn = [...this.placed.straight.lines, ...this.placed.wheels.lines];
     const whole = placement(display, picture, display.view);
-    this.strokeAll(context, display.ratio * Math.min(1.5, Math.max(0.6, whole.width / USUAL_PX)));
     const visible = inside(whole, display, display.ratio);
+    context.save();
+    context.beginPath();
+    context.rect(visible.left, visible.top, visible.right - visible.left, visible.bottom - visible.top);
+    context.clip(); // the box may be wider than its picture
+    this.strokeAll(context, display.ratio * Math.min(1.5, Math.max(0.6, whole.width / USUAL_PX)));
+    context.restore();
     labelDistances(context, this.drawn, visible, display.ratio);
     if (this.label) labelPicture(context, this.label, visible, display.ratio);
   }

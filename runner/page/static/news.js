@@ -24,7 +24,8 @@ function refresh() {
 function showToast({ text, level, of }) {
   [...toasts.children].find((each) => each.getAttribute("data-text") === text)?.remove();
   const shape = level === "problem" ? "✕ " : "";
-  const element = make("div", { class: "toast", "data-level": level, "data-text": text }, make("span", { "data-of": of }, shape + text));
+  const words = make("span", { "data-of": of ?? null }, shape + text);
+  const element = make("div", { class: "toast", "data-level": level, "data-text": text }, words);
   element.append(make("button", { "aria-label": "close", onclick: () => element.remove() }, "×"));
   toasts.append(element);
   while (toasts.children.length > MAX_TOASTS) toasts.firstChild?.remove();
