@@ -51,7 +51,7 @@ FAULTS = [
     Fault("vehicle/sending.py", "left - captured - self.usual_s", "left - captured", "test_sending"),
     Fault("vehicle/inbox.py", "len(waiting) >= MAX_QUEUED", "len(waiting) > MAX_QUEUED", "test_inbox"),
     Fault("operator/meter.py", "* 8 / 1000 /", "/ 1000 /", "test_meter"),
-    Fault("operator/notes.py", "if factors[0] != factors[1]", "if True", "test_notes"),
+    Fault("operator/notes.py", "if form < before", "if form > before", "test_notes"),
     Fault("mqtt/messages.py", "if len(payload) > limit:", "if len(payload) > 2 * limit:", "test_messages"),
     Fault(
         "mqtt/link.py",

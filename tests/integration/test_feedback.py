@@ -149,7 +149,7 @@ def held_up(broker, log):
     ):
         onlooker = Operator(broker)
         # Half of the prediction until the link is measured, which carries more.
-        onlooker.state(lambda state: state.get("operator") and state.get("total_kbps") > 4000)
+        onlooker.state(lambda state: state.get("driving", {}).get("holder") and state.get("total_kbps") > 4000)
         time.sleep(1.5)  # the usual time from capture to sending becomes known
         begin = onlooker.as_of()
         for side in [vehicle] * PAUSES + [operator] * PAUSES:
