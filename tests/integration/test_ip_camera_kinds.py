@@ -152,7 +152,7 @@ def test_a_camera_that_answers_slowly_is_awaited(monkeypatch, method, delay_s):
         refused(plan)
         waiting = until(lambda: side.read()["rear"].fault)
         assert re.fullmatch(rf"waiting for the camera: {method}, [12] s", waiting)
-        assert refused(plan) < 0.3
+        assert refused(plan) < 1  # it would take delay_s
         shown(plan)
         assert side.read()["rear"].fault is None
         assert camera.connections == 1

@@ -489,8 +489,6 @@ def test_drive_the_front_camera_is_large_and_nothing_is_cut_off(fresh):
     page.locator("#offer-drive").click()
     assert page.locator("#offer").is_hidden()
     assert page.evaluate("tod.view") == "drive"
-    while page.locator("#birdseye").is_visible():
-        page.keyboard.press("e")  # in place of the top views
     for width, height in SCREENS[:2]:  # the others in test_a_view_fits_every_screen
         sized(page, width, height)
         front = whole(page)["front_center"]

@@ -13,11 +13,8 @@ let failure = ""; // why it cannot be drawn any more
 
 const cameras = () => (globalThis.boot.canShowVideo && store.hello?.dimensions ? store.hello.cameras.filter(isTopView) : []);
 
-/** By default it is shown only if all its cameras are calibrated. */
-function isChosen() {
-  const choice = localStorage.getItem(ofVehicle(CHOICE));
-  return choice === null ? cameras().every(({ calibrated }) => calibrated) : choice === "on";
-}
+/** Off until somebody wants it: without a GPU it takes what the pictures need. */
+const isChosen = () => localStorage.getItem(ofVehicle(CHOICE)) === "on";
 
 /** The size of the ground that it shows, m; null: it is off, or the vehicle has no camera that looks down. */
 export function birdseyeSize() {
