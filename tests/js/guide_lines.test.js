@@ -150,13 +150,3 @@ test("all outlines are drawn before the lines", () => {
     assert.deepEqual(points, lines[i][2]);
   }
 });
-test("all outlines are drawn before the lines", () => {
-  const { stroked } = drawing().draw();
-  const [outlines, lines] = [stroked.slice(0, 3), stroked.slice(3)];
-  assert.deepEqual(lines.map(([colour]) => colour), Object.values(COLOURS));
-  for (const [i, [colour, width, points]] of outlines.entries()) {
-    assert.equal(colour, "rgba(0,0,0,0.55)");
-    assert.ok(width > lines[i][1]);
-    assert.deepEqual(points, lines[i][2]);
-  }
-});
