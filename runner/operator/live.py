@@ -128,7 +128,7 @@ class LiveOperator:
             yield
         finally:
             is_built.set()
-            thread.join()
+            thread.join(END_S)
 
     def show(self, cameras: Collection[str], is_open: bool) -> None:
         """Receive these cameras, and drive while a page is open. From any thread; for a side that follows a demand."""

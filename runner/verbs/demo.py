@@ -266,15 +266,16 @@ def with_shown(arguments: Arguments) -> tuple[Arguments, Configuration, list[str
     left_out = [name for name in names if name not in choice.cameras]
     words = [f"~cameras.{name}" for name in left_out]
     words += [f"fps_max={choice.fps_max}"] if choice.fps_max else []
+    if not words:
+        return arguments, config, []
     chosen = replace(arguments, overrides=[*words, *arguments.overrides])
-    told = []
     if left_out:
         told = [
             f"{len(choice.cameras)} of {len(names)} cameras{choice.rate}: as many as {cores} cores show smoothly",
             f"left out: {', '.join(left_out)}",
             f"all {len(names)}{every.rate}: {_command(arguments, config)}",
         ]
-    elif choice.fps_max:
+    else:
         told = [
             f"{len(names)} cameras{choice.rate}: as fast as {cores} cores show them; fps_max=null: at their own rates"
         ]
