@@ -166,14 +166,12 @@ def _inside(identity: int) -> Iterator[int]:
 def _claimed_network(ip: str) -> Iterator[tuple[str, ipaddress.IPv4Network]]:
     """A name and addresses that are not in use elsewhere.
 
-    The search starts at random: connections of an earlier link whose other end no longer exists send to its addresses
-    for minutes, and would enter a new link with the same ones.
+    The search is random, and takes what a killed run has left last: connections of an earlier link whose other
+    end no longer exists send to its addresses for minutes, and would enter a new link with the same ones.
     """
     networks = {f"tod-{number}": network for number, network in enumerate(NETWORK.subnets(new_prefix=PREFIX))}
-    _remove_left_behind(ip, networks)
-    names = [*networks]
-    first = random.randrange(len(names))
-    for name in names[first:] + names[:first]:
+    removed = set(_remove_left_behind(ip, networks))
+    for name in sorted(networks, key=lambda name: (name in removed, random.random())):
         with _claim(networks[name]) as is_free:
             if is_free and not any(address in networks[name] for address in _addresses(ip)):
                 yield name, networks[name]
@@ -181,12 +179,13 @@ def _claimed_network(ip: str) -> Iterator[tuple[str, ipaddress.IPv4Network]]:
     raise RunError(f"link=netns: every address of {NETWORK} is in use; end other runs, {ALTERNATIVE}")
 
 
-def _remove_left_behind(ip: str, networks: Mapping[str, ipaddress.IPv4Network]) -> None:
-    """Remove the namespaces of runs that were killed: those whose name is not claimed."""
+def _remove_left_behind(ip: str, networks: Mapping[str, ipaddress.IPv4Network]) -> Iterator[str]:
+    """Remove the namespaces of runs that were killed: those whose name is not claimed. Yields their names."""
     for name in networks.keys() & {path.name for path in RUN.glob("tod-*")}:
         with _claim(networks[name]) as is_free:
             if is_free:
                 _remove(ip, name, networks[name])
+                yield name
 
 
 @contextmanager
