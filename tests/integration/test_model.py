@@ -10,10 +10,12 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from fractions import Fraction
 from pathlib import Path
 
+import inside
 import numpy as np
 import pytest
 
@@ -149,20 +151,23 @@ def test_the_live_pipeline_has_the_same_quality(clip, measured):
 
 
 def luma_of(path: Path) -> list[np.ndarray]:
-    return pulled(f'filesrc location="{path}" ! decodebin ! videoconvert ! video/x-raw,format=I420', FRAMES)[0]
+    line = f'filesrc location="{path}" ! decodebin ! videoconvert ! video/x-raw,format=I420'
+    return [picture for picture, _ in pulled(line, FRAMES)]
 
 
 def streamed(clip: Path, form: list[str], knobs: dict[str, object]) -> list[np.ndarray] | None:
     """The first pictures received over RTSP; None if a busy machine left some out, or changed what each may cost."""
     with streaming("source=file", f"source.clip={clip}", *form, cameras=["front_center"]) as (side, _, plans, reported):
         side.turn([Command("front_center", knob, value) for knob, value in knobs.items()])
-        pictures, captured = pulled(over_tcp(plans[0]).receiver_into("videoconvert ! video/x-raw,format=I420"), FRAMES)
-    steady = np.allclose(np.diff(captured), 1 / FPS, atol=1e-3)
-    return pictures if steady and reported == faults(reported) else None
+        line = over_tcp(plans[0]).receiver_into("videoconvert ! video/x-raw,format=I420")
+        seen = [(*each, inside.camera(side, "front_center").knobs.pace) for each in pulled(line, FRAMES)]
+    pictures, captured, paces = zip(*seen, strict=True)
+    is_steady = set(paces) == {1.0} and np.allclose(np.diff(captured), 1 / FPS, atol=1e-3)
+    return list(pictures) if is_steady and reported == faults(reported) else None
 
 
-def pulled(line: str, count: int) -> tuple[list[np.ndarray], list[float | None]]:
-    """The first pictures of a pipeline, and their capture times, s."""
+def pulled(line: str, count: int) -> Iterator[tuple[np.ndarray, float | None]]:
+    """The first pictures of a pipeline, each with its capture time, s."""
     from runner.gst import Gst
     from runner.gst.pictures import luma_of
     from runner.gst.receiver import capture_time
@@ -170,14 +175,10 @@ def pulled(line: str, count: int) -> tuple[list[np.ndarray], list[float | None]]
     pipeline = Gst.parse_launch(f"{line} ! appsink name=sink sync=false")
     pipeline.set_state(Gst.State.PLAYING)
     try:
-        pictures: list[np.ndarray] = []
-        captured: list[float | None] = []
-        while len(pictures) < count:
+        for number in range(count):
             sample = pipeline.get_by_name("sink").emit("try-pull-sample", 10 * Gst.SECOND)
-            assert sample, f"{len(pictures)} of {count} pictures arrived"
-            pictures.append(luma_of(sample.get_buffer(), sample.get_caps()))
-            captured.append(capture_time(sample.get_buffer()))
-        return pictures, captured
+            assert sample, f"{number} of {count} pictures arrived"
+            yield luma_of(sample.get_buffer(), sample.get_caps()), capture_time(sample.get_buffer())
     finally:
         pipeline.set_state(Gst.State.NULL)
 
