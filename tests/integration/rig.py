@@ -166,10 +166,14 @@ def set_clock(directory: Path, seconds: float) -> None:
         file.write(round(1e9 * seconds).to_bytes(8, sys.byteorder, signed=True))
 
 
+# Of vehicles by default and in tests: each takes those that are free at the moment when a viewer comes.
+RTP_PORTS = range(20_000, 22_000)
+
+
 # Below the ephemeral range of Linux: a client might take one of those before a side under test has bound it.
 def _own_ports() -> Iterator[int]:
     """Ports that no other process of the tests hands out: until its end, an abstract socket claims a block of them."""
-    blocks = list(range(10_000, 30_000, 100))
+    blocks = [begin for begin in range(10_000, 30_000, 100) if begin not in RTP_PORTS]
     random.SystemRandom().shuffle(blocks)
     for begin in blocks:
         claim = socket.socket(socket.AF_UNIX)
@@ -209,6 +213,13 @@ def free_port(count: int = 1) -> int:
         follows = bool(row) and port == row[-1] + 1
         row = [*(row if follows else []), port] if _is_free(port) else []
     return row[0]
+
+
+def even_ports(count: int) -> range:
+    """So many ports of `free_port` in a row, of which the first is even, as for RTP and RTCP."""
+    first = free_port(count + 1) + 1
+    first -= first % 2
+    return range(first, first + count)
 
 
 def _is_free(port: int) -> bool:

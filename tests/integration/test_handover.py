@@ -128,11 +128,12 @@ def site(tmp_path: Path) -> Iterator[Site]:
 
 @contextmanager
 def two_operators(site: Site) -> Iterator[tuple[Driver, Driver]]:
-    """The first one drives, the other one is refused the pictures."""
+    """The first one drives, the other one is present and refused the pictures."""
     alice = site.operator("alice")
     until(lambda: alice.driving() == f"held by {alice.name}" and alice.sees())
     bob = site.operator("bob")
     until(lambda: bob.driving() == f"held by {alice.name}")
+    until(lambda: bob.name in alice.of("driving")[-1]["present"])
     try:
         yield alice, bob
     finally:

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from test_players import serving
 
-from rig import CHECKOUT, free_port, needs_root, until
+from rig import CHECKOUT, even_ports, needs_root, until
 from rtsp_client import RtspClient
 
 pytestmark = [pytest.mark.gst, pytest.mark.soak, pytest.mark.players]
@@ -114,12 +114,11 @@ def missing(player):
 def test_players_with_their_defaults_change_to_tcp_where_udp_is_refused(player):
     """Another program holds the vehicle's ports: SETUP over UDP gets 461."""
     missing(player)
-    first = free_port(7) + 1
-    first -= first % 2
+    ports = even_ports(6)
     with ExitStack() as stack:
-        for port in range(first, first + 6):
+        for port in ports:
             stack.enter_context(socket.socket(type=socket.SOCK_DGRAM)).bind(("127.0.0.1", port))
-        vehicle = stack.enter_context(serving(f"media.rtp_ports=[{first},{first + 5}]"))
+        vehicle = stack.enter_context(serving(f"media.rtp_ports=[{ports[0]},{ports[-1]}]"))
         began = time.monotonic()
         code, output = watch(player, vehicle.url)
         assert code == 0, output

@@ -9,7 +9,7 @@ from statistics import median
 
 import pytest
 
-from rig import free_port, needs_root, over_tcp, streaming, until
+from rig import even_ports, free_port, needs_root, over_tcp, streaming, until
 from rtsp_client import RtspClient
 from runner.core.commands import Command
 from runner.gst.repair import OVER_TCP
@@ -59,14 +59,14 @@ def test_a_picture_does_not_wait_for_the_next_one(tcp):
 
 def test_a_viewer_that_falls_back_to_tcp_is_named():
     """Another program holds the ports for RTP."""
+    ports = even_ports(6)
     with ExitStack() as stack:
-        for port in range(28000, 28006):
+        for port in ports:
             stack.enter_context(socket.socket(type=socket.SOCK_DGRAM)).bind(("127.0.0.1", port))
-        _, operator, _, reported = stack.enter_context(driving("media.rtp_ports=[28000,28005]"))
+        _, operator, _, reported = stack.enter_context(driving(f"media.rtp_ports=[{ports[0]},{ports[-1]}]"))
         until(lambda: received(operator).frames > 5, every_s=0.1)
-        until(
-            lambda: {"rear: over TCP, UDP ports 28000-28005 are in use", f"operator: rear: {OVER_TCP}"} <= set(reported)
-        )
+        over_tcp = {f"rear: over TCP, UDP ports {ports[0]}-{ports[-1]} are in use", f"operator: rear: {OVER_TCP}"}
+        until(lambda: over_tcp <= set(reported))
 
 
 @pytest.mark.parametrize(
