@@ -16,7 +16,7 @@ import rig
 
 sync_api = pytest.importorskip("playwright.sync_api")
 
-SCREENSHOTS = Path(os.environ.get("TOD_SCREENSHOTS", "/tmp/tod-runner-screenshots"))
+SCREENSHOTS = os.environ.get("TOD_SCREENSHOTS")  # directory to keep them in
 
 
 until = partial(rig.until, every_s=0.1)  # each poll costs the browser time
@@ -270,9 +270,10 @@ def sized(page, width, height):
     until(lambda: page.evaluate("[innerWidth, innerHeight]") == [width, height])
 
 
-def shot(page, name):
-    SCREENSHOTS.mkdir(parents=True, exist_ok=True)
-    page.screenshot(path=SCREENSHOTS / f"{name}.png")
+def shot(page, name, **options):
+    """Keep a picture of the page for people to look at, if TOD_SCREENSHOTS is set."""
+    if SCREENSHOTS:
+        page.screenshot(path=Path(SCREENSHOTS) / f"{name}.png", **options)
 
 
 def send(page, **event):

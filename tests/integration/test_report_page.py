@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import pytest
 from drives import write_drive, write_models
 
+from browser import shot
 from rig import needs_browser
 from runner.configuration.compose import compose
 from runner.drive.colours import DAY, NIGHT
@@ -36,14 +36,6 @@ SINGLE = {
 DRAWN = "[...document.querySelectorAll('.chart')].every(chart => chart.dataset.drawn)"
 TRACES = """[...document.querySelectorAll('.chart')].map(chart =>
     [chart.dataset.figure, Number(chart.dataset.drive), Number(chart.dataset.part), chart.data.length])"""
-
-
-@pytest.fixture(scope="module")
-def screenshots(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    kept = os.environ.get("TOD_SCREENSHOTS")
-    path = Path(kept) if kept else tmp_path_factory.mktemp("screenshots")
-    path.mkdir(parents=True, exist_ok=True)
-    return path
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +92,7 @@ OTHER_PAGES = (("light", 1280), ("light", 1920), ("dark", 1920))
     ("scheme", "width"),
     [("dark", 1280), *(pytest.param(*other, marks=pytest.mark.soak) for other in OTHER_PAGES)],
 )
-def test_every_chart_is_drawn_and_fits(chromium: Any, single: Path, screenshots: Path, width: int, scheme: str) -> None:
+def test_every_chart_is_drawn_and_fits(chromium: Any, single: Path, width: int, scheme: str) -> None:
     with opened(chromium, single, width, scheme) as page:
         traces = {(figure, part): count for figure, _, part, count in page.evaluate(TRACES)}
         assert traces == SINGLE
@@ -109,7 +101,7 @@ def test_every_chart_is_drawn_and_fits(chromium: Any, single: Path, screenshots:
             links = page.locator(f".files a[href$='.{name}']").evaluate_all("links => links.map(a => a.href)")
             assert len(links) == 6
             assert all(Path(link.removeprefix("file://")).is_file() for link in links)
-        page.screenshot(path=screenshots / f"report-{width}-{scheme}.png", full_page=True)
+        shot(page, f"report-{width}-{scheme}", full_page=True)
 
 
 def test_the_theme_follows_the_system_and_is_chosen_by_a_button(chromium: Any, single: Path) -> None:
@@ -156,9 +148,7 @@ def test_tables_are_reached_by_keyboard(chromium: Any, single: Path) -> None:
         assert page.locator("[aria-label='Statistics by camera'] tbody tr").count() == 8
 
 
-def test_several_drives_share_their_axes(
-    chromium: Any, drives: list[Path], tmp_path: Path, screenshots: Path, unprinted: None
-) -> None:
+def test_several_drives_share_their_axes(chromium: Any, drives: list[Path], tmp_path: Path, unprinted: None) -> None:
     with opened(chromium, report(drives, tmp_path / "out")) as page:
         traces = [tuple(each) for each in page.evaluate(TRACES)]
         assert len(traces) == 1 + 2 + 4 + 4 + 3
@@ -170,4 +160,4 @@ def test_several_drives_share_their_axes(
         assert ranges[0][1] == 60
         assert page.locator("h1").inner_text() == "adaptive and static <share>"
         assert page.locator("[aria-label='One row for each drive'] tbody tr").count() == 2
-        page.screenshot(path=screenshots / "report-several.png", full_page=True)
+        shot(page, "report-several", full_page=True)
