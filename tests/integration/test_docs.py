@@ -40,7 +40,7 @@ SHORT = {  # by verb: words that make it shorter
     "vehicle": ["fps_max=5"],
     "operator": ["fps_max=5", "page.serve=false"],
     "record": ["duration_s=1.2", "fps_max=5"],
-    "simulate": ["duration_s=5"],
+    "simulate": ["duration_s=5", "predictions=absent"],  # which many drives have with each kind of prediction
     "tune": ["duration_s=5", "seeds=2", "left_out=shared", "predictions=absent"],
     "model": ["scalings=[1.0]", "bitrates_kbps=[100,400]", "plan=full"],
 }
