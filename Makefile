@@ -34,7 +34,7 @@ test: $(TEST_READY)
 ALONE = $(shell grep -l mark.alone tests/integration/test_*.py)
 timed: $(TEST_READY)
 	$(BIN)/pytest $(ALONE) -m "alone and not soak $(WITHOUT)" -n $$(($$(nproc) + 1)) --dist loadgroup --durations=10
-	$(BIN)/pytest tests/integration -m "timed and not soak $(WITHOUT)" -n $$(($$(nproc) + 1)) --dist loadfile --no-loadscope-reorder --durations=30
+	$(BIN)/pytest tests/integration -m "timed and not soak $(WITHOUT)" -n $$(($$(nproc) + 2)) --dist loadfile --no-loadscope-reorder --durations=30
 
 untimed: $(TEST_READY)
 	scripts/background $(MAKE) --no-print-directory -j 1 compiled lint javascript golden units

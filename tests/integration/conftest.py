@@ -19,25 +19,37 @@ from runner.settings import Endpoint
 
 UNTIMED = ("test_keyframe", "test_model", "test_report_page")
 
-# Started first, so that no worker is left with a long file at the end.
+# Started first, in this order, so that no worker is left with a long file at the end: those of more than 20 s.
 LONGEST = (
     "test_feedback",
-    "test_docs",
-    "test_page",
-    "test_live",
-    "test_secure",
-    "test_server",
-    "test_control",
     "test_page_layouts",
-    "test_ends",
-    "test_page_sides",
+    "test_server",
+    "test_two_uplinks",
+    "test_docs",
+    "test_secure",
+    "test_page",
     "test_ip_camera",
+    "test_page_sides",
+    "test_control",
+    "test_handover",
+    "test_fleet",
+    "test_live",
     "test_link",
-    "test_latency",
     "test_video_files",
-    "test_record",
     "test_contract",
+    "test_deployment",
     "test_receiver",
+    "test_drive_in_step",
+    "test_latency",
+    "test_record",
+    "test_embedded",
+    "test_ends",
+    "test_watchers",
+    "test_bag_source",
+    "test_loss",
+    "test_slow_cameras",
+    "test_apply",
+    "test_link_lanes",
     "test_quality",
 )
 

@@ -86,10 +86,10 @@ class Programs:
     def output(self, name: str) -> str:
         return (self._log / f"{name}.txt").read_text()
 
-    def file(self) -> str:
-        """A file of all vehicles."""
+    def file(self, names: Sequence[str] = NAMES) -> str:
+        """A file of vehicles."""
         path = self._log / "vehicles.yaml"
-        path.write_text(json.dumps({name: self._own(name) for name in NAMES}))
+        path.write_text(json.dumps({name: self._own(name) for name in names}))
         return str(path)
 
     def _own(self, name: str) -> dict[str, object]:
