@@ -24,7 +24,7 @@ pytestmark = [
 ]  # load delays packets, and so lowers the measured link
 
 ROBOT = (*SMALL_ROBOT, "fps_max=15", "page.serve=false", "pqos=constant", "pqos.kbps=4000")
-SECONDS, SETTLED_S = 14, 6
+SECONDS, SETTLED_S = 12, 6
 PAUSES, PAUSE_S = 3, 0.2
 
 

@@ -407,7 +407,9 @@ def test_no_element_negotiates_again_when_a_viewer_joins():
 
 
 @pytest.mark.alone
-@pytest.mark.parametrize("small", [True, False], ids=["small buffers", "large buffers"])
+@pytest.mark.parametrize(
+    "small", [pytest.param(True, id="small buffers"), pytest.param(False, id="large buffers", marks=pytest.mark.soak)]
+)
 @pytest.mark.parametrize(
     "neighbour", ["both", pytest.param("udp", marks=pytest.mark.soak), pytest.param("tcp", marks=pytest.mark.soak)]
 )
