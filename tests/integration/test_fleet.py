@@ -86,7 +86,7 @@ def test_a_vehicle_that_is_only_listed_costs_its_uplink_nothing(fleet, page):
     _, heard = fleet
     until(lambda: set(heard.telemetry) == set(NAMES))
     for name in NAMES:
-        assert "Nobody drives" in card(page, name).inner_text()
+        until(lambda name=name: "Nobody drives" in card(page, name).inner_text(), every_s=0.1)
         assert (heard.encoding(name), heard.driver(name)) == (set(), None)
     assert page.title() == "Vehicles · tod-runner"
     shot(page, "fleet")

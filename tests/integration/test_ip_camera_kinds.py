@@ -10,7 +10,7 @@ import inside
 import pytest
 from mini_camera import mini_camera
 
-from rig import free_port, ip_camera, streaming, until, watching
+from rig import faults, free_port, ip_camera, streaming, until, watching
 from runner.configuration.yaml_file import load_file
 from runner.core.commands import Command
 from runner.resources import directory
@@ -85,7 +85,7 @@ def test_only_the_chosen_video_of_a_camera_is_set_up(media, medium, chosen):
     ):
         until(lambda: client.frames_with_retry() > 5)
         assert camera.set_up == [chosen]
-        assert reported == ["rear: pipeline built"]
+        assert faults(reported) == ["rear: pipeline built"]
         source = inside.sender(side, "rear").get_by_name("source")
         assert source.get_property("tcp-timeout") == 1_000_000  # as in its file again: the camera has streamed
 
@@ -156,7 +156,10 @@ def test_a_camera_that_answers_slowly_is_awaited(monkeypatch, method, delay_s):
         shown(plan)
         assert side.read()["rear"].fault is None
         assert camera.connections == 1
-        assert reported[1:3] == [f"rear: {waiting}", f"rear: the camera answered {method} after {delay_s:.0f} s"]
+        assert faults(reported)[1:3] == [
+            f"rear: {waiting}",
+            f"rear: the camera answered {method} after {delay_s:.0f} s",
+        ]
 
 
 def test_a_vehicle_stops_while_a_camera_does_not_answer():

@@ -144,7 +144,7 @@ def test_speed_is_advised_by_latency_and_not_without_it(broker):
 
         until(lambda: reported(latency_ms=100) == 1)
         until(lambda: reported(latency_ms=340) == 0.5)
-        assert advice[-1]["latency_ms"] == 400
+        assert {each["latency_ms"] for each in tuple(advice) if each["speed_factor"] == 0.5} == {400}
         until(lambda: operator.telemetry[-1]["speed_factor"] == reported(latency_ms=340))
         until(lambda: reported() == 0)  # it does not know
         until(lambda: reported(latency_ms=100) == 1)

@@ -498,7 +498,7 @@ def test_a_driver_is_warned_if_the_vehicle_has_another_operator_in_control(chrom
         station.happens(event="operator_connected", operator=OWN, role="supervisor")
         server.on_state(replace(station.state, cameras=paused))
         until(lambda: page.inner_text("#alarms") == "❚❚ PAUSED front, rear, mast")
-        assert page.inner_text("#worst-of") == "3 of 3 pictures not live"
+        until(lambda: page.inner_text("#worst-of") == "3 of 3 pictures not live")
         until(lambda: tones(page) >= before + 4)
         shot(page, "paused-drive")
         sample = Sample(1.0, None, 0, 0.0, Position(49.0, 8.4, 10.0), 0, {}, speed_factor=0.5)
@@ -543,7 +543,7 @@ def test_a_driver_is_alerted_to_a_picture_lost_in_a_monitor_only(chromium, pictu
         before = tones(page)
         withheld.add(2)
         until(lambda: page.inner_text("#alarms") == "✕ LOST mast (monitor)")
-        assert page.inner_text("#worst-of") == "1 of 3 pictures not live"
+        until(lambda: page.inner_text("#worst-of") == "1 of 3 pictures not live")
         until(lambda: tones(page) >= before + 4)
         page.bring_to_front()
         shot(page, "lost-in-a-monitor")
@@ -552,10 +552,10 @@ def test_a_driver_is_alerted_to_a_picture_lost_in_a_monitor_only(chromium, pictu
         withheld.add(2)
         until(lambda: page.inner_text("#alarms") == "✕ LOST mast (monitor)")
         viewing(page, "configure")
-        assert page.inner_text("#hidden-alarms") == "✕ LOST mast (monitor)"
+        until(lambda: page.inner_text("#hidden-alarms") == "✕ LOST mast (monitor)")
         monitor.evaluate("dispatchEvent(new Event('pagehide'))")
         monitor.evaluate("new Promise((done) => setTimeout(done, 1000))")  # its worker and its timer go on for a moment
-        assert page.locator("#hidden-alarms").is_hidden()
+        until(page.locator("#hidden-alarms").is_hidden)
         monitor.evaluate("dispatchEvent(new Event('pageshow'))")
         until(lambda: page.inner_text("#hidden-alarms") == "✕ LOST mast (monitor)")
         monitor.close(run_before_unload=True)
@@ -939,7 +939,7 @@ def test_an_enlarged_picture_hides_no_alarm(chromium, picture):
         all_live(page)
         page.locator("[data-camera=front]").dblclick()
         until(lambda: page.locator("[data-camera=rear]").is_hidden())
-        assert page.locator("#hidden-alarms").is_hidden()
+        until(page.locator("#hidden-alarms").is_hidden)  # a busy machine may make a picture late
         server.silent.update(["rear", "front"])
         until(lambda: page.locator("#hidden-alarms").inner_text() == "✕ LOST rear")
         shot(page, "enlarged-alarm")

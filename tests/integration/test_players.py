@@ -14,7 +14,7 @@ from itertools import permutations
 import pytest
 
 from keyed import VEHICLE, WATCHER, issue
-from rig import Client, streaming, until
+from rig import Client, faults, streaming, until
 from rtsp_client import RtspClient
 from runner.core.commands import Command
 from runner.security.keyring import Keyring
@@ -99,7 +99,7 @@ def test_one_medium_is_described_and_set_up_by_each_path(tmp_path, secure):
                 formats = "96 97" if profile == feedback else "96"
                 assert re.findall(r"^m=(.*)\r$", description, re.M) == [f"video 0 {profile} {formats}"]
                 assert (" rtx/90000" in description) is (profile == feedback)
-        assert reported == [f"{CAMERA}: pipeline built"]
+        assert faults(reported) == [f"{CAMERA}: pipeline built"]
 
 
 # --- first pictures ---------------------------------------------------------------------------------------------------

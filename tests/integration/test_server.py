@@ -706,7 +706,7 @@ def test_an_element_that_fails_while_its_pipeline_stops_is_not_reported():
             failing.sync_state_with_parent()
         until(lambda: f"{SMALL_CAMERA}: pipeline stopped" in vehicle.reported)
         assert failed.is_set()
-        assert vehicle.reported == [f"{SMALL_CAMERA}: pipeline {what}" for what in ("built", "stopped")]
+        assert faults(vehicle.reported) == [f"{SMALL_CAMERA}: pipeline {what}" for what in ("built", "stopped")]
 
 
 def test_an_ended_pipeline_leaves_no_watched_source():

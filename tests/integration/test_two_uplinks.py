@@ -19,7 +19,7 @@ import pytest
 from ways import ADDRESSES, ADDRESSES_6, OPERATOR, OPERATOR_6, Ways, two_ways
 
 from keyed import CONTROLLER, VEHICLE, issue
-from rig import LOOPBACK6, free_port, needs_root, repeating, small_robot, until
+from rig import LOOPBACK6, faults, free_port, needs_root, repeating, small_robot, until
 from runner.system import children
 from runner.system.interfaces import addresses_of
 
@@ -65,7 +65,7 @@ class Vehicle:
 
     @property
     def reported(self) -> list[str]:
-        return list(self._ask()["reported"])
+        return faults(self._ask()["reported"])
 
     def end(self) -> None:
         assert self._process.stdin
@@ -315,7 +315,7 @@ def test_an_uplink_whose_device_comes_back_with_another_address_is_used_again(tm
     with drive(tmp_path, keys=False) as (ways, vehicle, operator):
         ways["b"].remove()
         operator.watch(1.5)
-        assert vehicle.reported[1:] == ["uplink b: way-b: No such device"]
+        until(lambda: vehicle.reported[1:] == ["uplink b: way-b: No such device"])
         ways["b"].create("10.78.4.2")
         operator.side.admit({"a": [ADDRESSES["a"]], "b": ["10.78.4.2"]})
         before = ways["b"].passed
@@ -324,7 +324,7 @@ def test_an_uplink_whose_device_comes_back_with_another_address_is_used_again(tm
         operator.watch(1)
         check_every_picture(operator)
         assert operator.side.received()[CAMERA]["b"].packets > FPS
-        assert vehicle.reported[2:] == ["uplink b: works again"]
+        until(lambda: vehicle.reported[2:] == ["uplink b: works again"])
 
 
 @needs_root
@@ -364,7 +364,8 @@ def test_a_stranger_without_keys_is_refused_at_the_address_of_each_uplink(tmp_pa
             with suppress(ssl.SSLError, ConnectionError), tls.wrap_socket(plain) as stranger:
                 stranger.sendall(b"OPTIONS * RTSP/1.0\r\nCSeq: 1\r\n\r\n")
                 assert not stranger.recv(1000)
-        assert vehicle.reported[1].startswith(f"keys: refused an RTSP client at {OPERATOR}: ")
+        refused = f"keys: refused an RTSP client at {OPERATOR}: "
+        until(lambda: any(line.startswith(refused) for line in vehicle.reported))
         check_every_picture(operator)
 
 
