@@ -16,7 +16,7 @@ from runner.page.documents import Documents, document
 from runner.page.front import Front
 from runner.page.loop import PageLoop
 from runner.page.relay import RETRY_S, STATION, relay, station_session
-from runner.page.summaries import CLOSE_S, RELEASE
+from runner.page.summaries import CLOSE_S, HEARTBEAT_S, RELEASE
 from runner.security.keyring import Keyring
 from runner.settings import Endpoint
 from runner.system.ports import check_port_free
@@ -146,7 +146,7 @@ class FleetServer:
 
     async def _on_list(self, request: web.Request) -> web.WebSocketResponse:
         """Send the list whenever it has changed, until the browser leaves or may no longer see it."""
-        ws = web.WebSocketResponse(compress=False, heartbeat=1.0, timeout=CLOSE_S)
+        ws = web.WebSocketResponse(compress=False, heartbeat=HEARTBEAT_S, timeout=CLOSE_S)
         await ws.prepare(request)
         self._lists.add(ws)
         try:

@@ -12,6 +12,7 @@ from runner.operator.summary import summary
 from runner.records.vehicle import Outcome
 
 EVERY_S = 0.5
+HEARTBEAT_S = 10.0  # between pings; to answer one, a browser on a slow network or a busy machine has half of it
 CLOSE_S = 0.1  # how long the other side may take to answer that it is closed
 RELEASE = "release"  # the other side's only message: release control
 
@@ -23,7 +24,7 @@ class Summaries:
         self._station, self._open = station, set[web.WebSocketResponse]()
 
     async def serve(self, request: web.Request) -> web.WebSocketResponse:
-        ws = web.WebSocketResponse(compress=False, heartbeat=1.0, timeout=CLOSE_S)
+        ws = web.WebSocketResponse(compress=False, heartbeat=HEARTBEAT_S, timeout=CLOSE_S)
         await ws.prepare(request)
         self._open.add(ws)
         try:
