@@ -219,12 +219,13 @@ def test_a_flood_of_one_operator_does_not_delay_others(broker, vehicle):
             waits.append(time.monotonic() - began)
             assert reply["result"] == "applied", reply
             time.sleep(0.05)
-        assert int(flood.communicate()[0]) > 20_000
+        sent = int(flood.communicate()[0])
+    assert sent > 10_000  # of 40 000: a busy machine floods less
     print(f"{len(waits)} requests, {max(waits) * 1000:.0f} ms at most")
     most_s = max(0.5, (began - flooded) / 5)  # a busy machine is slow; behind the flood they would wait for its end
     assert sorted(waits)[len(waits) * 9 // 10] < most_s
     assert sorted(waits)[-2] < 2 * most_s  # when the flood begins, everything on the machine is delayed
-    until(lambda: good.telemetry[-1]["refused"] > 10_000)
+    until(lambda: good.telemetry[-1]["refused"] > sent / 4)
 
 
 # --- broker -----------------------------------------------------------------------------------------------------------

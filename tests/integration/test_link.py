@@ -467,10 +467,13 @@ def test_both_directions_of_a_namespace_lose_and_delay_any_packet():
 
 FLOOD = """
 import socket, sys, time
-out, began = socket.socket(type=socket.SOCK_DGRAM), time.monotonic()
+out, began, late_s = socket.socket(type=socket.SOCK_DGRAM), time.monotonic(), 0.0
 for number in range(250):  # of 1028 bytes on the link each, 2056 kbit/s
-    time.sleep(max(0, began + number * 0.004 - time.monotonic()))
+    due = began + number * 0.004
+    time.sleep(max(0, due - time.monotonic()))
+    late_s = max(late_s, time.monotonic() - due)
     out.sendto(bytes(1000), (sys.argv[1], 9))
+print(late_s)
 """
 
 
@@ -478,11 +481,14 @@ for number in range(250):  # of 1028 bytes on the link each, 2056 kbit/s
 def test_a_policer_drops_what_exceeds_its_rate_without_a_queue():
     """Of a second at 2056 kbit/s it passes 1028 kbit/s and its depth; nothing waits."""
     policed = replace(WIDE, policer=Policing(1028, 64))
-    lines = []
-    with limited_link("netns", policed, *_ends(), lines.append) as link:
-        flood = (sys.executable, "-c", FLOOD, link.broker.host)
-        subprocess.run([*link.vehicle_command, *flood], check=True, timeout=30)
-        link.start(time.time())
+    for _ in range(5):
+        lines = []
+        with limited_link("netns", policed, *_ends(), lines.append) as link:
+            flood = [*link.vehicle_command, sys.executable, "-c", FLOOD, link.broker.host]
+            late_s = float(subprocess.run(flood, check=True, timeout=30, stdout=subprocess.PIPE).stdout)
+            link.start(time.time())
+        if late_s < 0.03:
+            break  # otherwise a busy machine sent a burst, of which less passes
     assert lines[-1].queue_ms == 0
     assert lines[-1].packets + lines[-1].dropped == 250
     assert 125 <= lines[-1].packets <= 150
