@@ -20,7 +20,7 @@ NODE_READY := node_modules/.ready
 # Tests start hundreds of processes; without cached bytecode each would compile the project again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test generated timed untimed compiled golden units check fast coverage lint javascript setup bench deadspot uplink-given soak everywhere packages ros1 ros2 clean
+.PHONY: demo test generated timed untimed checks compiled golden units check fast coverage lint javascript setup bench deadspot uplink-given soak everywhere packages ros1 ros2 clean
 
 demo: $(READY)
 	$(BIN)/tod-runner demo
@@ -37,7 +37,10 @@ timed: $(TEST_READY)
 	$(BIN)/pytest tests/integration -m "timed and not soak $(WITHOUT)" -n $$(($$(nproc) + 2)) --dist loadfile --no-loadscope-reorder --durations=30
 
 untimed: $(TEST_READY)
-	scripts/background $(MAKE) --no-print-directory -j 1 compiled lint javascript golden units
+	scripts/background $(MAKE) --no-print-directory -j 1 compiled checks
+
+checks: $(TEST_READY)
+	$(MAKE) --no-print-directory -j 2 --output-sync=line lint javascript golden units
 
 # Workers of pytest start at the same time, and each would compile all tests, and what Numba compiles at the first call.
 # What cannot be imported, or fails, does so there.

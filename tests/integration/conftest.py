@@ -56,9 +56,9 @@ LONGEST = (
 # Files of drives among the tests marked `alone`, in two groups: the tests of a group run one after the other.
 DRIVES = {
     "test_link": "1",
-    "test_feedback": "1",
+    "test_live": "1",
     "test_players": "1",
-    "test_live": "2",
+    "test_feedback": "2",
     "test_page_sides": "2",
     "test_transports": "2",
 }
