@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from aiohttp import web
+from aiohttp import WSCloseCode, web
 from aiohttp.http_exceptions import HttpProcessingError
 from aiohttp.web_protocol import RequestHandler
 
@@ -19,6 +20,8 @@ from runner.system.reports import LimitedReports
 MAX_STRANGERS = 100  # connections without access; a new one replaces the oldest
 MAX_BODY = 4096  # bytes of a request
 REQUEST_S = 10.0  # a connection without a complete request for this long is closed
+FAREWELL_S = 0.3  # how long browsers may take to answer that it ends
+ENDED = b"the station has ended"  # reason of closing, to pages: a crash or a cut link states none
 
 
 class Connections:
@@ -115,6 +118,13 @@ class Connections:
             raise ConnectionRefusedError("too many connections")
         del self._strangers[oldest]
         abort(oldest.transport)
+
+
+async def say_ended(sockets: Iterable[web.WebSocketResponse]) -> None:
+    """Close WebSockets because this program ends in order, after all that was sent by them."""
+    closing = [ws.close(code=WSCloseCode.GOING_AWAY, message=ENDED) for ws in sockets]
+    with suppress(TimeoutError):
+        await asyncio.wait_for(asyncio.gather(*closing, return_exceptions=True), FAREWELL_S)
 
 
 def abort(transport: asyncio.BaseTransport | None) -> None:

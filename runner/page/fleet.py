@@ -12,6 +12,7 @@ from typing import Any
 
 from aiohttp import ClientError, ClientWebSocketResponse, WSMessage, WSMsgType, web
 
+from runner.page.connections import say_ended
 from runner.page.documents import Documents, document
 from runner.page.front import Front
 from runner.page.loop import PageLoop
@@ -107,8 +108,7 @@ class FleetServer:
                 vehicle.task.cancel()
         for transport in list(self._relayed):
             transport.abort()
-        for ws in list(self._lists):
-            await ws.close()
+        await say_ended(self._lists)
         await self._front.connections.close()
 
     def _add(self, vehicle: Listed) -> None:

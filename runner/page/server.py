@@ -23,7 +23,7 @@ from runner.h264.access_unit import AccessUnit, RecentUnits
 from runner.mqtt.messages import read_message
 from runner.operator.station import LinkState, Listener, Station
 from runner.page.access import Access
-from runner.page.connections import abort
+from runner.page.connections import abort, say_ended
 from runner.page.counter import CounterReading, counter_reading
 from runner.page.documents import Documents, document
 from runner.page.front import Front
@@ -105,6 +105,7 @@ class PageServer(Listener):
         self._history = History()
         self._notes: deque[Mapping[str, Any]] = deque(maxlen=NOTES)
         self._turn = asyncio.Lock()
+        self._open = set[web.WebSocketResponse]()
 
     @property
     def url(self) -> str:
@@ -116,7 +117,7 @@ class PageServer(Listener):
             self._station.note(note)
 
     def stop(self) -> None:
-        self._loop.stop(self._front.connections.close())
+        self._loop.stop(self._end())
 
     def on_state(self, state: VehicleState | None) -> None:
         self._call_soon(self._windows.broadcast, "state", _stated(state, self._station))
@@ -156,6 +157,10 @@ class PageServer(Listener):
         app.router.add_get("/counter", document("counter.html"))
         self._documents.add_to(app, self._front.access)
         return await self._front.connections.serve(app, self._setup.page.endpoint)
+
+    async def _end(self) -> None:
+        await say_ended(self._open)
+        await self._front.connections.close()
 
     def _on_attention(self, attention: Attention | None) -> None:
         self._station.attention = attention
@@ -203,6 +208,7 @@ class PageServer(Listener):
         except ValueError:  # headers that are not ASCII: the client's fault
             raise web.HTTPBadRequest(text="not a handshake of a WebSocket\n") from None
         viewer = PageViewer(token, cameras, lambda camera: self._recent[camera].burst(), browser, monitor, visitor)
+        self._open.add(ws)
         self._windows.add(viewer)
         self._send_current_state(viewer)
         self._windows.opened(viewer, request.query.get("before"))
@@ -218,6 +224,7 @@ class PageServer(Listener):
         finally:
             for task in tasks:
                 task.cancel()
+            self._open.discard(ws)
             self._windows.closed(viewer)
         return ws
 

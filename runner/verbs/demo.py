@@ -40,10 +40,11 @@ import json
 import os
 import re
 import shlex
+import subprocess
 import tempfile
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from itertools import count
@@ -72,6 +73,7 @@ from runner.verbs.screen import command_name, progress_bar, say, streaming
 
 AS_GIVEN = ("vehicle", "cameras", "fps_max", "experiment")  # what keeps all cameras, if the user gives one of them
 OTHER_VEHICLE = ("vehicle", "source", "experiment")  # of these, camera= chooses its own
+FAREWELL_S = 0.3  # of the operator's side to its pages
 LOOK_S = 0.05  # how soon the other side is stopped once one has ended
 SIDE_END_S = signals.END_S + 0.2  # a side ends itself by force before it is killed
 END_S = 2.8  # both sides, link and broker
@@ -376,11 +378,18 @@ def _sides(words: Sequence[str], link: LimitedLink | None, run: _Run) -> Iterato
                     say(line.rstrip())
 
 
-def _end(sides: Iterable[VerbProcess]) -> None:
-    """Ask both sides to end, and kill those that do not."""
+def _end(sides: Sequence[VerbProcess]) -> None:
+    """Ask both sides to end, and kill those that do not.
+
+    sides  vehicle and operator: the page is told that the operator's side ends before it learns that the vehicle is
+           gone, which is an alarm
+    """
     until = time.monotonic() + SIDE_END_S
-    for side in sides:
-        side.request_end()
+    vehicle, operator = sides
+    operator.request_end()
+    with suppress(subprocess.TimeoutExpired):
+        operator.process.wait(FAREWELL_S)
+    vehicle.request_end()
     for side in sides:
         if not children.end(side.process, max(0.0, until - time.monotonic())):
             left = " but still runs, blocked in the kernel" if side.poll() is None else ""

@@ -102,6 +102,24 @@ def test_a_hung_station_is_dropped_and_reconnected(chromium):
         reconnects(page)
 
 
+def test_a_station_that_ends_says_so_and_a_killed_one_is_lost(chromium):
+    with sides() as (url, vehicle, operator), vehicle(), opened(chromium, url, refused=True) as page:
+        all_live(page)
+        operator.send_signal(signal.SIGTERM)
+        page.wait_for_selector("#banner:not([hidden])")
+        assert page.locator("#banner").inner_text().startswith("○ The station has ended")
+        assert page.locator("#connection").inner_text() == "○ station has ended"
+        until(lambda: statuses(page) == {"ended"})
+        shot(page, "station-ended")
+        with process(*operator.args[3:]) as again:
+            until(lambda: answers(int(url.rstrip("/").rpartition(":")[2])))
+            reconnects(page)
+            again.kill()
+            page.wait_for_selector("#banner:not([hidden])")
+            assert "NO CONNECTION TO THE STATION" in page.locator("#banner").inner_text()
+            until(lambda: statuses(page) == {"lost"})
+
+
 @pytest.mark.alone
 @pytest.mark.soak
 @pytest.mark.parametrize("attempts", [12, 25])
@@ -114,6 +132,10 @@ def test_a_restarted_station_is_reconnected_promptly(chromium, attempts):
         with process(*operator.args[3:], "dimensions.width_m=0.6"):  # the page's worker makes new streams
             until(lambda: answers(int(url.rstrip("/").rpartition(":")[2])))
             reconnects(page)
+
+
+def statuses(page):
+    return set(page.eval_on_selector_all(".tile", "all => all.map(({ dataset }) => dataset.status)"))
 
 
 def reconnects(page):

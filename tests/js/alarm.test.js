@@ -14,7 +14,7 @@ function tones(...changes) {
 test("a stalled picture and a late one have different tones", () => {
   for (const status of ["lost", "frozen", "unsupported"]) assert.deepEqual(tones([0, status]), ["lost"]);
   for (const status of ["late", "damaged"]) assert.deepEqual(tones([0, status]), ["late"]);
-  for (const status of ["live", "synchronising", "off"]) assert.deepEqual(tones([0, status]), [null]);
+  for (const status of ["live", "synchronising", "off", "ended"]) assert.deepEqual(tones([0, status]), [null]);
 });
 
 test("a picture that fails again within two seconds triggers one tone", () => {

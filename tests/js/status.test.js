@@ -16,6 +16,8 @@ const judged = (more) => judge({ ...LIVE, ...more }, LIMITS, NOW);
 test("a stream whose pictures arrive is live", () => assert.equal(judged({}), "live"));
 
 const CASES = [
+  ["ended", { connected: false, ended: true }],
+  ["ended", { connected: false, ended: true, on: false, arrived: NOW - 5000 }],
   ["off", { on: false }],
   ["off", { on: false, sending: false, arrived: NOW - 5000 }], // the silence was requested
   ["paused", { sending: false }],

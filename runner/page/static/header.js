@@ -9,6 +9,7 @@ import { byId, displayName, setAttribute, setText, whole } from "./format.js";
 const START_MS = 800; // no alarm while the page is opening
 const GRACE_MS = 2000; // of a warning
 const UNKNOWN = "▲ Latency unknown: no capture times, or no answer from the vehicle's clock; LATE covers only the time since arrival here";
+const ENDED = "○ The station has ended: no video. This page looks for it, and connects once it runs again";
 const UNMEASURED = "▲ No measurements from the station: speed, advised speed and bitrates are unknown";
 
 let clockKnownAt = performance.now(); // when the clock offset was last known, or could not be measured
@@ -50,15 +51,16 @@ function refreshBanner() {
   const why = store.hung
     ? "VIDEO STOPPED: the page's worker does not respond; reload the page"
     : "NO CONNECTION TO THE STATION: video is not live; reconnecting";
+  const gone = store.ended && !store.hung ? ENDED : `✕ ${why}`;
   const offline = store.link.fault ? `VIDEO IS NOT LIVE: ${store.link.fault}` : "VEHICLE OFFLINE: video is not live";
-  const text = store.connected ? offline : why;
   byId("banner").hidden = !isOffline;
-  setText(byId("banner"), isOffline ? `✕ ${text}` : "");
+  setAttribute(byId("banner"), "data-level", gone === ENDED && !store.connected ? "ended" : null);
+  setText(byId("banner"), isOffline ? (store.connected ? `✕ ${offline}` : gone) : "");
 }
 
 /** What is wrong with the connection to the vehicle; null: nothing. */
 export function linkFault() {
-  if (!store.connected) return store.hung ? "video stopped" : "station unreachable";
+  if (!store.connected) return store.hung ? "video stopped" : store.ended ? "station has ended" : "station unreachable";
   if (!store.state) return "no state yet";
   if (!store.state.online) return store.link.fault ? "no control link" : "vehicle offline";
   return isUnheard() ? "vehicle receives nothing" : null;
@@ -66,8 +68,9 @@ export function linkFault() {
 
 function refreshConnection() {
   const fault = linkFault();
-  setText(byId("connection"), fault ? `✕ ${fault}` : "● connected");
-  setAttribute(byId("connection"), "data-state", fault ? "bad" : "fine");
+  const state = !fault ? "fine" : store.ended && !store.hung ? "ended" : "bad";
+  setText(byId("connection"), fault ? `${state === "ended" ? "○" : "✕"} ${fault}` : "● connected");
+  setAttribute(byId("connection"), "data-state", state);
 }
 
 /** Warn once samples have ceased, or the clock offset has been unknown for a while: measuring it takes time. */

@@ -15,7 +15,8 @@ let hung = null; // while the worker hangs: its last connection state
 
 const handlers = {
   server: ({ message }) => onStationMessage(message),
-  socket({ open }) {
+  socket({ open, ended }) {
+    store.ended = ended;
     if (hung) return void (hung.connected = open);
     store.connected = open;
     if (!open) store.holder = "unknown";

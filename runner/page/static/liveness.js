@@ -88,10 +88,10 @@ export class Liveness {
 
   /** @param {{refused: string, fps?: number, drawn?: boolean}} more fps: of the drawing, at most; drawn: whether the newest counts */
   times({ refused, fps = Infinity, drawn = true }) {
-    const { connected, online } = this.station;
+    const { connected, ended, online } = this.station;
     const { on, sending, unopened, stood_since, waits_since, damaged, arrived, decoded, late_until } = this;
     const { wave_s } = this.camera;
-    const known = { connected, online, on, sending, unopened, refused, stood_since, waits_since, wave_s, damaged };
+    const known = { connected, ended, online, on, sending, unopened, refused, stood_since, waits_since, wave_s, damaged };
     const faulty = this.failed_at !== null;
     const least = Math.min(this.slow_fps ?? this.camera.fps, fps);
     const begins = !this.beginning.isOver;

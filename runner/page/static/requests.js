@@ -47,7 +47,8 @@ export function pending(control) {
 
 /** Why this page's person cannot change what is sent, and what they can do. */
 export function whyNoControl() {
-  if (!store.connected) return store.hung ? "the page's worker does not respond" : "no connection to the station";
+  if (store.hung) return "the page's worker does not respond";
+  if (!store.connected) return store.ended ? "the station has ended" : "no connection to the station";
   if (onlyWatches()) return "you may only watch";
   const { driving } = store;
   switch (who()) {

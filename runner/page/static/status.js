@@ -14,6 +14,7 @@ export const INTERVALS = 1.3; // this many frame intervals without a picture are
 /**
  * @typedef {object} Times the known state of a stream
  * @property {boolean} connected
+ * @property {boolean} [ended] whether the station has ended in order
  * @property {boolean} online
  * @property {boolean|null} on
  * @property {boolean|null} sending
@@ -36,9 +37,10 @@ export const INTERVALS = 1.3; // this many frame intervals without a picture are
  * @param {Times} s
  * @param {{frozen_ms: number}} limits
  * @param {number} now page time
- * @returns {"off"|"paused"|"lost"|"refused"|"unsupported"|"frozen"|"damaged"|"late"|"synchronising"|"live"}
+ * @returns {"ended"|"off"|"paused"|"lost"|"refused"|"unsupported"|"frozen"|"damaged"|"late"|"synchronising"|"live"}
  */
 export function judge(s, limits, now) {
+  if (s.ended) return "ended";
   const reachable = s.connected && s.online;
   if (reachable && s.on === false) return "off";
   if (reachable && s.sending === false) return s.unopened ? "lost" : "paused";

@@ -69,6 +69,7 @@ let sampledAt = -Infinity; // page time of the last sample
  * @property {boolean} elsewhere
  * @property {boolean} covered
  * @property {boolean} connected
+ * @property {boolean} ended
  * @property {boolean} hung
  * @property {Note[]} notes
  * @property {ReturnType<typeof emptySeries>} series
@@ -97,6 +98,7 @@ export const store = {
   elsewhere: false, // whether another window of this page has the keyboard focus
   covered: false, // whether another window of this page is hidden
   connected: false,
+  ended: false, // whether the station has ended in order, and has not returned since
   hung: false, // whether the worker does not respond: nothing is known then
   notes: [],
   series: emptySeries([]),

@@ -21,9 +21,10 @@ import { announce, boxSize, byId, displayName, factor, latency, make, setAttribu
 
 export const SHAPES = {
   live: "●", late: "▲", damaged: "◪", frozen: "■", lost: "✕", off: "○", paused: "❚❚", synchronising: "◌", unsupported: "⊘", refused: "⊗",
+  ended: "○",
 };
 const SHORT = { synchronising: "SYNC", unsupported: "NO PICTURE" }; // the overlay has the full word
-const SILENT = ["lost", "off", "paused", "refused"]; // no frames arrive: the last values are out of date
+const SILENT = ["lost", "off", "paused", "refused", "ended"]; // no frames arrive: the last values are out of date
 export const STALE = [...SILENT, "frozen"]; // the displayed picture is older than when it was drawn
 export const EXPLAINED = ["refused", "unsupported"]; // by `store.refused`
 const THIN = "\u2009"; // space

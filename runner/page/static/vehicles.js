@@ -1,5 +1,6 @@
 /** The vehicles of this station, each as a card: on the page that lists them, and beside the pictures of one of them. */
 
+import { hasEnded } from "./ended.js";
 import { make, setAttribute, setText } from "./format.js";
 import { alarmsOf, driverOf, figuresOf, isHeldHere, pictureOf, stateOf, toWatcher } from "./vehicle_words.js";
 
@@ -83,7 +84,8 @@ class Card {
  * @param {object} options
  * @param {string|null} options.current name of the vehicle of this page
  * @param {(name: string) => boolean} options.mayLeave whether a vehicle may be opened now in place of the current one
- * @param {(rows: Row[]|null) => void} [options.onRows] called with each list; null: there is no connection
+ * @param {(rows: Row[]|null, ended?: boolean) => void} [options.onRows] called with each list; null: there is no connection,
+ *   ended: because the server has ended in order
  */
 export function startVehicles(element, { current, mayLeave, onRows = () => {} }) {
   /** @type {Map<string, Card>} */
@@ -101,16 +103,16 @@ export function startVehicles(element, { current, mayLeave, onRows = () => {} })
     onRows(rows);
   }
 
-  const release = follow((rows) => {
+  const release = follow((rows, ended) => {
     setAttribute(element, "data-stale", rows ? null : "");
     if (rows) show(rows);
-    else onRows(null);
+    else onRows(null, ended);
   });
 }
 
 /**
  * Call a function with each list that the server sends; null: it sends none.
- * @param {(rows: Row[]|null) => void} onList
+ * @param {(rows: Row[]|null, ended?: boolean) => void} onList
  * @returns {(name: string) => void} releases control of a vehicle
  */
 function follow(onList) {
@@ -126,18 +128,18 @@ function follow(onList) {
       const { vehicles, may_drive } = JSON.parse(data);
       onList(may_drive ? vehicles : vehicles.map(toWatcher));
     };
-    own.onclose = () => own === socket && again();
+    own.onclose = (event) => own === socket && again(hasEnded(event));
     return own;
   }
 
-  function again() {
-    onList(null);
+  function again(ended = false) {
+    onList(null, ended);
     setTimeout(async () => {
       const answer = await fetch("/static/vehicles.js", { method: "HEAD", cache: "no-store" }).catch(() => null);
       if (answer?.status === 401) return location.assign("/login");
       heard = performance.now();
       if (answer?.ok) socket = connect();
-      else again();
+      else again(ended);
     }, AGAIN_MS);
   }
 

@@ -8,6 +8,7 @@ import { ageOf, skewOf } from "./ages.js";
 import { isTopView } from "./arrange.js";
 import { Clock, now } from "./clock.js";
 import { described } from "./drawn_pictures.js";
+import { hasEnded } from "./ended.js";
 import { GroundView } from "./ground_view.js";
 import { hasGpu } from "./picture.js";
 import { startWarps } from "./remote_warp.js";
@@ -51,6 +52,7 @@ const station = {
   dimensions: null, // of the vehicle
   limits: { late_ms: 200, frozen_ms: 120 },
   connected: false,
+  ended: false, // whether it has ended in order, and has not returned since
   online: true,
   bound: NaN, // error bound of capture times on the station's clock, ms
   video: true,
@@ -99,15 +101,15 @@ function connect() {
     if (typeof data === "string") onText(JSON.parse(data));
     else onUnit(data);
   };
-  own.onclose = dropConnection;
+  own.onclose = (event) => dropConnection(hasEnded(event));
 }
 
-/** Give up a connection, or an attempt at one, and retry soon. */
-function dropConnection() {
+/** Give up a connection, or an attempt at one, and retry soon. @param {boolean} [ended] whether the station has ended in order */
+function dropConnection(ended = false) {
   socket.onopen = socket.onmessage = socket.onclose = null;
   socket.close();
   socket = null;
-  setConnected(false);
+  setConnected(false, ended);
   setTimeout(reconnect, RECONNECT_MS);
 }
 
@@ -131,12 +133,12 @@ function checkConnection() {
   if (now() - receivedAt > limit) dropConnection();
 }
 
-function setConnected(open) {
+function setConnected(open, ended = false) {
   if (station.connected === open) return;
-  station.connected = open;
+  Object.assign(station, { connected: open, ended });
   reported = "";
   if (!open) judgeAll();
-  toPage({ kind: "socket", open });
+  toPage({ kind: "socket", open, ended });
 }
 
 function send(message) {
