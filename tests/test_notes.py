@@ -50,7 +50,7 @@ def state(
 
 PREDICTED = "bitrate_predicted kbps 900"
 LOW = "500 of 4000 kbit/s, range [0, 800) -> 0.25"
-RATE = "0.5 of 4.0 Mbit/s"
+RATE = "500 of 4000 kbit/s"
 STALE = "no prediction for 2 s"
 LIMIT = "total 900 -> 400: capacity of the link, believed to be 440"
 

@@ -84,7 +84,7 @@ def driver_words(driving: Driving, own: str, since: float) -> str:
 def decision_note(before: VehicleState, state: VehicleState) -> str | None:
     """The changes made by a decision, and why.
 
-        Prediction 900 kbit/s: rear smaller, at quarter size (0.3 of 4.0 Mbit/s)
+        Prediction 900 kbit/s: rear smaller, at quarter size (300 of 4000 kbit/s)
         Mode automatic: front, rear smaller, at quarter size; mast on, at 1/8 size (3 of 8 cameras, total 900 kbit/s)
         Mode single: total 3000 kbit/s, cameras keep what mode collective gave them
 
@@ -198,10 +198,7 @@ def _rate(camera: CameraState) -> str:
     """The allocated bitrate of what the camera could use; of one that is not sent, why."""
     if not camera.sending:
         return camera.reason.split("; ")[0].removeprefix("lost: ") if camera.scaling is None and camera.on else ""
-    kbps, demand = camera.kbps, max(camera.kbps, camera.demand_kbps)
-    if kbps < 100:
-        return f"{kbps:.0f} of {demand:.0f} kbit/s"
-    return f"{kbps / 1000:.1f} of {demand / 1000:.1f} Mbit/s"
+    return f"{camera.kbps:.0f} of {max(camera.kbps, camera.demand_kbps):.0f} kbit/s"
 
 
 class Refusals:

@@ -228,8 +228,8 @@ def test_find_out_why_a_camera_got_less(typist, page):
     typist.does("camera_left")
     typist.does("drawer")
     reason = page.locator("#camera-panel .why-decided")
-    rate = f"0.1 of {FULL_KBPS / 1000:.1f} Mbit/s"
-    until(lambda: f"Half size: {rate}, its share of the 0.4 Mbit/s set." in reason.inner_text())
+    rate = f"100 of {FULL_KBPS} kbit/s"
+    until(lambda: f"Half size: {rate}, its share of the 400 set." in reason.inner_text())
     formula = f"100 of {FULL_KBPS} kbit/s, range [0, 200) -> 0.5"
     assert formula not in reason.inner_text()
     reason.locator("summary").press("Enter")

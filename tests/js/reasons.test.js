@@ -3,7 +3,8 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-import { limitWords, percent, rateWords, reasonWords, regionWords, sizeWords } from "../../runner/page/static/reasons.js";
+import { limitWords, percent, reasonWords, regionWords, setterWords, sizeWords } from "../../runner/page/static/reasons.js";
+import { rate } from "../../runner/page/static/format.js";
 
 const FULL = { width: 1920, height: 1040 };
 const CAMERA = /** @type {any} */ ({
@@ -17,14 +18,14 @@ test("a factor is a size", () => {
   assert.deepEqual(words, ["full size", "half size", "quarter size", "1/8 size", "3/8 size", "3/4 size", "0.3 of full size"]);
 });
 
-test("a bitrate is of what could be used", () => {
-  assert.equal(rateWords(1000, 6000), "1.0 of 6.0 Mbit/s");
-  assert.equal(rateWords(99, 6000), "99 of 6000 kbit/s");
+test("every bitrate has the same unit", () => {
+  assert.equal(rate(1000, 6000), "1000 of 6000 kbit/s");
+  assert.deepEqual([12_345.6, 0.4, null].map((kbps) => rate(kbps)), ["12346 kbit/s", "0 kbit/s", "– kbit/s"]);
 });
 
 test("a part of the image is never none of it", () => assert.deepEqual([0.25, 0.001].map(percent), ["25 %", "less than 1 %"]));
 
-const SHARE = "Half size: 1.2 of 6.0 Mbit/s, its share of the 6.5 Mbit/s";
+const SHARE = "Half size: 1181 of 6000 kbit/s, its share of the 6500";
 const TABLE = [
   [{}, {}, `${SHARE} predicted.`],
   [{}, { predicted: false }, `${SHARE} at the start.`],
@@ -32,11 +33,11 @@ const TABLE = [
   [{}, { asked_kbps: 3000 }, `${SHARE} the link carries.`], // more than was predicted
   [{}, { mode: "collective" }, `${SHARE} set.`],
   [{}, { mode: "collective", asked_kbps: 9000 }, `${SHARE} the link carries.`],
-  [{}, { mode: "single" }, "Half size: 1.2 of 6.0 Mbit/s."],
-  [{}, { mode: "single", asked_kbps: 9000 }, "Half size: 1.2 of 6.0 Mbit/s, less than was set: the link carries no more."],
-  [{ kbps: 6000, scaling: 1 }, {}, "Full size: 6.0 of 6.0 Mbit/s, all that it can use."],
-  [{ kbps: 7000 }, { mode: "single" }, "Half size: 7.0 of 7.0 Mbit/s."],
-  [{ roi: { x: 0, y: 0, width: 960, height: 520 }, demand_kbps: 1500, kbps: 300, scaling: 0.25 }, {}, "Quarter size of 25 % of the image: 0.3 of 1.5 Mbit/s, its share of the 6.5 Mbit/s predicted."],
+  [{}, { mode: "single" }, "Half size: 1181 of 6000 kbit/s."],
+  [{}, { mode: "single", asked_kbps: 9000 }, "Half size: 1181 of 6000 kbit/s, less than was set: the link carries no more."],
+  [{ kbps: 6000, scaling: 1 }, {}, "Full size: 6000 of 6000 kbit/s, all that it can use."],
+  [{ kbps: 7000 }, { mode: "single" }, "Half size: 7000 of 7000 kbit/s."],
+  [{ roi: { x: 0, y: 0, width: 960, height: 520 }, demand_kbps: 1500, kbps: 300, scaling: 0.25 }, {}, "Quarter size of 25 % of the image: 300 of 1500 kbit/s, its share of the 6500 predicted."],
   [{ on: false, sending: false, scaling: null, reason: "switched off" }, {}, "Switched off."],
   [{ sending: false, scaling: null, reason: "lost: no /dev/video0" }, {}, "No picture: no /dev/video0."],
   [{ sending: false, reason: "0 of 6000 kbit/s; not sending: operator gone for 3.2 s" }, {}, "Paused: operator gone for 3.2 s."],
@@ -45,6 +46,12 @@ const TABLE = [
 ];
 for (const [camera, { predicted = true, ...state }, words] of /** @type {any[]} */ (TABLE))
   test(words, () => assert.equal(reasonWords({ ...CAMERA, ...camera }, { ...STATE, ...state }, FULL, predicted), words));
+
+test("what sets the total in mode A is the link where that limits, or raises, what was predicted", () => {
+  assert.equal(setterWords(STATE, true), "Set by the prediction");
+  assert.equal(setterWords(STATE, false), "Set by the mode, without a prediction");
+  for (const asked_kbps of [3000, 9000]) assert.equal(setterWords({ ...STATE, asked_kbps }, true), "Set by what the link carries");
+});
 
 test("nothing is said of a vehicle that is offline", () => assert.equal(reasonWords(undefined, null, FULL, false), "–"));
 

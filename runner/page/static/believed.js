@@ -1,5 +1,7 @@
 /** What the vehicle believes of its uplink, and what predictions of it are worth, in words for a driver. */
 
+import { rate } from "./format.js";
+
 const SURE = 0.3; // deviation, ln: a capacity that is less sure is not stated
 const STEP = 5; // %: finer figures would change all the time
 const SCATTER = 10; // %: errors below this are not worth words
@@ -26,8 +28,8 @@ export const furtherReasons = (reasons, words) =>
   reasons.filter((reason) => !words.startsWith("Link: ") || !SAID.some((each) => reason.includes(each)));
 
 function linkWords({ kbps, deviation, margin, policer_kbps }) {
-  if (policer_kbps !== null) return `Link: drops what exceeds ${about(policer_kbps)} kbit/s.`;
-  return deviation > SURE ? "" : `Link: about ${about(kbps)} kbit/s, ${rounded(1 - Math.exp(-margin))} % kept free.`;
+  if (policer_kbps !== null) return `Link: drops what exceeds ${rate(about(policer_kbps))}.`;
+  return deviation > SURE ? "" : `Link: about ${rate(about(kbps))}, ${rounded(1 - Math.exp(-margin))} % kept free.`;
 }
 
 function predictionWords({ bias, error, gain }) {

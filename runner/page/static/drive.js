@@ -18,7 +18,7 @@ import { limitWords } from "./reasons.js";
 import { limitReasons, pauseReason } from "./total.js";
 import { copiesWords, ofWords, totalsOf } from "./totals.js";
 import { showUplinks, uplinkLines } from "./uplinks.js";
-import { byId, displayName, latency, setAttribute, setText, whole } from "./format.js";
+import { byId, displayName, KBPS, latency, setAttribute, setText, whole } from "./format.js";
 
 const MODES = { single: "Single", automatic: "Automatic", collective: "Collective" };
 const WORDS = { unsupported: "NO PICTURE" };
@@ -106,7 +106,7 @@ function steeringText(rad) {
 
 function totalWords() {
   const totals = isOnline() ? totalsOf(store.state) : null;
-  return `${whole(totals?.total)}${ofWords(totals)} kbit/s${copiesWords(totals)}`;
+  return `${whole(totals?.total)}${ofWords(totals)} ${KBPS}${copiesWords(totals)}`;
 }
 
 /** The state of the connection, why nothing is sent, or what limits the total. */

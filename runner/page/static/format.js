@@ -5,6 +5,11 @@ const WHOLE = new Intl.NumberFormat("en", { maximumFractionDigits: 0, useGroupin
 /** A whole number, "–" where unknown. */
 export const whole = (value) => (Number.isFinite(value) ? WHOLE.format(value) : "–");
 
+export const KBPS = "kbit/s"; // the unit of every bitrate on the page, as in configuration, events and log
+
+/** A bitrate, or one of another: 1704 kbit/s, 1704 of 6000 kbit/s. */
+export const rate = (...kbps) => `${kbps.map(whole).join(" of ")} ${KBPS}`;
+
 /** To a tenth, "–" where unknown. Values below 0 are clock errors, and shown as 0. */
 export const tenth = (value) => (Number.isFinite(value) ? Math.max(0, value).toFixed(1) : "–");
 
@@ -25,6 +30,8 @@ export const region = (roi) => (roi ? `${size(roi.width, roi.height)} at ${roi.x
 export const sameRegion = (a, b) => ["x", "y", "width", "height"].every((key) => a?.[key] === b?.[key]);
 
 export const clockTime = (seconds) => new Date(seconds * 1000).toTimeString().slice(0, 8);
+
+export const capital = (text) => text[0].toUpperCase() + text.slice(1);
 
 /** A camera's name for display: front_left -> front left. */
 export const displayName = (name) => name.replaceAll("_", " ");

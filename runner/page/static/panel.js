@@ -11,21 +11,24 @@ import { canStraighten } from "./straight.js";
 import { isStraight, toggleStraight } from "./straighten.js";
 import { withKey } from "./hints.js";
 import { Kept } from "./kept.js";
-import { reasonWords, regionWords } from "./reasons.js";
+import { reasonWords, regionWords, setterWords } from "./reasons.js";
 import { colourOf } from "./colours.js";
-import { byId, factor, latency, make, region, setAttribute, setText, size, tenth, whole } from "./format.js";
+import { byId, capital, factor, KBPS, latency, make, rate, region, setAttribute, setText, size, tenth, whole } from "./format.js";
 
 const SIDES = ["x", "y", "width", "height"];
-const WHY = {
-  automatic: "Set by the prediction; choose S to set it.",
-  collective: "Shared from the total; choose S to set it.",
-};
+const BY_HAND = "; choose S to set it.";
 
 /** The selected camera; "" before the first hello, when nothing is shown here. */
 const name = () => store.selected ?? "";
 const whyNot = () => (!decisionOf(name()) ? whyUndecided(name()) : inControl() ? null : `${capital(whyNoControl())}.`);
-const whyNotByHand = () => whyNot() ?? WHY[mode()] ?? null;
-const capital = (text) => text[0].toUpperCase() + text.slice(1);
+const isPredicted = () => Number.isFinite(store.sample?.predicted_kbps);
+const whyNotByHand = () => whyNot() ?? setBy();
+
+/** What sets the bitrate in the mode in force; null: the operator does. */
+function setBy() {
+  if (mode() === "automatic") return `${setterWords(store.state, isPredicted())}${BY_HAND}`;
+  return mode() === "collective" ? `Shared from the total${BY_HAND}` : null;
+}
 
 // --- parts ------------------------------------------------------------------------------------------------------------
 
@@ -45,7 +48,7 @@ const bitrate = makeSlider({
   data: "kbps",
   control: () => `kbps:${name()}`,
   target: name,
-  send: (kbps, target) => configure("kbps", kbps, `${kbps} kbit/s`, target),
+  send: (kbps, target) => configure("kbps", kbps, rate(kbps), target),
 });
 const choices = make("span", { class: "choices", role: "group", "aria-label": "factors of this camera" });
 const free = number("scaling", "factor", { min: 0.01, max: 1, step: "any" });
@@ -91,7 +94,7 @@ function field(label, ...content) {
 
 function comparison() {
   const body = make("tbody");
-  for (const [key, label] of [["sending", "Sending"], ["bitrate", "kbit/s"], ["size", "Size"], ["ROI", "ROI"]]) {
+  for (const [key, label] of [["sending", "Sending"], ["bitrate", KBPS], ["size", "Size"], ["ROI", "ROI"]]) {
     const cells = [make("td"), make("td")];
     rows.set(key, { row: make("tr", {}, make("th", { scope: "row" }, label), ...cells), cells });
     body.append(rows.get(key).row);
@@ -181,7 +184,7 @@ function refreshHead(now) {
   on.disabled = Boolean(whyNot());
   on.title = whyNot() ?? withKey("switch this camera on or off", "switch");
   setText(on, requested ? (requested.event.on ? "on…" : "off…") : now?.on ? "on" : now ? "off" : "–");
-  const words = reasonWords(now, store.state, fullRegion(name()), Number.isFinite(store.sample?.predicted_kbps));
+  const words = reasonWords(now, store.state, fullRegion(name()), isPredicted());
   setText(reason, [EXPLAINED.includes(word) ? store.refused[name()] : "", words].filter(Boolean).join(" · "));
   setText(formula, now?.reason || "–");
 }

@@ -1,6 +1,6 @@
 /** Why a camera is sent as it is, in words for a driver; the vehicle's own reason has the formula. Pure. */
 
-import { sameRegion, whole } from "./format.js";
+import { capital, KBPS, rate, sameRegion, whole } from "./format.js";
 
 const NAMED = { 1: "full size", 0.5: "half size", 0.25: "quarter size" };
 const PARTS = [2, 4, 8, 16]; // of a size that has a name: 3/8
@@ -12,19 +12,13 @@ export function sizeWords(factor) {
   return NAMED[factor] ?? (parts ? `${parts * factor}/${parts} size` : `${Number(factor.toPrecision(2))} of full size`);
 }
 
-/** A bitrate of what could be used: 1.0 of 6.0 Mbit/s. @param {number} kbps  @param {number} most */
-export function rateWords(kbps, most) {
-  if (kbps < 100) return `${whole(kbps)} of ${whole(most)} kbit/s`;
-  return `${(kbps / 1000).toFixed(1)} of ${(most / 1000).toFixed(1)} Mbit/s`;
-}
-
 /**
  * What limits the total, without the totals: "total 3000 -> 1690: capacity of the link, believed to be 1690".
  * @param {string} reason
  */
 export function limitWords(reason) {
   const words = reason.slice(reason.indexOf(": ") + 2);
-  return /\d$/.test(words) ? `${words} kbit/s` : words;
+  return /\d$/.test(words) ? `${words} ${KBPS}` : words;
 }
 
 /** How much of its image a camera sends, 0 to 1. @param {import("./framing.js").Size} roi  @param {import("./framing.js").Size} full */
@@ -47,7 +41,7 @@ export function regionWords({ roi }, isSingle, full, end) {
 }
 
 /**
- * Half size: 1.2 of 6.0 Mbit/s, its share of the 6.5 Mbit/s predicted.
+ * Half size: 1181 of 6000 kbit/s, its share of the 6500 predicted.
  * @param {import("./records.js").CameraState|undefined} camera its decision
  * @param {import("./store.js").State|null} state of the vehicle
  * @param {import("./framing.js").Size} full image
@@ -63,8 +57,8 @@ export function reasonWords(camera, state, full, predicted) {
   const part = sameRegion(camera.roi, image) ? "" : ` of ${percent(shareOf(camera.roi, full))} of the image`;
   const words = sizeWords(camera.scaling);
   const most = Math.max(camera.kbps, camera.demand_kbps);
-  const cause = `${rateWords(camera.kbps, most)}${causeWords(camera, state, predicted)}`;
-  return `${words[0].toUpperCase()}${words.slice(1)}${part}: ${cause}.`;
+  const cause = `${rate(camera.kbps, most)}${causeWords(camera, state, predicted)}`;
+  return `${capital(words)}${part}: ${cause}.`;
 }
 
 function pauseWords({ weight }, { mode }, common) {
@@ -78,7 +72,17 @@ function causeWords({ kbps, demand_kbps }, { mode, total_kbps, asked_kbps }, pre
   const isLimited = total_kbps < asked_kbps;
   if (mode === "single") return isLimited ? ", less than was set: the link carries no more" : "";
   if (kbps >= Math.floor(demand_kbps)) return ", all that it can use";
-  const total = `, its share of the ${(total_kbps / 1000).toFixed(1)} Mbit/s`;
+  const total = `, its share of the ${whole(total_kbps)}`;
   if (mode === "collective") return `${total} ${isLimited ? "the link carries" : "set"}`;
   return `${total} ${total_kbps !== asked_kbps ? "the link carries" : predicted ? "predicted" : "at the start"}`;
+}
+
+/**
+ * What sets the total in mode A.
+ * @param {import("./store.js").State|null} state
+ * @param {boolean} predicted whether there is a prediction
+ */
+export function setterWords(state, predicted) {
+  if (state && state.total_kbps !== state.asked_kbps) return "Set by what the link carries";
+  return predicted ? "Set by the prediction" : "Set by the mode, without a prediction";
 }

@@ -4,7 +4,7 @@
  */
 
 import { pending } from "./requests.js";
-import { make, setAttribute, setText, whole } from "./format.js";
+import { KBPS, make, rate, setAttribute, setText, whole } from "./format.js";
 import { STEPS, throttle, toKbps, toStep } from "./scale.js";
 
 const SEND_EVERY_MS = 200;
@@ -19,7 +19,7 @@ const HAND_MS = 400;
 export function makeSlider({ label, data, id, target, send, control }) {
   const named = (what, key) => ({ "aria-label": `${label}, ${what}`, "data-control": key });
   const range = make("input", { type: "range", min: 0, max: STEPS, step: 1, ...named("slider", `${data}-slider`) });
-  const number = make("input", { type: "number", min: 1, step: 1, id: id ?? false, ...named("kbit/s", data) });
+  const number = make("input", { type: "number", min: 1, step: 1, id: id ?? false, ...named(KBPS, data) });
   const tick = make("i", { class: "tick", "aria-hidden": "true" });
   const words = make("span", { class: "in-force" });
   const element = make("div", { class: "slider" }, make("div", { class: "track" }, range, tick), number, words);
@@ -67,7 +67,7 @@ export function makeSlider({ label, data, id, target, send, control }) {
       tick.hidden = !Number.isFinite(inForce);
       tick.style.setProperty("--at", String(toStep(inForce || 1, max) / STEPS));
       setText(words, isPending ? `◌ now ${whole(inForce)}` : `now ${whole(inForce)}`);
-      setAttribute(range, "aria-valuetext", `${chosen()} kbit/s, in force ${whole(inForce)}`);
+      setAttribute(range, "aria-valuetext", `${rate(chosen())}, in force ${whole(inForce)}`);
       if (isHeld || isPending || performance.now() - touchedAt < HAND_MS) return;
       range.value = String(toStep(value || 1, max));
       if (!isEdited) number.value = shown;

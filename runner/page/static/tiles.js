@@ -17,7 +17,7 @@ import { withKey } from "./hints.js";
 import { ALARMS } from "./alarm.js";
 import { percent, reasonWords, shareOf } from "./reasons.js";
 import { colourOf } from "./colours.js";
-import { announce, boxSize, byId, displayName, factor, latency, make, setAttribute, setText, size, whole } from "./format.js";
+import { announce, boxSize, byId, displayName, factor, KBPS, latency, make, setAttribute, setText, size, whole } from "./format.js";
 
 export const SHAPES = {
   live: "●", late: "▲", damaged: "◪", frozen: "■", lost: "✕", off: "○", paused: "❚❚", synchronising: "◌", unsupported: "⊘", refused: "⊗",
@@ -333,7 +333,8 @@ function refreshCaption(name, { rates, form, reason }) {
   const part = now && isPart(name) ? ` of ${percent(shareOf(now.roi, camera(name) ?? now.roi))} of the image` : "";
   const shape = `${size(sample?.width, sample?.height)} · ×${factor(now?.scaling)}${part}`;
   const of = now?.slow_fps && !isSilent ? ` of ${whole(camera(name)?.fps)}` : "";
-  caption(rates, bitrate, `${whole(sample?.fps)}${of} fps · ${kbps} kbit/s`, "pictures a second · kbit/s: received / allocated / demanded");
+  const rated = `pictures a second · ${KBPS}: received / allocated / demanded`;
+  caption(rates, bitrate, `${whole(sample?.fps)}${of} fps · ${kbps} ${KBPS}`, rated);
   const lost = sample?.lost ? ` · ${sample.lost} lost` : "";
   const wire = `${whole(sample?.lost)} packets lost, receiver rebuilt ${whole(sample?.rebuilt)} times`;
   const why = `received size · scaling factor · latency from capture to drawing ± error bound; ${wire}${repair}`;

@@ -4,15 +4,12 @@ import { inControl, listen, mode, store } from "./store.js";
 import { pending, request, showProblem, whyNoControl } from "./requests.js";
 import { makeSlider } from "./slider.js";
 import { believedWords, furtherReasons } from "./believed.js";
-import { limitWords } from "./reasons.js";
+import { limitWords, setterWords } from "./reasons.js";
 import { copiesWords, ofWords, sliderValue, totalsOf } from "./totals.js";
 import { showUplinks, uplinkLines } from "./uplinks.js";
-import { byId, make, setText, whole } from "./format.js";
+import { byId, capital, KBPS, make, rate, setText, whole } from "./format.js";
 
-const WHY = {
-  single: "sum of the cameras; choose C to set it",
-  automatic: "set by the prediction; choose C to set it",
-};
+const BY_HAND = "; choose C to set it.";
 
 const figure = make("b", { class: "large" });
 const requested = make("span", { class: "muted" }); // the total before rules lowered it
@@ -36,11 +33,14 @@ const maxTotal = () =>
 /** Why the operator cannot set the total; null: they can. */
 function whyNot() {
   const now = mode();
-  return !now ? "the vehicle is offline" : WHY[now] ?? (inControl() ? null : whyNoControl());
+  if (!now) return "The vehicle is offline.";
+  if (now === "single") return `Sum of the cameras${BY_HAND}`;
+  if (now === "automatic") return `${setterWords(store.state, Number.isFinite(store.sample?.predicted_kbps))}${BY_HAND}`;
+  return inControl() ? null : `${capital(whyNoControl())}.`;
 }
 
 function send(kbps) {
-  request("total", { event: "total_set", kbps }, `total ${kbps} kbit/s`);
+  request("total", { event: "total_set", kbps }, `total ${rate(kbps)}`);
 }
 
 /** Scale the total, or the one already requested; a reduction starts from what the rules have left of it. */
@@ -61,13 +61,19 @@ function refresh() {
   setText(prediction, whole(store.sample?.predicted_kbps));
   const words = believedWords(mode() ? store.state?.believed : undefined);
   const lines = uplinkLines(store.state, store.sample);
-  const unlimited = mode() === "automatic" && (words || lines.length) ? "" : reason ?? "shared among the cameras by demand and weight";
-  const reasons = limitReasons();
-  const limit = lines.length ? "limited by the uplinks" : "limited by a rule";
-  show(why, !ofWords(totals) ? unlimited : reasons.length ? furtherReasons(reasons, words).map(limitWords).join("; ") : limit);
+  const limits = ofWords(totals) ? limitsWords(words, lines.length > 0) : "";
+  show(why, [reason ?? "Shared among the cameras by demand and weight.", limits].filter(Boolean).join(" "));
   show(believed, words);
   showUplinks(uplinks, lines);
   slider.update({ value: sliderValue(totals, mode()), inForce: totals?.total, max: maxTotal(), why: reason });
+}
+
+/** What limits the total, without what the words on the link say. @param {string} words  @param {boolean} hasUplinks */
+function limitsWords(words, hasUplinks) {
+  const reasons = limitReasons();
+  const all = furtherReasons(reasons, words).map(limitWords).join("; ");
+  const text = reasons.length ? all : hasUplinks ? "limited by the uplinks" : "limited by a rule";
+  return text && `${capital(text)}.`;
 }
 
 function show(line, text) {
@@ -87,9 +93,9 @@ function commonReasons(beginning) {
 }
 
 export function startTotal() {
-  const unit = make("span", { class: "muted" }, " kbit/s");
-  const predicted = make("div", { class: "prediction" }, make("span", {}, "Predicted "), prediction, unit);
-  const inForce = make("div", {}, make("span", {}, "Total "), figure, requested, make("span", { class: "muted" }, " kbit/s"), copies);
+  const unit = () => make("span", { class: "muted" }, ` ${KBPS}`);
+  const predicted = make("div", { class: "prediction" }, make("span", {}, "Predicted "), prediction, unit());
+  const inForce = make("div", {}, make("span", {}, "Total "), figure, requested, unit(), copies);
   byId("total-panel").append(make("div", { class: "figures" }, inForce, predicted), slider.element, why, believed, uplinks);
   listen("hello state sample control requests socket", refresh);
   refresh();

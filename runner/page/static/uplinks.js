@@ -1,6 +1,6 @@
 /** A line for each of several uplinks: what it may carry, what arrives over it, its queue and loss, and its cameras. */
 
-import { displayName, make, setAttribute, setText, whole } from "./format.js";
+import { displayName, KBPS, make, setAttribute, setText, whole } from "./format.js";
 
 const UNBROKEN = "\u00a0"; // a line breaks elsewhere
 
@@ -18,7 +18,8 @@ export function uplinkLines(state, sample) {
     const cameras = Object.keys(state.cameras).filter((camera) => state.cameras[camera].uplinks?.includes(name));
     const isAll = cameras.length > 1 && cameras.length === Object.keys(state.cameras).length;
     const carries = isAll ? "all cameras" : cameras.map(displayName).join(", ") || "no camera";
-    const what = isStalled ? "STALLED" : `${whole(measured?.kbps)} of ${whole(total_kbps)}${UNBROKEN}kbit/s, ${measuredWords(measured)}`;
+    const carried = `${whole(measured?.kbps)} of ${whole(total_kbps)}${UNBROKEN}${KBPS}`;
+    const what = isStalled ? "STALLED" : `${carried}, ${measuredWords(measured)}`;
     const text = `${isStalled ? "✕ " : ""}${name}: ${what}: ${carries}`;
     return { text, title: titled(isStalled ? "nothing arrives" : reason), isStalled };
   });

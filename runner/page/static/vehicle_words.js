@@ -1,6 +1,6 @@
 /** What a list of vehicles says of each, from what its station says. Pure. */
 
-import { latency, whole } from "./format.js";
+import { latency, rate, whole } from "./format.js";
 
 /**
  * @typedef {object} Summary what a station says of its vehicle, see runner/operator/summary.py
@@ -68,8 +68,8 @@ export function figuresOf({ summary }) {
 
 /** What arrives here, of what the vehicle sends, or would. @param {Summary} summary */
 function linkWords({ received, actual_kbps, allocated_kbps, believed_kbps }) {
-  const rate = received.length ? `${whole(actual_kbps)} of ${whole(allocated_kbps)}` : whole(allocated_kbps);
-  return `${rate} kbit/s${believed_kbps === null ? "" : `, can carry ${whole(believed_kbps)}`}`;
+  const arriving = received.length ? rate(actual_kbps, allocated_kbps) : rate(allocated_kbps);
+  return `${arriving}${believed_kbps === null ? "" : `, can carry ${whole(believed_kbps)}`}`;
 }
 
 /** @param {Row} row */
