@@ -87,6 +87,10 @@ class Layouts:
         saved = self._saved.vehicles.get(vehicle.name)
         return own_places(vehicle) if saved is None else {name: saved.get(name) for name in vehicle.cameras}
 
+    def has_places(self, vehicle: Vehicle) -> bool:
+        """Whether places were saved for a vehicle."""
+        return vehicle.name in self._saved.vehicles
+
     def drive_places(self, vehicle: Vehicle) -> DrivePlaces | None:
         """The places of a vehicle's cameras in the Drive view; None: they follow from the poses."""
         return self._saved.drive.get(vehicle.name)

@@ -37,7 +37,8 @@ class PageLayouts:
         """The places of the pictures in both views, and why a layout cannot be saved."""
         own, places = own_places(self._vehicle), self._layouts.places(self._vehicle)
         problem, drive = None if self._layouts.path else NOWHERE, self._layouts.drive_places(self._vehicle)
-        return {"places": _places(places), "own": _places(own), "drive": drive, "problem": problem}
+        saved = self._layouts.has_places(self._vehicle)
+        return {"places": _places(places), "own": _places(own), "saved": saved, "drive": drive, "problem": problem}
 
     def save(self, kind: str, document: dict[str, Any], answer: Answer) -> None:
         """Save the layout of a view in its own thread: a hung disk must not stop the video."""

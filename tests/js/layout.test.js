@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-import { bandsOf, boxesOf, heightsOf, narrowBands } from "../../runner/page/static/layout.js";
+import { bandsOf, boxesOf, heightsOf, narrowBands, spreadBands } from "../../runner/page/static/layout.js";
 
 const GAP = 8;
 const CHROME = 66;
@@ -51,6 +51,35 @@ test("rows that a picture joins form one band, and empty rows and columns take n
 test("bands that overlap in a chain are one", () => {
   const bands = bandsOf(cameras("a", "b", "c"), { a: at(0, 0, 2), b: at(1, 1, 2), c: at(2, 0, 2) });
   assert.deepEqual(bands.map(({ rows }) => rows), [4]);
+});
+
+const SPREAD = [
+  [["a"], 1270, 880, [["a"]]],
+  [["a", "b"], 900, 880, [["a"], ["b"]]],
+  [["a", "b"], 1270, 880, [["a", "b"]]],
+  [["a", "b", "c"], 1270, 880, [["b"], ["a", "c"]]], // the middle one above its neighbours
+  [["a", "b", "c"], 1270, 300, [["a", "b", "c"]]],
+  [["a", "b", "c", "d", "e"], 1270, 880, [["a", "b", "c"], ["d", "e"]]],
+];
+for (const [all, width, height, rows] of /** @type {any[]} */ (SPREAD))
+  test(`a row of ${all.length} uses an area of ${width}×${height}`, () => {
+    const row = bandsOf(cameras(...all), Object.fromEntries(all.map((name, column) => [name, at(0, column)])));
+    assert.deepEqual(names(spreadBands(row, width, height, CHROME)), rows);
+  });
+
+test("a row of one picture is joined with the next where most of the width is left", () => {
+  const places = { front: at(0, 0), rear: at(1, 0), left: at(2, 0), top: at(2, 1), right: at(2, 2) };
+  const bands = bandsOf(cameras(...Object.keys(places)), places);
+  assert.deepEqual(names(spreadBands(bands, 940, 660, CHROME)), [["front", "rear"], ["left", "top", "right"]]);
+});
+
+test("rows that fill an area, and grids, stay as they are", () => {
+  const full = Object.fromEntries([..."abc", ..."de", ..."fgh"].map((name, i) => [name, at(i < 3 ? 0 : i < 5 ? 1 : 2, i)]));
+  const grid = { a: at(0, 0, 2), b: at(0, 1), c: at(1, 1) };
+  for (const places of [full, grid]) {
+    const bands = bandsOf(cameras(...Object.keys(places)), places);
+    assert.deepEqual(spreadBands(bands, 1270, 880, CHROME), bands);
+  }
 });
 
 /** Rows of some lengths of 16:9 pictures in an area: neither too wide nor too high. */

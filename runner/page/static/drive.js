@@ -77,7 +77,7 @@ function refreshSpeed() {
   const factor = isOnline() ? store.sample?.speed_factor : undefined;
   setText(byId("driven"), `${whole(KMH * (speed_mps ?? NaN))} km/h`);
   setText(byId("advised"), Number.isFinite(factor) ? `advised: ${whole(100 * (factor ?? 0))} % of full speed` : "no speed advised");
-  const level = (factor ?? 1) < 1 ? "near" : Number.isFinite(speed_mps) ? "fine" : "unknown";
+  const level = (factor ?? 1) < 1 ? "near" : Number.isFinite(speed_mps) ? "fine" : "none";
   setAttribute(byId("speed-now"), "data-level", factor === 0 ? "late" : level);
 }
 

@@ -8,6 +8,7 @@
 
 export const GAP = 8;
 const EVEN = 1.25; // a row is at most this many times as high as the highest row limited by the width
+const LARGER = 1.4; // times the area, for which a row is broken
 const MIN_HEIGHT = 24; // of a picture
 const READABLE_PX = 300; // width of a tile on a narrow page
 
@@ -42,6 +43,42 @@ export function narrowBands(bands, width) {
   const length = Math.max(1, Math.floor(width / READABLE_PX));
   const rows = Array.from({ length: Math.ceil(cameras.length / length) }, (_, i) => cameras.slice(i * length, (i + 1) * length));
   return rows.map((row) => bandOf(row.map((camera, column) => ({ camera, row: 0, column, row_span: 1, column_span: 1 }))));
+}
+
+/**
+ * The bands with rows broken in two, or joined, wherever that makes the pictures much larger, in an area as of `heightsOf`:
+ * three wide pictures side by side leave most of a window empty, and so does one above another above three.
+ * @param {Band[]} bands  @param {number} width  @param {number} height  @param {number} chrome
+ * @returns {Band[]}
+ */
+export function spreadBands(bands, width, height, chrome) {
+  const shown = (some) => shownArea(some, width, height, chrome);
+  const rows = bands.filter(({ grid }) => !grid);
+  const long = rows.filter(({ tiles }) => tiles.length > 1);
+  const broken = long.map((row) => bands.flatMap((band) => (band === row ? halves(band) : [band])));
+  const followed = rows.filter((row) => rows.includes(bands[bands.indexOf(row) + 1]));
+  const [best] = [...broken, ...followed.map((row) => withNext(bands, bands.indexOf(row)))].sort((a, b) => shown(b) - shown(a));
+  return best && shown(best) > LARGER * shown(bands) ? spreadBands(best, width, height, chrome) : bands;
+}
+
+/** A row as two; of three pictures, the middle one comes above its neighbours. @param {Band} band */
+function halves({ tiles }) {
+  const upper = tiles.length === 3 ? [tiles[1]] : tiles.slice(0, Math.ceil(tiles.length / 2));
+  return [upper, tiles.filter((tile) => !upper.includes(tile))].map(bandOf);
+}
+
+/** The bands with a row and its next one as one row. @param {Band[]} bands  @param {number} at */
+function withNext(bands, at) {
+  const tiles = [bands[at], bands[at + 1]].flatMap((band) => band.tiles);
+  const row = bandOf(tiles.map((tile, column) => ({ ...tile, row: 0, column })));
+  return [...bands.slice(0, at), row, ...bands.slice(at + 2)];
+}
+
+/** What the pictures of bands cover, px². */
+function shownArea(bands, width, height, chrome) {
+  const heights = heightsOf(bands, width, height, chrome);
+  const boxes = bands.flatMap((band, i) => boxesOf(band, heights[i], width, chrome).boxes);
+  return boxes.reduce((sum, box) => sum + box.width * box.height, 0);
 }
 
 /** Tiles by band, from the top: those in the same row, or in rows that a tile joins. */

@@ -62,7 +62,7 @@ const locked = make("button", {
 }, "Lock aspect");
 const part = make("p", { class: "why", id: "region-part" });
 const frame = new RegionFrame();
-const differing = make("p", { class: "differing" });
+const differing = make("th", { class: "differing", scope: "col" });
 const rows = new Map();
 const STAGES = {
   capture: ["Capture", "on the vehicle, to the encoder: conversion, region and scaling"],
@@ -99,7 +99,7 @@ function comparison() {
     rows.set(key, { row: make("tr", {}, make("th", { scope: "row" }, label), ...cells), cells });
     body.append(rows.get(key).row);
   }
-  const head = make("tr", {}, ...["", "Decided", "Applied"].map((text) => make("th", { scope: "col" }, text)));
+  const head = make("tr", {}, differing, ...["Decided", "Applied"].map((text) => make("th", { scope: "col" }, text)));
   const caption = make("caption", { class: "unseen" }, "decided and applied values");
   return make("table", { class: "facts" }, caption, make("thead", {}, head), body);
 }
@@ -204,7 +204,9 @@ function refreshSettings(info, now) {
   setText(part, now && isPart(name()) ? regionWords(now, mode() === "single", info, withKey("Full image", "full_image")) : "");
   apply.title = why ?? "send these numbers; a rectangle dragged on the picture does the same";
   fill(weight, now?.weight ?? info.weight, whyNot(), pending(`weight:${name()}`));
-  setText(weightNote, whyNot() ?? (mode() === "single" ? "used in modes A and C only" : "scales this camera's share of the total"));
+  const use = mode() === "single" ? "used in modes A and C only" : "scales this camera's share of the total";
+  weight.title = whyNot() ?? use;
+  setText(weightNote, whyNot() ?? use);
 }
 
 /** A number field shows the value in force, except while it is being edited or a request is pending. */
@@ -249,7 +251,8 @@ function refreshComparison(now) {
     setText(cells[1], differs.includes(key) ? `◌ ${values[key][1]}` : values[key][1]);
     setAttribute(row, "data-differs", differs.includes(key) ? "" : null);
   }
-  setText(differing, differs.length ? "◌ pending: decided, not yet read back" : "");
+  setText(differing, differs.length ? "◌ pending" : "");
+  differing.title = differs.length ? "decided, not yet read back" : "";
 }
 
 /** Latency by stage. Stages are sampled on different pictures, so their sum only approximates the latency. */
@@ -285,7 +288,7 @@ export function startPanel() {
   const head = make("div", { class: "head" }, swatch, title, status, straight, on);
   const more = make("span", { class: "more", "aria-hidden": "true" }, "Why?"); // "disclosure triangle" in a screen reader
   const why = make("details", { class: "why-decided" }, make("summary", {}, reason, more), formula);
-  byId("camera-panel").append(head, why, controls, comparison(), differing);
+  byId("camera-panel").append(head, why, controls, comparison());
   byId("latency-panel").append(stageTable());
   listen("state", (state) => state.online && origin.update(state));
   listen("hello state sample control requests socket status theme straight aspect", refresh);

@@ -40,8 +40,9 @@ let sampledAt = -Infinity; // page time of the last sample
  * visitor: who has logged in, "" on the station's own machine; selected: in another window of this page; operator: this
  *   station's; answer_s: the station answers a request within this time; late_ms: a picture older than this is late
  * @typedef {{keys: Record<string, string|null>, buttons: Record<string, number|string|null>}} Inputs by action
- * @typedef {{places: Places, own: Places, drive: import("./placing.js").Places|null, problem: string|null}} Layout of the Configure
- *   view: places in force, and the vehicle's own; saved places of the Drive view; and why a layout cannot be saved
+ * @typedef {{places: Places, own: Places, saved: boolean, drive: import("./placing.js").Places|null, problem: string|null}} Layout
+ *   of the Configure view: places in force, the vehicle's own, and whether others were saved; saved places of the Drive view;
+ *   and why a layout cannot be saved
  * @typedef {import("./layout.js").Places} Places
  * @typedef {object} Applied the values read back from the elements
  * @property {boolean} [sending]

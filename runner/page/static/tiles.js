@@ -6,7 +6,7 @@ import { pending, request, whyNoControl } from "./requests.js";
 import { dragRegion, isPart, shownRegion } from "./roi.js";
 import { RegionFrame, showsPart } from "./region_frame.js";
 import { zoomRegion } from "./zoom.js";
-import { bandsOf, boxesOf, gridOf, heightsOf, narrowBands } from "./layout.js";
+import { bandsOf, boxesOf, gridOf, heightsOf, narrowBands, spreadBands } from "./layout.js";
 import { arrange, BIRDSEYE, rolesOf, viewOf } from "./arrange.js";
 import { birdseyeSize, placeBirdseye } from "./birdseye.js";
 import { placePanels } from "./panels.js";
@@ -90,6 +90,7 @@ function groupTiles() {
   const cameras = store.hello?.cameras ?? [];
   bands = draft ? [gridOf(cameras, draft)] : bandsOf(cameras, store.hello?.layout.places ?? {});
   if (isColumn()) bands = narrowBands(bands, area.clientWidth);
+  else if (!draft && !store.hello?.layout.saved) bands = spreadBands(bands, area.clientWidth, area.clientHeight, chromeHeight());
   const key = JSON.stringify(bands);
   if (key === bandsKey) return layOut();
   bandsKey = key; // only if changed: moving a tile drops the focus
