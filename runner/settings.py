@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
 from runner.core.model import Camera, Element, ModelError, Vehicle, check_unique
+from runner.redact import has_password
 
 if TYPE_CHECKING:
     from ipaddress import IPv4Network, IPv6Network
@@ -363,3 +365,15 @@ class Setup:
     def with_cameras(self, cameras: Mapping[str, Camera]) -> Setup:
         """The same, of a vehicle with these cameras."""
         return replace(self, vehicle=replace(self.vehicle, cameras=cameras))
+
+
+def address_rule(address: str) -> str | None:
+    """The rule that an IP camera's address breaks; None: none. One without a scheme is left to its source."""
+    if has_password(address):
+        return "must not contain user or password: write user:password to a file, and name that as credentials"
+    try:
+        parts = urlsplit(address)
+        is_complete = not parts.scheme or bool(parts.hostname and (parts.port is None or parts.port))
+    except ValueError:  # a port that is no number, or brackets that do not match
+        is_complete = False
+    return None if is_complete else "must name a host, as rtsp://10.0.0.11/stream does"

@@ -97,6 +97,15 @@ def test_what_cannot_be_asked(override: str, problem: str) -> None:
     assert str(raised.value).startswith(f"command line: {problem}")
 
 
+@pytest.mark.parametrize("address", ["rtsp://", "rtsp:///stream", "rtsp://:554/x", "rtsp://a:99999/x", "rtsp://[::1/x"])
+def test_an_address_without_a_host_is_refused(address: str) -> None:
+    with pytest.raises(ConfigError) as raised:
+        plans("source=rtsp", f'cameras.front.address="{address}"', 'cameras.rear.address="rtsp://cam.local:554/x"')
+    rule = f"cameras.front.address: '{address}': must name a host, as rtsp://10.0.0.11/stream does"
+    assert f"command line: {rule}" in str(raised.value)
+    assert "cameras.rear.address" not in str(raised.value)
+
+
 @pytest.mark.parametrize(
     "address",
     ["rtsp://me:secret@10.0.0.1/x", "rtsp://me:secret#1@10.0.0.1/x", "rtsp://10.0.0.1/x?user=me&password=secret"],

@@ -37,7 +37,7 @@ from runner.core.model import (
 from runner.core.rules import RuleCall
 from runner.errors import ConfigError, Problem, suggest
 from runner.graph import Plan, assignments, check_video, compile_graph
-from runner.redact import has_password, redacted
+from runner.redact import redacted
 from runner.settings import (
     Control,
     Dimensions,
@@ -52,6 +52,7 @@ from runner.settings import (
     RosQos,
     RosSettings,
     Setup,
+    address_rule,
 )
 
 if TYPE_CHECKING:
@@ -311,9 +312,8 @@ class Builder:
             if given is None:
                 rule = f"must be given, here or for each mounted camera as {key}"
                 self._report_input(camera, ModelError(key, "null", rule))
-            elif key == "address" and has_password(str(given)):
-                rule = "must not contain user or password: write user:password to a file, and name that as credentials"
-                self._report_input(camera, ModelError(key, repr(redacted(given)), rule))
+            elif key == "address" and (broken := address_rule(str(given))):
+                self._report_input(camera, ModelError(key, repr(redacted(given)), broken))
             elif key == "topic" and not TOPIC.fullmatch(str(given)):
                 self._report_input(camera, ModelError(key, repr(given), TOPIC_RULE))
 
