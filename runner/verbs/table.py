@@ -36,14 +36,14 @@ SUMMARY = (
     *(
         "frames",
         "Hz",
-        "seconds short\nof frames",
-        "kbit/s of\nallocated",
-        "seconds at the\ndecided size",
+        "seconds with\ntoo few frames",
+        "received of\nallocated",
+        "seconds at\ndecided size",
         "sizes\nseen",
     ),
-    *("latency ms\nmedian", "p95", "packets\nlost", "rebuilt"),
+    *("latency ms\nmedian", "p95", "packets\nlost", "stream\nrebuilt"),
 )
-IN_SHORT = ("frames", "Hz", "seconds short\nof frames", "latency ms\nmedian", "p95", "packets\nlost")
+IN_SHORT = ("frames", "Hz", "seconds with\ntoo few frames", "latency ms\nmedian", "p95", "packets\nlost")
 WHOLE = 110  # columns from which all of these fit
 WHOLE_SUMMARY = 130
 MOST_NAME = 20  # columns that a camera's name keeps on a narrow terminal
@@ -153,7 +153,8 @@ def show_summary(meters: Mapping[str, ReceptionMeter], received: Mapping[str, An
     """Reception compared with the decisions, over the whole run."""
     console = _console()
     shown = IN_SHORT if console.width < WHOLE_SUMMARY else SUMMARY
-    table = RichTable(title="received", title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    title = "received over the drive, compared with what was decided"
+    table = RichTable(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     table.add_column("camera", overflow="fold")
     for heading in shown:
         table.add_column(heading, justify="right", no_wrap=True)
