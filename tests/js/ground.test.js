@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-import { crosses, groundOf, groundPlacement, latticeOf, outline, sharesOf, sightOf, trianglesOf } from "../../runner/page/static/ground.js";
+import { apart, crosses, groundOf, groundPlacement, latticeOf, outline, sharesOf, sightOf, trianglesOf } from "../../runner/page/static/ground.js";
 
 const CAR = { wheelbase_m: 2.9, track_m: 1.6, width_m: 2, front_m: 4, rear_m: 1 };
 const NATIVE = { width: 1280, height: 800, left: 0, top: 0 };
@@ -101,4 +101,12 @@ test("the front is up, the left at the left, and the scale is the same in both d
   const high = groundPlacement({ width: 400, height: 1000 }, CAR);
   near(high.px_per_m, 20);
   near(high.y, 500 + 1.5 * 20, 1e-9); // the ground's middle is 1.5 m ahead
+});
+
+test("labels are moved apart, and stay inside", () => {
+  const label = (x, y) => ({ x, y, width: 100, height: 20 });
+  const at = (boxes, height = 300) => apart(boxes, height).map(({ x, y }) => [x, y]);
+  assert.deepEqual(at([label(0, 10), label(200, 12), label(50, 15)]), [[0, 10], [200, 12], [50, 31]]);
+  assert.deepEqual(at([label(0, 0), label(0, 0), label(0, 0)]), [[0, 0], [0, 21], [0, 42]]);
+  assert.deepEqual(at([label(0, 270), label(0, 275)]), [[0, 259], [0, 280]]);
 });

@@ -50,7 +50,7 @@ export class Attention {
     const warnings = [
       !this.focused && !this.elsewhere && "OUT OF FOCUS: keys do not reach this page; click it",
       this.covered && "HIDDEN: another window of this page cannot be seen",
-      this.slow && "SLOW: this page does not draw enough of the pictures that arrive",
+      this.slow && "SLOW: this computer is too busy to draw all pictures that arrive; close other windows and programs",
     ];
     return warnings.filter(Boolean).join(" · ") || null;
   }

@@ -2,12 +2,13 @@
 
 import { listen, store } from "./store.js";
 import { colourOfRate, metres, rangeOf } from "./track.js";
-import { byId } from "./format.js";
+import { byId, rate, whole } from "./format.js";
 
 const ACROSS_M = 250; // of the shorter side
 const BAR_M = 50; // the length that the scale bar shows
 const LINE_PX = 5;
 const ARROW_PX = 11;
+const NORTH_PX = 48; // of the word in the corner, and margins
 const [TEXT, MUTED, UNKNOWN] = ["#e8edf2", "#a5b3c1", "#76879a"];
 
 const canvas = /** @type {HTMLCanvasElement} */ (byId("drive-map").firstElementChild);
@@ -29,6 +30,7 @@ function draw() {
   drawTrack(context, track, px_per_m);
   drawVehicle(context);
   drawScale(context, px_per_m);
+  drawLegend(context, rangeOf(track.kbps));
 }
 
 function drawTrack(context, { x, y, kbps }, px_per_m) {
@@ -36,8 +38,8 @@ function drawTrack(context, { x, y, kbps }, px_per_m) {
   const at = (i) => [size.width / 2 + (x[i] - (x.at(-1) ?? 0)) * px_per_m, size.height / 2 - (y[i] - (y.at(-1) ?? 0)) * px_per_m];
   Object.assign(context, { lineWidth: LINE_PX, lineCap: "round" });
   for (let i = 1; i < x.length; i++) {
-    const rate = kbps[i];
-    context.strokeStyle = rate === null || !range ? UNKNOWN : colourOfRate(rate, range);
+    const received = kbps[i];
+    context.strokeStyle = received === null || !range ? UNKNOWN : colourOfRate(received, range);
     context.beginPath();
     context.moveTo(...at(i - 1));
     context.lineTo(...at(i));
@@ -70,6 +72,19 @@ function drawScale(context, px_per_m) {
   context.fillRect(x, y, BAR_M * px_per_m, 2);
   write(context, `${BAR_M} m`, x, y - 5, "start");
   write(context, "N ↑", size.width - 8, 16, "end");
+}
+
+/** What the colours mean, where there is room for it. @param {[number, number]|null} range */
+function drawLegend(context, range) {
+  if (!range) return;
+  const text = `received ${whole(range[0])} to ${rate(range[1])}`;
+  const wide = context.measureText(text).width;
+  if (wide + NORTH_PX > size.width) return;
+  write(context, text, 8, 16, "start");
+  for (let at = 0; at < wide; at++) {
+    context.fillStyle = colourOfRate(at, [0, wide]);
+    context.fillRect(8 + at, 21, 1.5, 4);
+  }
 }
 
 function write(context, text, x, y, align) {

@@ -142,3 +142,27 @@ export function groundPlacement(box, dimensions) {
   const [across, along] = [(extent.left + extent.right) / 2, (extent.front + extent.rear) / 2];
   return { px_per_m, x: box.width / 2 + across * px_per_m, y: box.height / 2 + along * px_per_m };
 }
+
+/**
+ * Boxes moved so that none covers another: from the top one on, each goes below those that it would cover, and then up
+ * again as far as the height needs it.
+ * @template {{x: number, y: number, width: number, height: number}} B
+ * @param {B[]} boxes  @param {number} height
+ * @returns {B[]} from the top
+ */
+export function apart(boxes, height) {
+  const isBeside = (a, b) => a.x < b.x + b.width && b.x < a.x + a.width;
+  /** @type {B[]} */
+  const down = [];
+  for (const box of [...boxes].sort((a, b) => a.y - b.y)) {
+    const y = Math.max(box.y, ...down.filter((other) => isBeside(other, box)).map((other) => other.y + other.height + 1));
+    down.push({ ...box, y });
+  }
+  /** @type {B[]} */
+  const placed = [];
+  for (const box of down.reverse()) {
+    const lowest = Math.min(height, ...placed.filter((other) => isBeside(other, box)).map((other) => other.y - 1));
+    placed.unshift({ ...box, y: Math.min(box.y, lowest - box.height) });
+  }
+  return placed;
+}

@@ -3,7 +3,7 @@
  * what does not change with every picture: the vehicle, distances, and which pictures are not live.
  */
 
-import { groundOf, groundPlacement, latticeOf, outline, sharesOf, sightOf, trianglesOf } from "./ground.js";
+import { apart, groundOf, groundPlacement, latticeOf, outline, sharesOf, sightOf, trianglesOf } from "./ground.js";
 import { COLOURS, ESTIMATED, labelPicture, STEERING_STEP_RAD } from "./guide_lines.js";
 import { pathGuides } from "./guides.js";
 import { AMBER, frame, RED } from "./overlay.js";
@@ -12,7 +12,8 @@ import { RemoteWarp, UNANSWERED } from "./remote_warp.js";
 import { resize } from "./resizing.js";
 import { MOVING, STALLED } from "./status.js";
 
-const DISTANCES_M = [1, 2, 5]; // from the vehicle
+const DISTANCES_M = [5, 2, 1]; // from the vehicle, the farthest first
+const LINE = 1.4; // height of a line of text, of its size
 const LABEL_M = 4; // distance from a camera to the label of its status
 const FONT = 'system-ui, "DejaVu Sans", sans-serif';
 
@@ -200,21 +201,27 @@ export class GroundView {
 
   drawStates(context, laid, size, seen) {
     const { width, height } = this.display;
-    const { dimensions } = this;
-    if (!dimensions) return;
-    for (const [i, { label, status }] of seen.entries()) {
-      if (!label) continue;
-      const { pose, name } = this.streams[i].camera;
-      const yaw = (pose.yaw_deg * Math.PI) / 180;
-      const at = toBox({ x: pose.x_m + LABEL_M * Math.cos(yaw), y: pose.y_m + LABEL_M * Math.sin(yaw) }, laid);
-      const [back, fore] = STALLED.includes(status) ? [RED, "#fff"] : MOVING.includes(status) ? [AMBER, "#000"] : ["#2b333c", "#e6ebf0"];
-      drawLabel(context, at.x, at.y, size, `${label} ${name.replaceAll("_", " ")}`, back, fore, width);
-    }
+    context.font = `700 ${size}px ${FONT}`;
+    const labelled = seen.map((each, i) => ({ ...each, camera: this.streams[i].camera })).filter(({ label }) => label);
+    /** @type {ReturnType<GroundView["labelOf"]>[]} */
+    const labels = labelled.map(({ camera, label, status }) => this.labelOf(context, camera, label, status, laid, size));
+    for (const label of apart(labels, height)) drawLabel(context, label, size);
     const thick = 0.4 * size;
     if (seen.some(({ status }) => STALLED.includes(status))) frame(context, width, height, thick, RED, []);
     else if (seen.some(({ label, status }) => label && MOVING.includes(status))) {
       frame(context, width, height, thick, AMBER, [2 * size, size]);
     }
+  }
+
+  /** The label of a camera's status, inside the box. */
+  labelOf(context, { pose, name }, label, status, laid, size) {
+    const yaw = (pose.yaw_deg * Math.PI) / 180;
+    const at = toBox({ x: pose.x_m + LABEL_M * Math.cos(yaw), y: pose.y_m + LABEL_M * Math.sin(yaw) }, laid);
+    const [back, fore] = STALLED.includes(status) ? [RED, "#fff"] : MOVING.includes(status) ? [AMBER, "#000"] : ["#2b333c", "#e6ebf0"];
+    const text = `${label} ${name.replaceAll("_", " ")}`;
+    const width = Math.min(this.display.width, context.measureText(text).width + size);
+    const x = Math.min(this.display.width - width, Math.max(0, at.x - width / 2));
+    return { x, y: at.y - 0.8 * size, width, height: 1.6 * size, text, back, fore };
   }
 
   /** For tests: its placement in its box, CSS px; the cameras' labels now, and when the picture was drawn. */
@@ -233,6 +240,7 @@ function drawDistances(context, dimensions, laid, size) {
   context.font = `600 ${size}px ${FONT}`;
   context.textBaseline = "middle";
   context.textAlign = "center";
+  let above = -Infinity; // height of the last label
   for (const metres of DISTANCES_M) {
     const [box, { px_per_m }] = [boxOf(outline(dimensions, metres), laid), laid];
     for (const [thick, colour] of /** @type {[number, string][]} */ ([[2.5, "rgba(0,0,0,0.45)"], [1, "rgba(255,255,255,0.8)"]])) {
@@ -242,7 +250,8 @@ function drawDistances(context, dimensions, laid, size) {
       context.roundRect(box.x, box.y, box.width, box.height, metres * px_per_m);
       context.stroke();
     }
-    if (px_per_m < size) continue; // no room between two lines
+    if (box.y - above < LINE * size) continue; // no room below the label of a farther line
+    above = box.y;
     context.lineWidth = size / 4;
     context.strokeStyle = "rgba(0,0,0,0.7)";
     context.strokeText(`${metres} m`, box.x + box.width / 2, box.y);
@@ -286,7 +295,7 @@ function drawScale(context, { width, height }, { px_per_m }, size) {
   context.font = `600 ${size}px ${FONT}`;
   context.textAlign = "right";
   context.textBaseline = "bottom";
-  const label = `5 m · ${px_per_m.toFixed(1)} px/m`;
+  const label = "5 m";
   for (const [thick, colour] of /** @type {[number, string][]} */ ([[size / 4 + 3, "#000"], [size / 4, "#fff"]])) {
     context.strokeStyle = colour;
     context.lineWidth = thick;
@@ -302,17 +311,13 @@ function drawScale(context, { width, height }, { px_per_m }, size) {
   context.fillText(label, right, bottom - size / 3);
 }
 
-/** A label, kept inside the box. */
-function drawLabel(context, x, y, size, label, back, fore, width) {
-  context.font = `700 ${size}px ${FONT}`;
+function drawLabel(context, { x, y, width, height, text, back, fore }, size) {
   context.textAlign = "center";
   context.textBaseline = "middle";
-  const wide = Math.min(width, context.measureText(label).width + size);
-  const middle = Math.min(width - wide / 2, Math.max(wide / 2, x));
   context.fillStyle = back;
-  context.fillRect(middle - wide / 2, y - 0.8 * size, wide, 1.6 * size);
+  context.fillRect(x, y, width, height);
   context.fillStyle = fore;
-  context.fillText(label, middle, y, wide);
+  context.fillText(text, x + width / 2, y + 0.8 * size, width);
 }
 
 function boxOf({ rear, front, right, left }, laid) {

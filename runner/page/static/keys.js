@@ -71,8 +71,8 @@ function onFixedKey(key) {
   publish("toast", { text: "mode: s Single, a Automatic, c Collective", level: "hint" });
 }
 
-/** Two tables beside each other, so that the list fits on small screens. */
-function keyTables() {
+/** Two tables beside each other, so that the list fits on small screens. @param {boolean} hasPad whether there is a gamepad */
+function keyTables(hasPad) {
   const buttons = store.hello?.inputs.buttons ?? {};
   const listed = (names, of) => names.map(of).join(" ").trim();
   /** @type {(names: string[], description: string) => [string, string, string]} */
@@ -84,10 +84,10 @@ function keyTables() {
   const count = store.view === "monitor" ? undefined : store.hello?.cameras.length;
   rows.splice(ROLES, 0, cells(numbered.slice(0, count), "select a camera by its number"));
   /** @param {[string, string, string]} cells */
-  const row = ([key, ...others]) =>
-    make("tr", {}, make("th", { scope: "row" }, key), ...others.map((text) => make("td", {}, text)));
-  const heads = () => ["Key", "Button", "Action"].map((head) => make("th", { scope: "col" }, head));
-  const used = [...rows, ...FIXED].filter(([key, button]) => key || button).map(row);
+  const row = ([key, button, action]) =>
+    make("tr", {}, make("th", { scope: "row" }, key), ...(hasPad ? [button, action] : [action]).map((text) => make("td", {}, text)));
+  const heads = () => ["Key", ...(hasPad ? ["Button"] : []), "Action"].map((head) => make("th", { scope: "col" }, head));
+  const used = [...rows, ...FIXED].filter(([key, button]) => key || (hasPad && button)).map(row);
   const half = Math.ceil(used.length / 2);
   const tables = [used.slice(0, half), used.slice(half)].map((part) =>
     make("table", {}, make("thead", {}, make("tr", {}, ...heads())), make("tbody", {}, ...part)));
@@ -102,7 +102,9 @@ export function startKeys() {
   listen("help", () => {
     if (help.open) return;
     setText(pressed, "");
-    help.replaceChildren(make("h2", { id: "help-title" }, "Keys and buttons"), keyTables(), pressed, close);
+    const hasPad = navigator.getGamepads().some(Boolean);
+    const title = hasPad ? "Keys and buttons of a gamepad" : "Keys";
+    help.replaceChildren(make("h2", { id: "help-title" }, title), keyTables(hasPad), pressed, close);
     help.showModal();
   });
   addEventListener("keydown", onKeyDown);
