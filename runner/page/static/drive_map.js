@@ -74,16 +74,16 @@ function drawScale(context, px_per_m) {
   write(context, "N ↑", size.width - 8, 16, "end");
 }
 
-/** What the colours mean, where there is room for it. @param {[number, number]|null} range */
+/** What the colours mean, beside or below the north. @param {[number, number]|null} range */
 function drawLegend(context, range) {
   if (!range) return;
   const text = `received ${whole(range[0])} to ${rate(range[1])}`;
   const wide = context.measureText(text).width;
-  if (wide + NORTH_PX > size.width) return;
-  write(context, text, 8, 16, "start");
+  const y = wide + NORTH_PX > size.width ? 36 : 16;
+  write(context, text, 8, y, "start");
   for (let at = 0; at < wide; at++) {
     context.fillStyle = colourOfRate(at, [0, wide]);
-    context.fillRect(8 + at, 21, 1.5, 4);
+    context.fillRect(8 + at, y + 5, 1.5, 4);
   }
 }
 
