@@ -680,6 +680,7 @@ def test_a_layout_is_saved_by_the_page_in_control_and_sent_to_all(tmp_path):
         for window in (page, watcher, monitor):
             layout = await received(window, "layout")
             assert {name: place for name, place in layout["places"].items() if place} == {"rear_center": PLACE}
+            assert layout["saved"]
             assert layout["own"]["front_left"] == {"row": 0, "column": 0, "row_span": 1, "column_span": 1}
         await received(page, "reply", id="2", result="applied")
         assert "    rear_center: {row: 0, column: 0, column_span: 2}\n" in file.read_text()
@@ -692,7 +693,8 @@ def test_a_layout_is_saved_by_the_page_in_control_and_sent_to_all(tmp_path):
         await received(page, "reply", id="5", result="applied")
         await monitor.send_json({"id": "3", "layout": None})  # it has its page's control
         await received(monitor, "reply", id="3", result="applied")
-        assert (await received(page, "layout"))["places"] == layout["own"]
+        reset = await received(page, "layout")
+        assert (reset["places"], reset["saved"]) == (layout["own"], False)
         assert file.read_text().endswith("vehicles: {}\n")
 
     in_windows(steps, layouts=Layouts(tmp_path, "alice"))

@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-import { ageOf, skewOf, worstOf } from "../../runner/page/static/ages.js";
+import { mostOf, ageOf, skewOf, worstOf } from "../../runner/page/static/ages.js";
 
 const picture = (captured, ...later) => [captured, ...later];
 
@@ -87,4 +87,13 @@ test("an age follows within half a second, whatever the frame rate", () => {
 test("one unknown age makes the worst one unknown", () => {
   for (const unknown of [age(null), age(50, NaN), age(50, Infinity)])
     assert.deepEqual(worst({ front: age(10), rear: unknown }, live("front", "rear"), 200), { camera: "rear", age_ms: null, bound_ms: null, level: "unknown" });
+});
+
+test("a latency arises mostly where more than half of it does", () => {
+  const parts = { capture: 5, encode: 200, link: 20, buffer: 30, page: 2, decode: 4, draw: 8 };
+  assert.equal(mostOf(parts), "encode");
+  assert.equal(mostOf({ ...parts, encode: 10 }), "link"); // the wait for packets counts as the link's
+  assert.equal(mostOf({ ...parts, encode: 60 }), "");
+  assert.equal(mostOf({}), "");
+  assert.equal(mostOf({ encode: null, link: null, draw: 90 }), "draw");
 });

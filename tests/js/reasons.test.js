@@ -11,7 +11,10 @@ const CAMERA = /** @type {any} */ ({
   on: true, sending: true, demand_kbps: 6000, kbps: 1181, scaling: 0.5, roi: { x: 0, y: 0, ...FULL }, width: 960, height: 520,
   reason: "1181 of 6000 kbit/s, range [950, ...) -> 0.5", weight: 1, applied: {}, fault: null,
 });
-const STATE = /** @type {any} */ ({ mode: "automatic", total_kbps: 6500, asked_kbps: 6500 });
+const STATE = /** @type {any} */ ({ mode: "automatic", total_kbps: 6500, asked_kbps: 6500, cameras: { front: CAMERA } });
+const OLD = "no prediction for 3.2 s, limit 2 s";
+const FADED = `${CAMERA.reason}; total 9000 -> 6500: ${OLD}`;
+const LINK = `${FADED}; total 6500 -> 6500: capacity of the link, believed to be 6500`;
 
 test("a factor is a size", () => {
   const words = [1, 0.5, 0.25, 0.125, 0.375, 0.75, 0.3].map(sizeWords);
@@ -31,6 +34,10 @@ const TABLE = [
   [{}, { predicted: false }, `${SHARE} at the start.`],
   [{}, { asked_kbps: 9000 }, `${SHARE} the link carries.`],
   [{}, { asked_kbps: 3000 }, `${SHARE} the link carries.`], // more than was predicted
+  [{ reason: LINK }, { asked_kbps: 9000 }, `${SHARE} the link carries.`],
+  [{ reason: FADED }, { asked_kbps: 9000 }, `${SHARE} left: ${OLD}.`], // not the link
+  [{ reason: FADED }, { mode: "single", asked_kbps: 9000 }, `Half size: 1181 of 6000 kbit/s, less than was set: ${OLD}.`],
+  [{ slow_fps: 10 }, {}, `${SHARE} predicted. Only 10 Hz: the camera is slow or the vehicle too busy, not the link.`],
   [{}, { mode: "collective" }, `${SHARE} set.`],
   [{}, { mode: "collective", asked_kbps: 9000 }, `${SHARE} the link carries.`],
   [{}, { mode: "single" }, "Half size: 1181 of 6000 kbit/s."],
@@ -51,6 +58,7 @@ test("what sets the total in mode A is the link where that limits, or raises, wh
   assert.equal(setterWords(STATE, true), "Set by the prediction");
   assert.equal(setterWords(STATE, false), "Set by the mode, without a prediction");
   for (const asked_kbps of [3000, 9000]) assert.equal(setterWords({ ...STATE, asked_kbps }, true), "Set by what the link carries");
+  assert.equal(setterWords({ ...STATE, asked_kbps: 9000, cameras: { front: { ...CAMERA, reason: FADED } } }, true), "Limited by a rule");
 });
 
 test("nothing is said of a vehicle that is offline", () => assert.equal(reasonWords(undefined, null, FULL, false), "–"));

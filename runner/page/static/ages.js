@@ -24,6 +24,19 @@ export function ageOf(pictures, bound_ms = Infinity) {
   return { age_ms: isKnown ? Math.max(0, age_ms ?? 0) : null, parts_ms: { page: part(1, 2), decode: part(2, 3), draw: part(3, 4) } };
 }
 
+const PARTS = { capture: "capture", encode: "encode", link: "link", buffer: "link", page: "page", decode: "decode", draw: "draw" };
+
+/**
+ * Where most of a latency arises; "": nowhere, or unknown.
+ * @param {Record<string, number|null>} parts ms by stage
+ */
+export function mostOf(parts) {
+  const known = Object.keys(PARTS).map((stage) => ({ at: PARTS[stage], ms: parts[stage] ?? 0 }));
+  const all = known.reduce((sum, { ms }) => sum + ms, 0);
+  const share = (at) => known.filter((part) => part.at === at).reduce((sum, { ms }) => sum + ms, 0);
+  return known.map(({ at }) => at).find((at) => share(at) > all / 2) ?? "";
+}
+
 /** @typedef {{camera: string, status: string, age_ms: number|null, bound_ms: number}} Picture */
 
 /**

@@ -1,7 +1,7 @@
 /** The Drive view's figures: what a driver must not miss. */
 
 import { alertStatus, inControl, listen, mode, ofVehicle, publish, remind, store } from "./store.js";
-import { worstOf } from "./ages.js";
+import { mostOf, worstOf } from "./ages.js";
 import { ALARMS } from "./alarm.js";
 import { Attention } from "./attention.js";
 import { isGuided, nextChoice } from "./guides.js";
@@ -56,10 +56,17 @@ function refreshLatency() {
   const { camera, age_ms, bound_ms, level } = worstOf([...ownPictures(), ...inMonitors()], store.hello?.late_ms ?? 0);
   const notLive = names().filter(isNotLive);
   const none = Object.values(store.status).includes("synchronising") ? "synchronising" : "no moving picture";
-  const from = camera === null ? none : `${level === "unknown" ? "unknown" : "worst"}: ${displayName(camera)}`;
+  const from = camera === null ? none : `${level === "unknown" ? "unknown" : "worst"}: ${displayName(camera)}${whereWords(camera, level)}`;
   setAttribute(byId("latency"), "data-level", notLive.length ? "late" : level);
   setText(byId("worst"), latency(age_ms, bound_ms));
   setText(byId("worst-of"), notLive.length ? `${notLive.length} of ${names().length} pictures not live` : from);
+}
+
+/** Where most of a high latency arises: a busy machine is not the link. */
+function whereWords(camera, level) {
+  if (!["near", "late"].includes(level)) return "";
+  const most = mostOf({ ...store.sample?.cameras[camera]?.stages_ms, ...store.ages[camera]?.parts_ms });
+  return most && ` (${most})`;
 }
 
 /** Pictures in monitors, which say where they are. */

@@ -5,6 +5,7 @@ import { capital, KBPS, rate, sameRegion, whole } from "./format.js";
 const NAMED = { 1: "full size", 0.5: "half size", 0.25: "quarter size" };
 const PARTS = [2, 4, 8, 16]; // of a size that has a name: 3/8
 const PAUSED = "not sending: ";
+const TOTAL = "total ";
 
 /** A scaling factor as a size: half size, 3/8 size, 0.3 of full size. @param {number} factor */
 export function sizeWords(factor) {
@@ -19,6 +20,18 @@ export function sizeWords(factor) {
 export function limitWords(reason) {
   const words = reason.slice(reason.indexOf(": ") + 2);
   return /\d$/.test(words) ? `${words} ${KBPS}` : words;
+}
+
+/**
+ * What limits the total, or raises it above what was predicted or set; null: nothing, "link": the link, as most rules say;
+ * else what the rule says.
+ * @param {string[]} reasons parts of a camera's
+ * @param {{total_kbps: number, asked_kbps: number}} state
+ */
+function limitOf(reasons, { total_kbps, asked_kbps }) {
+  if (total_kbps === asked_kbps) return null;
+  const words = limitWords(reasons.filter((part) => part.startsWith(TOTAL)).at(-1) ?? "");
+  return !words || /\blink\b/.test(words) ? "link" : words;
 }
 
 /** How much of its image a camera sends, 0 to 1. @param {import("./framing.js").Size} roi  @param {import("./framing.js").Size} full */
@@ -58,8 +71,11 @@ export function reasonWords(camera, state, full, predicted) {
   const words = sizeWords(camera.scaling);
   const most = Math.max(camera.kbps, camera.demand_kbps);
   const cause = `${rate(camera.kbps, most)}${causeWords(camera, state, predicted)}`;
-  return `${capital(words)}${part}: ${cause}.`;
+  return `${capital(words)}${part}: ${cause}.${slowWords(camera)}`;
 }
+
+/** Why it has fewer pictures than its rate, where that is not the link. @param {import("./records.js").CameraState} camera */
+const slowWords = ({ slow_fps }) => (slow_fps ? ` Only ${slow_fps} Hz: the camera is slow or the vehicle too busy, not the link.` : "");
 
 function pauseWords({ weight }, { mode }, common) {
   const rule = common.find((part) => part.startsWith(PAUSED));
@@ -68,13 +84,14 @@ function pauseWords({ weight }, { mode }, common) {
 }
 
 /** What limits its bitrate. */
-function causeWords({ kbps, demand_kbps }, { mode, total_kbps, asked_kbps }, predicted) {
-  const isLimited = total_kbps < asked_kbps;
-  if (mode === "single") return isLimited ? ", less than was set: the link carries no more" : "";
+function causeWords({ kbps, demand_kbps, reason }, state, predicted) {
+  const { mode, total_kbps, asked_kbps } = state;
+  const limit = mode !== "automatic" && total_kbps >= asked_kbps ? null : limitOf(reason.split("; "), state);
+  if (mode === "single") return !limit ? "" : `, less than was set: ${limit === "link" ? "the link carries no more" : limit}`;
   if (kbps >= Math.floor(demand_kbps)) return ", all that it can use";
   const total = `, its share of the ${whole(total_kbps)}`;
-  if (mode === "collective") return `${total} ${isLimited ? "the link carries" : "set"}`;
-  return `${total} ${total_kbps !== asked_kbps ? "the link carries" : predicted ? "predicted" : "at the start"}`;
+  if (limit) return limit === "link" ? `${total} the link carries` : `${total} left: ${limit}`;
+  return `${total} ${mode === "collective" ? "set" : predicted ? "predicted" : "at the start"}`;
 }
 
 /**
@@ -83,6 +100,8 @@ function causeWords({ kbps, demand_kbps }, { mode, total_kbps, asked_kbps }, pre
  * @param {boolean} predicted whether there is a prediction
  */
 export function setterWords(state, predicted) {
-  if (state && state.total_kbps !== state.asked_kbps) return "Set by what the link carries";
+  const camera = Object.values(state?.cameras ?? {}).find(({ on }) => on);
+  const limit = state && camera ? limitOf(camera.reason.split("; "), state) : null;
+  if (limit) return limit === "link" ? "Set by what the link carries" : "Limited by a rule";
   return predicted ? "Set by the prediction" : "Set by the mode, without a prediction";
 }
