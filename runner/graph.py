@@ -92,7 +92,7 @@ class Plan:
     vehicle    elements after the source
     operator   elements of the operator's side
     wire_*     what `print` adds in place of RTSP server and client
-    recorder   elements that follow the source when it is recorded, without the file; empty if it is not recorded
+    recorder   elements that follow the source when it is recorded, without the file; empty if it is not
     bag        pictures that are pushed into the first element of the source; None: none
     needs      by element that only the vehicle may have, the package that provides it
     video      whether each side also writes what it sends or receives into a file
@@ -198,7 +198,7 @@ def compile_graph(
                packets that SRT would cut
     """
     graph, source = camera.graph, camera.source
-    recorder = recording.elements if recording else ()
+    recorder = recording.elements if recording and not graph.passes else ()
     _check_names(graph, source, recorder)
     _check_packets(graph)
     values = _values(camera, media, index, clip)
@@ -208,7 +208,10 @@ def compile_graph(
 
     stand_in = fill(source.stand_in, "source.stand_in")
     unrendered = bool(source.render) and clip is None
-    frames = stand_in if unrendered else fill(source.elements, "source.elements")
+    key = "encoded" if graph.passes else "elements"
+    if not (elements := getattr(source, key)):
+        raise ModelError("graph.passes", graph.passes, "needs a source with `encoded`, such as rtsp or v4l2")
+    frames = stand_in if unrendered else fill(elements, f"source.{key}")
     stands_in = bool(stand_in) and clip is None
     return Plan(
         camera=camera,
@@ -407,7 +410,7 @@ def _values(camera: Camera, media: Media, index: int, clip: str | None) -> dict[
     """The values of the placeholders of a camera's source and graph; None: the property keeps its default."""
     width, height = camera.source_size
     rate = f"{camera.fps.numerator}/{camera.fps.denominator}"
-    settings = camera.graph.settings
+    settings, passes = camera.graph.settings, camera.graph.passes
     port = settings.first_port + index
     values: dict[str, Value | None] = {
         **camera.source.settings,
@@ -419,6 +422,7 @@ def _values(camera: Camera, media: Media, index: int, clip: str | None) -> dict[
         "framerate": rate,
         "raw_caps": f"video/x-raw,format=I420,width={width},height={height},framerate={rate},{_PICTURE}",
         "capture_caps": _capture_caps(camera.capture),
+        "encoded_caps": _ENCODED[passes] if passes else None,
         "controls": _controls(camera.capture),
         "host": media.host,
         "url": rtsp_url(media, camera.name, feedback=bool(settings.retransmission_ms)),

@@ -36,6 +36,11 @@ def vehicle(*overrides: str) -> Vehicle:
     return setup(*overrides).vehicle
 
 
+def source_for(graph: str) -> str:
+    """The name of a source that serves a packaged graph."""
+    return "v4l2" if graph.startswith("pass_through") else "test"
+
+
 @cache
 def composed_once(overrides: tuple[str, ...]) -> Composed:
     """A packaged configuration for tests that only read it: composing takes most of the time of many."""

@@ -33,6 +33,7 @@ EXAMPLES: list[dict[str, Any]] = [
     {"t": 0.7, "event": "moment_marked", "back_s": 10},
     {"t": 0.8, **LINK},
     {"t": 0.8, "event": "copies_counted", "copies": {"front_left": 2}},
+    {"t": 0.8, "event": "stream_measured", "camera": "front_left", "kbps": 3140},
     {"t": 0.8, "event": "source_reported", "camera": "front_left", "works": False, "reason": "no such device"},
     {"t": 0.8, "event": "control_passed", "operator": "me"},
     {"t": 0.8, "event": "control_requested", "operator": "me"},

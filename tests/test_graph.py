@@ -8,7 +8,7 @@ from fractions import Fraction
 from typing import Any
 
 import pytest
-from helpers import CONF, setup, vehicle
+from helpers import CONF, setup, source_for, vehicle
 
 from runner.core.commands import KnobValue
 from runner.core.model import Camera, Element, Graph, GraphSettings, KnobTarget, ModelError, Roi, Source
@@ -102,7 +102,7 @@ def test_the_recording_of_front_left() -> None:
 
 @pytest.mark.parametrize("name", GRAPHS)
 def test_every_graph_ends_in_a_sink_and_begins_with_the_source_for_it(name: str) -> None:
-    camera = vehicle(f"graph={name}").cameras["front_right"]
+    camera = vehicle(f"graph={name}", f"source={source_for(name)}").cameras["front_right"]
     compiled = plan(camera, index=2)
     port = str(camera.graph.settings.first_port + 2)
     sink, source = compiled.vehicle_line(KNOBS).split(" ! ")[-1], compiled.operator_line().split(" ! ")[0]

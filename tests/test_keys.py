@@ -461,7 +461,10 @@ def test_a_name_has_one_role(tmp_path, capsys):
 
 # --- roles x events ---------------------------------------------------------------------------------------------------
 
-OWN = ("link_measured", "copies_counted", "source_reported", "control_passed", "control_restored", "attention_changed")
+OWN = (
+    *("link_measured", "copies_counted", "stream_measured", "source_reported"),
+    *("control_passed", "control_restored", "attention_changed"),
+)
 PRESENCE = ("operator_connected", "operator_disconnected")
 DRIVEN = {*EVENTS} - {*OWN, "clock_advanced", "bitrate_predicted", "position_reported", "steering_reported"}
 ALLOWED = {

@@ -362,6 +362,7 @@ EVENTS: dict[str, dict[str, st.SearchStrategy[Any]]] = {
         "evidence": st.sampled_from([{}, carries(1000), carries(9000), {"silent_s": 0.5}, {"kbit": 40, "wait_s": 0.3}]),
     },
     "copies_counted": {"copies": st.dictionaries(st.sampled_from(list(TUM.cameras)), st.sampled_from([1, 2, 3]))},
+    "stream_measured": {**FRONT_LEFT, **KBPS},
     "source_reported": {**FRONT_LEFT, "works": st.booleans(), "reason": st.just("no such device")},
     "control_passed": {"operator": st.sampled_from(["a", "b", ""])},
     **{f"control_{kind}": {"operator": st.just("a")} for kind in ("requested", "released", "taken", "restored")},

@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager
 from multiprocessing import active_children
 
 import pytest
-from helpers import CONF, Command, UserConf, process
+from helpers import CONF, Command, UserConf, process, source_for
 
 from runner.configuration.config import configuration
 from runner.configuration.files import GROUPS
@@ -276,7 +276,7 @@ def test_elements_of_the_packaged_graphs_have_a_package() -> None:
     from runner.gst import Gst
 
     for graph in (file.stem for file in (CONF / "graph").glob("*.yaml")):
-        for plan in compile_plans(configuration([f"graph={graph}", "source=test"]).setup()):
+        for plan in compile_plans(configuration([f"graph={graph}", f"source={source_for(graph)}"]).setup()):
             for element in (*plan.vehicle, *plan.operator):
                 found = Gst.ElementFactory.find(element.factory)
                 is_core = found is not None and found.get_plugin_name() == "coreelements"
@@ -346,7 +346,8 @@ def test_a_reference_to_another_group_is_combined_with_each_of_its_files(tod: Co
     with_mine = tod("validate", "all=true", conf.word, *one_of_each)
     assert (plain.status, with_mine.status) == (0, 0), with_mine.err
     before, after = (int(result.out.split()[3]) for result in (plain, with_mine))
-    assert after - before == 1 + count("graph")  # the file alone, and with each graph
+    served = [file for file in (CONF / "graph").glob("*.yaml") if source_for(file.stem) == "test"]
+    assert after - before == 1 + len(served)  # the file alone, and with each graph
 
 
 # --- FILE -------------------------------------------------------------------------------------------------------------

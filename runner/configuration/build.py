@@ -64,7 +64,7 @@ TOPIC = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")  # des
 TOPIC_RULE = "must be the name of a topic: letters, digits and _ between slashes, no part beginning with a digit"
 CAMERA_NEEDS = ("width_px", "height_px", "fps", "rate_quality")  # keys that the schema requires, set by the kind
 GRAPH_STRUCTURE = (
-    *("defaults", "transport", "verified", "key_frame", "vehicle", "operator", "wire", "knobs", "mutable"),
+    *("defaults", "transport", "verified", "passes", "key_frame", "vehicle", "operator", "wire", "knobs", "mutable"),
     *("effort", "efforts", "needs"),
 )
 GRAPH_SETTINGS = [part.name for part in fields(GraphSettings)]
@@ -220,7 +220,7 @@ class Builder:
         # Parts that the schema accepts are checked further, whatever the problems elsewhere.
         graph = self.part(self._place(path, "graph"), _graph)
         source = self.part(self._place(path, "source"), _source)
-        model = self.part((*path, "rate_quality"), _rate_quality)
+        model = self.part((*path, "rate_quality"), lambda data: _rate_quality(data, graph))
         if graph is None or source is None or model is None or not (self.is_valid(*path) and self.is_valid("fps_max")):
             return None
         fps, limit = _rate(data["fps"]), document.get("fps_max")
@@ -417,12 +417,10 @@ def _capture(source: Source, data: Mapping[str, Any]) -> Capture:
     return Capture(**size, fps=None if fps is None else _rate(fps), controls=controls)
 
 
-def _rate_quality(data: Mapping[str, Any]) -> RateQualityModel:
-    return RateQualityModel(
-        scaling=tuple(map(exact, data["scaling"])),
-        b_min=tuple(map(exact, data["b_min_kbps"])),
-        b_full=exact(data["b_full_kbps"]),
-    )
+def _rate_quality(data: Mapping[str, Any], graph: Graph | None) -> RateQualityModel:
+    scaling, b_min = (tuple(map(exact, data[key])) for key in ("scaling", "b_min_kbps"))
+    whole = RateQualityModel((Fraction(1),), (Fraction(0),), exact(data["b_full_kbps"]))
+    return whole if graph and graph.passes else RateQualityModel(scaling, b_min, whole.b_full)
 
 
 def _rate(fps: float) -> Fraction:
@@ -469,7 +467,7 @@ def _graph(data: Mapping[str, Any]) -> Graph:
         settings=GraphSettings(**_given(named, GRAPH_SETTINGS)),
         placeholders=named,
         mutable=tuple((entry["element"], entry["property"]) for entry in data.get("mutable") or ()),
-        **_given(data, ("verified", "key_frame", "needs")),
+        **_given(data, ("verified", "passes", "key_frame", "needs")),
     )
 
 
@@ -477,6 +475,7 @@ def _source(data: Mapping[str, Any]) -> Source:
     render = data.get("render")
     return Source(
         elements=_elements(data["elements"]),
+        encoded=_elements(data.get("encoded")),
         settings={key: data[key] for key in MOUNT_KEYS if data.get(key) is not None},
         capture=data.get("capture") or {},
         plays_bags="bag" in data,

@@ -212,6 +212,14 @@ class CopiesCounted(_Event):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class StreamMeasured(_Event):
+    """What a camera sends whose pictures are passed on as it encodes them; until this is reported, its b_full."""
+
+    camera: CameraName
+    kbps: Annotated[Rate, "mean of the last seconds, kbit/s"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SourceReported(_Event):
     """A camera's source cannot be opened, or can be again; until this is reported, it can."""
 
@@ -368,6 +376,7 @@ Event = (
     | MomentMarked
     | LinkMeasured
     | CopiesCounted
+    | StreamMeasured
     | SourceReported
     | ControlPassed
     | ControlRequested
@@ -390,6 +399,7 @@ EVENTS: dict[str, type[Event]] = {  # mode_selected: ModeSelected
 OWN = (
     LinkMeasured,
     CopiesCounted,
+    StreamMeasured,
     SourceReported,
     ControlPassed,
     ControlRestored,

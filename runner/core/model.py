@@ -213,6 +213,7 @@ class Graph:
     placeholders  what its file states by name (mtu_bytes, jitter_buffer_ms, ...): properties refer to it as {name}
     mutable       (element, property) that knobs set although GStreamer does not declare it mutable while playing
     verified      False: only checked against its schema, never run by this project's tests
+    passes        format of the pictures that it passes on as the source encodes them, h264 or h265; None: it encodes
     key_frame     how to request a key frame after unrecovered packet loss: "event", GStreamer's own; "caps", a pixel
                   aspect ratio that differs imperceptibly, for an encoder that ignores the event; None: not at all
     needs         by element that only the vehicle may have, the Debian package that provides it
@@ -228,6 +229,7 @@ class Graph:
     placeholders: Mapping[str, Value]
     mutable: tuple[tuple[str, str], ...] = ()
     verified: bool = True
+    passes: str | None = None
     key_frame: str | None = None
     needs: Mapping[str, str] = field(default_factory=dict)
 
@@ -267,6 +269,7 @@ def check_unique(key: str, names: list[str]) -> None:
 class Source:
     """Where a camera's frames come from: elements with {placeholders} for the mount's device, address, clip and size.
 
+    encoded     elements up to pictures as the origin encodes them, for graphs that pass these on; empty: it cannot
     settings    values for cameras that name none, from the file itself: clip, device, address, bag, topic
     capture     format requested from its cameras unless they state another, see `Capture`
     credentials file with user name and password, for cameras that name none
@@ -286,6 +289,7 @@ class Source:
     """
 
     elements: tuple[Element, ...]
+    encoded: tuple[Element, ...] = ()
     settings: Mapping[str, Value] = field(default_factory=dict)
     capture: Mapping[str, Any] = field(default_factory=dict)
     credentials: str | None = None
@@ -311,7 +315,7 @@ class Source:
     @property
     def placeholders(self) -> frozenset[str]:
         """Names of the placeholders in its elements."""
-        values = (value for element in self.elements for value in element.properties.values())
+        values = (value for element in (*self.elements, *self.encoded) for value in element.properties.values())
         return frozenset(name for value in values if isinstance(value, str) for name in PLACEHOLDER.findall(value))
 
 
@@ -477,6 +481,7 @@ class Vehicle:
     mode     at the start
     modes    the rules of each mode, in order
     uplinks  by name, kbit/s that are left to other traffic; empty: there is one, without a name
+    fixed    cameras whose pictures are sent as their sources encode them, whatever the rules would choose
     """
 
     name: str
@@ -484,6 +489,11 @@ class Vehicle:
     mode: Mode
     modes: Mapping[Mode, tuple[ModeRule, ...]]
     uplinks: Mapping[str, Kbps] = field(default_factory=dict)
+    fixed: frozenset[str] = field(init=False)
+
+    def __post_init__(self) -> None:
+        passed = (name for name, camera in self.cameras.items() if camera.graph.passes)
+        object.__setattr__(self, "fixed", frozenset(passed))
 
 
 Progress = Callable[[str, float], None]  # current step, share done in [0, 1]

@@ -47,6 +47,7 @@ class State:
     position: ev.PositionReported | None = None
     steering: ev.SteeringReported | None = None
     copies: Mapping[str, int] = field(default_factory=lambda: NOTHING)  # that leave the vehicle; 1 for others
+    streams: Mapping[str, Kbps] = field(default_factory=lambda: NOTHING)  # of cameras that encode by themselves, kbit/s
     lost: Mapping[str, str] = field(default_factory=lambda: NOTHING)  # why its source cannot be opened
     driving: dr.Driving = field(default_factory=dr.Driving)
     motion: dr.Motion = field(default_factory=dr.Motion)
@@ -111,6 +112,9 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
         case ev.CameraSwitched(camera=name, on=on):
             _known(vehicle, name)
             return {"on": {**state.on, name: on}, "manual": _manual(state, in_force, name, on)}
+        case ev.StreamMeasured(camera=name, kbps=kbps):
+            _known(vehicle, name)
+            return {"streams": {**state.streams, name: kbps}}
         case ev.SourceReported(camera=name, works=works, reason=reason):
             _known(vehicle, name)
             others = {other: why for other, why in state.lost.items() if other != name}
@@ -120,11 +124,12 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
             known = vehicle.cameras.get(name)
             if known is None or roi != known.full_roi:  # what a region leaves out can be had back at any time
                 _only_in(Mode.SINGLE, state, event)
-            _check_roi(_known(vehicle, name), roi)
+            _check_roi(_encoded_here(_known(vehicle, name), "choose the region on the page"), roi)
             return {"rois": {**state.rois, name: roi}}
         case ev.CameraConfigured(camera=name):
             _only_in(Mode.SINGLE, state, event)
-            configured = _configured(_known(vehicle, name), state.manual[name], event)
+            camera = _encoded_here(_known(vehicle, name), "switch it off to send less")
+            configured = _configured(camera, state.manual[name], event)
             return {"manual": {**state.manual, name: configured}}
         case ev.WeightsSet(weights=weights):
             for name in weights:
@@ -215,6 +220,12 @@ def _known(vehicle: Vehicle, name: str) -> Camera:
     if name in vehicle.cameras:
         return vehicle.cameras[name]
     raise Refused(f"unknown camera {name!r}{suggest(name, vehicle.cameras)}")
+
+
+def _encoded_here(camera: Camera, instead: str) -> Camera:
+    if not camera.graph.passes:
+        return camera
+    raise Refused(f"the pictures of {camera.name} are sent as the camera encodes them; {instead}")
 
 
 def _of_uplink(

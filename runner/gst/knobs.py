@@ -60,6 +60,9 @@ class KnobPanel:
             self._apply_pending()
             return
         names = {name for name, _, _ in changed}
+        if not names:  # of a graph that passes pictures on
+            self._apply_pending()
+            return
         first = next(element for element in self._elements if element.get_name() in names)
         # Only a source pad knows whether a frame it has pushed is still being processed downstream.
         above = first.get_static_pad("sink").get_peer()

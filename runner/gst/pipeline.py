@@ -108,7 +108,7 @@ class CameraPipeline:
         self._pushed: PushedPictures | None = None  # those of a Python program
         self._elements = [pipeline.get_by_name(element.name) for element in plan.vehicle]
         self._encoder = EncoderWatch(self._elements)
-        self._entered = _count_before(self._encoder.encoder) if self._encoder.encoder else None
+        self._entered = _count_before(self._encoder.encoder) if self._encoder.encoder else self._sent
         entry = self._elements[0].get_static_pad("sink")
         self._repeats = RepeatDetector(entry, plan.camera.source.repeated_s, on_report)
         last = next(pad for element in reversed(self._elements) if (pad := element.get_static_pad("src")))

@@ -43,7 +43,7 @@ from runner.vehicle.access import Access
 from runner.vehicle.attention import StatedAttention
 from runner.vehicle.holder import NOBODY, Held
 from runner.vehicle.inbox import MAX_QUEUED, Answer, Inbox, Item, QueuedReport, Request
-from runner.vehicle.noticed import copies_events, presence_events, source_events
+from runner.vehicle.noticed import Streams, copies_events, presence_events, source_events
 from runner.vehicle.operators import SILENT_S, Operators
 from runner.vehicle.publishing import Publish, Publisher
 from runner.vehicle.refusals import Refusals
@@ -120,7 +120,7 @@ class ControlLoop:
         self._inbox = Inbox()
         self.refusals = Refusals(self._now, self._inbox.is_full, self.on_report)
         self._operators, self._attention = Operators(self.setup.expires_s), StatedAttention()
-        self._pictures = SeenPictures(self.vehicle)
+        self._pictures, self._streams = SeenPictures(self.vehicle), Streams(self.vehicle.fixed)
         self._uplinks, self._sending, self._key_frames = MeasuredUplinks(self.vehicle), SendingTimes(), KeyFrames()
         self._publisher, self._replies = Publisher(self.setup.latency, self.publish), Replies()
         self._report_once = RepeatedReports(self.on_report)
@@ -216,6 +216,7 @@ class ControlLoop:
         self._guarded("cameras", self._read)
         self._guarded("sources", lambda: self._notice(source_events(self._run.state, self._cameras, t)))
         self._guarded("copies_counted", lambda: self._notice(copies_events(self._run.state, self._cameras, t)))
+        self._guarded("streams", lambda: self._notice(self._streams.events(self._run.state, self._cameras, t)))
         if self._ticks % TELEMETRY_TICKS == 0:
             self._guarded("telemetry", lambda: self._publish_measured(t))
         self._guarded("operators", lambda: self._watch_operators(t))

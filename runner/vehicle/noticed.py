@@ -5,7 +5,10 @@ Each is a comparison with the core's state, not with what was noticed before, si
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping
+from fractions import Fraction
+from math import ceil
 
 from runner.core.events import (
     CopiesCounted,
@@ -14,10 +17,16 @@ from runner.core.events import (
     OperatorConnected,
     OperatorDisconnected,
     SourceReported,
+    StreamMeasured,
 )
+from runner.core.model import Kbps
 from runner.core.roles import Role
 from runner.core.state import State
 from runner.records.vehicle import CameraReading
+
+STREAM_S = 4.0  # over which a stream is measured: many cameras send a key picture every two seconds
+LEAST_S = 2.0  # of these, before anything is said
+CHANGE = Fraction(11, 10)  # of its bitrate, that is told
 
 
 def presence_events(
@@ -52,6 +61,33 @@ def source_events(known: State, cameras: Mapping[str, CameraReading], t: float) 
     for name, why in ((name, camera.lost) for name, camera in cameras.items()):
         if why != known.lost.get(name):
             yield SourceReported(t=t, camera=name, works=why is None, reason=why)
+
+
+class Streams:
+    """Measures what cameras send that encode by themselves, from the counters of their pipelines.
+
+    cameras  their names
+    """
+
+    def __init__(self, cameras: Collection[str]) -> None:
+        self._seen: dict[str, deque[tuple[float, int]]] = {name: deque() for name in cameras}
+
+    def events(self, known: State, cameras: Mapping[str, CameraReading], t: float) -> Iterator[Event]:
+        """Those that send more or less than is known by `CHANGE`; several times a second."""
+        for name, seen in self._seen.items():
+            counted = cameras[name].encoded.bytes
+            if cameras[name].applied.get("sending") is not True or (seen and counted < seen[-1][1]):
+                seen.clear()  # it is off, or begins anew
+            seen.append((t, counted))
+            while len(seen) > 2 and t - seen[1][0] >= STREAM_S:
+                seen.popleft()
+            span_s = t - seen[0][0]
+            if span_s < LEAST_S or counted == seen[0][1]:
+                continue
+            kbps = Kbps(ceil(8 * (counted - seen[0][1]) / span_s / 1000))
+            last = known.streams.get(name)
+            if last is None or not 1 / CHANGE < kbps / last < CHANGE:
+                yield StreamMeasured(t=t, camera=name, kbps=kbps)
 
 
 def copies_events(known: State, cameras: Mapping[str, CameraReading], t: float) -> Iterator[Event]:

@@ -303,7 +303,7 @@ class _Tasks:
         self._given = [each for each in chosen if each[0] in GROUPS and each[1] in options(each[0], self._directories)]
 
     def selected(self) -> list[ValidationTask]:
-        return list(dict.fromkeys(filter(self._is_selected, self._all())))
+        return [task for task in dict.fromkeys(self._all()) if self._is_selected(task) and self._is_served(task)]
 
     def _all(self) -> Iterator[ValidationTask]:
         """Single files before combinations; the same task may occur twice."""
@@ -340,6 +340,19 @@ class _Tasks:
         chosen = (find_file(self._directories, group, name) for group, name in choices)
         files = {file for path in chosen for file in built_on(path, self._directories)}
         return not files.isdisjoint(self._named) or (not task.choices and self._root in self._named)
+
+    def _is_served(self, task: ValidationTask) -> bool:
+        """Whether the source of a combination delivers what its graph passes on; what somebody chose is checked."""
+        files = dict(self._given) | dict(task.choices)
+        passes = bool(task.choices) and self._states("graph", files.get("graph"), "passes")
+        return not passes or self._states("source", files.get("source"), "encoded")
+
+    def _states(self, group: str, name: str | None, key: str) -> bool:
+        """Whether a file, or one that it builds on, states a key."""
+        with suppress(ConfigError):  # reported for the file alone
+            files = built_on(find_file(self._directories, group, name), self._directories) if name else ()
+            return any(key in load_file(file) for file in files)
+        return False
 
     @property
     def _root(self) -> Path:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from fractions import Fraction
+from functools import partial
 
 from runner.core import allocation, scaling
 from runner.core.decision import Draft, short
 from runner.core.model import Kbps, Roi, Vehicle, plain
 from runner.core.rules.registry import Last, Memory, Step, rule
 from runner.core.state import State
+
+Shares = Mapping[str, Kbps]
+AS_ENCODED = "as the camera encodes it"
 
 
 @rule(gives=["total"], reads=["prediction", "predictions"])
@@ -30,27 +34,53 @@ def total_fixed(vehicle: Vehicle, state: State, draft: Draft, memory: Memory, *,
     return draft.replaced(total=kbps), memory
 
 
-@rule(gives=["demand"], reads=["on", "rois"])
+@rule(gives=["demand"], reads=["on", "rois", "streams"])
 def demand_from_roi(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
-    """Eq. (1): each camera that is on asks in proportion to the pixels of its ROI."""
+    """Eq. (1): each camera that is on asks in proportion to the pixels of its ROI, or for what it encodes by itself."""
     return draft.replaced(demand=demands(vehicle, state)), memory
 
 
 def demands(vehicle: Vehicle, state: State) -> dict[str, Kbps]:
     """kbit/s by camera, Eq. (1); 0 when off."""
     return {
-        name: allocation.demand(camera.rate_quality.b_full, state.rois[name], camera.full_roi)
+        name: allocation.demand(state.streams.get(name, camera.rate_quality.b_full), state.rois[name], camera.full_roi)
         if state.on[name]
         else allocation.ZERO
         for name, camera in vehicle.cameras.items()
     }
 
 
+def above_fixed(
+    vehicle: Vehicle, wanted: Mapping[str, Kbps], total: Kbps, share: Callable[[Mapping[str, Kbps], Kbps], Shares]
+) -> Shares:
+    """kbit/s by camera: what cameras encode by themselves comes off the total first; the others share the rest.
+
+    share  returns kbit/s by camera, from demands and their total
+    """
+    if not vehicle.fixed:
+        return share(wanted, total)
+    fixed = {name: kbps for name, kbps in wanted.items() if name in vehicle.fixed}
+    others = {name: kbps for name, kbps in wanted.items() if name not in fixed}
+    given = share(others, max(allocation.ZERO, total - sum(fixed.values())))
+    return {name: fixed[name] if name in fixed else given[name] for name in wanted}
+
+
+def with_excess_noted(vehicle: Vehicle, draft: Draft) -> Draft:
+    """With a note if what cameras encode by themselves is more than the total."""
+    assert draft.total is not None
+    fixed = sum((draft.bitrate[name] for name in vehicle.fixed), allocation.ZERO)
+    if fixed <= draft.total:
+        return draft
+    return draft.noted(f"cameras that encode by themselves send {whole(fixed)} of {whole(draft.total)} kbit/s")
+
+
 @rule(needs=["total", "demand"], gives=["bitrate"], reads=["weights"])
 def share_by_demand(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
     """Eq. (2): the total is shared in proportion to demand times weight, no camera gets more than its demand."""
     assert draft.total is not None
-    return draft.replaced(bitrate=allocation.allocate(draft.demand, draft.total, state.weights)), memory
+    share = partial(allocation.allocate, weights=state.weights)
+    given = above_fixed(vehicle, draft.demand, draft.total, share)
+    return with_excess_noted(vehicle, draft.replaced(bitrate=given)), memory
 
 
 @rule(needs=["total", "demand"], gives=["bitrate"], reads=["weights"])
@@ -60,7 +90,9 @@ def share_equally(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) 
     # Eq. (2) shares in proportion to weight times demand; this cancels the demand.
     wanted = {name: demand for name, demand in draft.demand.items() if demand}
     weights = {name: state.weights[name] / wanted.get(name, 1) for name in draft.demand}
-    return draft.replaced(bitrate=allocation.allocate(draft.demand, draft.total, weights)), memory
+    share = partial(allocation.allocate, weights=weights)
+    given = above_fixed(vehicle, draft.demand, draft.total, share)
+    return with_excess_noted(vehicle, draft.replaced(bitrate=given)), memory
 
 
 @rule(needs=["bitrate"], gives=["scaling"], reads=["rois"], uses=["sized_for"])
@@ -97,7 +129,7 @@ def _scaled(
         seen = ""
         if kbps and (lasting is not None or (roi is not full and roi != full)):
             seen = f", as {whole(of_full)} for the full image" + ("" if lasting is None else " at the total that lasts")
-        reasons[name] = f"{kbps} of {short(demand[name])} kbit/s{seen}, {why}"
+        reasons[name] = f"{kbps} of {short(demand[name])} kbit/s{seen}, {AS_ENCODED if camera.graph.passes else why}"
     return factors, reasons
 
 
@@ -105,11 +137,17 @@ def _scaled(
 def keep_operator_settings(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
     """Mode S: each camera is sent as the operator has set it; the total is the resulting sum."""
     on = [name for name in vehicle.cameras if state.on[name]]
-    bitrates = {name: Kbps(state.manual[name].kbps) if name in on else allocation.ZERO for name in vehicle.cameras}
+    bitrates = dict.fromkeys(vehicle.cameras, allocation.ZERO)
+    bitrates |= {name: _as_set(vehicle, state, draft, name) for name in on}
     factors = {name: state.manual[name].scaling for name in on}
     reasons = {name: f"{int(bitrates[name])} kbit/s and {plain(factors[name])} as set in mode single" for name in on}
+    reasons |= {name: f"{int(bitrates[name])} kbit/s, {AS_ENCODED}" for name in vehicle.fixed.intersection(on)}
     total = of_all_copies(state, bitrates)
     return draft.replaced(total=total, bitrate=bitrates, scaling=factors, reasons=reasons), memory
+
+
+def _as_set(vehicle: Vehicle, state: State, draft: Draft, name: str) -> Kbps:
+    return draft.demand[name] if name in vehicle.fixed else Kbps(state.manual[name].kbps)
 
 
 def of_all_copies(state: State, kbps: Mapping[str, Kbps]) -> Kbps:

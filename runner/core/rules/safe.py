@@ -18,7 +18,14 @@ from runner.core.events import LinkState
 from runner.core.follow_link import FLOOR, Ceiling, Reports
 from runner.core.model import Camera, Kbps, Mode, Vehicle, exact, plain
 from runner.core.placement import shared
-from runner.core.rules.paper import demands, lasting_share, of_all_copies, whole
+from runner.core.rules.paper import (
+    above_fixed,
+    demands,
+    lasting_share,
+    of_all_copies,
+    whole,
+    with_excess_noted,
+)
 from runner.core.rules.registry import Last, Memory, Step, rule
 from runner.core.state import State
 
@@ -34,7 +41,7 @@ def share_above_floors(vehicle: Vehicle, state: State, draft: Draft, memory: Mem
     """
     draft, given_up, memory = _give_up(vehicle, state, draft, draft.demand, memory)
     wanted = _without(given_up, draft.demand)
-    return draft.replaced(bitrate=_shared(vehicle, state, draft, wanted)), memory
+    return with_excess_noted(vehicle, draft.replaced(bitrate=_shared(vehicle, state, draft, wanted))), memory
 
 
 def _shared(vehicle: Vehicle, state: State, draft: Draft, wanted: Mapping[str, Kbps]) -> Mapping[str, Kbps]:
@@ -66,13 +73,12 @@ def _shared_among(vehicle: Vehicle, state: State, wanted: Mapping[str, Kbps], to
     """kbit/s by camera: floors first, then Eq. (2); the total counts every copy of a camera that leaves the vehicle."""
     floors = _floors(vehicle)
     if not state.copies:
-        allocated: Mapping[str, Kbps] = _allocated(wanted, total, state.weights, floors)
-        return allocated
+        return above_fixed(vehicle, wanted, total, lambda others, rest: _allocated(others, rest, state.weights, floors))
     copies = {name: state.copies.get(name, 1) for name in wanted}
     of_all = {name: own * copies[name] for name, own in wanted.items()}
     lowest = {name: floor * copies[name] for name, floor in floors.items() if name in copies}
-    shares = allocation.allocate_above_floors(of_all, total, state.weights, lowest)
-    return {name: Fraction(share) / copies[name] for name, share in shares.items()}
+    share = partial(allocation.allocate_above_floors, weights=state.weights, floors=lowest)
+    return {name: Fraction(own) / copies[name] for name, own in above_fixed(vehicle, of_all, total, share).items()}
 
 
 def _give_up(
@@ -83,7 +89,8 @@ def _give_up(
     given_up: tuple[str, ...] = ()
     if order := _shed_order(vehicle):
         assert draft.total is not None
-        floors = {name: floor * state.copies.get(name, 1) for name, floor in _floors(vehicle).items()}
+        lowest = {**_floors(vehicle), **_fixed(vehicle, wanted)}
+        floors = {name: floor * state.copies.get(name, 1) for name, floor in lowest.items()}
         of_all = {name: own * state.copies.get(name, 1) for name, own in wanted.items()}
         given_up = allocation.shed(of_all, draft.total, floors, order, before)
     if given_up != before:
@@ -102,6 +109,11 @@ def _without(given_up: Collection[str], wanted: Mapping[str, Kbps]) -> Mapping[s
 def _floors(vehicle: Vehicle) -> Mapping[str, Kbps]:
     """kbit/s by camera, for those that have a floor."""
     return {name: camera.floor_kbps for name, camera in vehicle.cameras.items() if camera.floor_kbps}
+
+
+def _fixed(vehicle: Vehicle, wanted: Mapping[str, Kbps]) -> Mapping[str, Kbps]:
+    """kbit/s by camera, for those that get all that they encode by themselves, or nothing."""
+    return {name: wanted[name] for name in vehicle.fixed if name in wanted}
 
 
 @cache
@@ -148,7 +160,7 @@ def fit_to_total(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -
 @rule(
     needs=["total"],
     gives=["total", "uncapped", "sized_for", "uplinks"],
-    reads=["copies", "link", "links", "on", "operator_since", "prediction", "predictions", "rois", "t"],
+    reads=["copies", "link", "links", "on", "operator_since", "prediction", "predictions", "rois", "streams", "t"],
 )
 def follow_link(
     vehicle: Vehicle,
@@ -314,9 +326,9 @@ def _wire_floors(vehicle: Vehicle, state: State, draft: Draft, cameras: tuple[Ca
 
     cameras  that are on, with repetitions for copies
     """
-    if not (lowest := _floors(vehicle)):
-        return allocation.ZERO
     wanted = _wanted(vehicle, state, draft)
+    if not (lowest := {**_floors(vehicle), **_fixed(vehicle, wanted)}):
+        return allocation.ZERO
     floors = sum(
         (
             min(floor, wanted.get(name, allocation.ZERO)) * state.copies.get(name, 1)

@@ -1,0 +1,135 @@
+"""Cameras that encode by themselves: the rules take what they send off the total first."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import Any
+
+import pytest
+from helpers import Command, Drive
+
+from runner.core.events import StreamMeasured
+from runner.core.state import State
+from runner.records.vehicle import CameraReading, EncoderCounts
+from runner.vehicle.noticed import Streams
+
+REAR = (
+    "+source@cameras.rear.source=rtsp",
+    "+graph@cameras.rear.graph=pass_through",
+    "+cameras.rear.address=rtsp://h/a",
+)
+
+
+def drive(kbps: float, *words: str, sends: float | None = None, modes: str = "paper") -> Drive:
+    """A robot whose rear camera encodes by itself, and was measured to send this much; `kbps` are predicted."""
+    made = Drive("vehicle=delivery_robot", f"modes={modes}", *REAR, *words)
+    if sends is not None:
+        made.accept("stream_measured", camera="rear", kbps=sends)
+    made.accept("bitrate_predicted", kbps=kbps)
+    return made
+
+
+@pytest.mark.parametrize("modes", ["paper", "safe", "equal"])
+def test_it_comes_off_the_total_first(modes: str) -> None:
+    """b_full, 1500 kbit/s, is what it is taken to send until it is measured."""
+    assert [drive(3000, modes=modes, sends=sends)["rear"].kbps for sends in (None, 800, 2400)] == [1500, 800, 2400]
+    for sends in (800, 2400):
+        others = [drive(3000, modes=modes, sends=sends)[name].kbps for name in ("front", "mast")]
+        assert 3000 - sends - len(others) <= sum(others) <= 3000 - sends
+
+
+def test_it_is_sent_whole_in_one_size_as_the_camera_encodes_it() -> None:
+    for kbps in (2000, 3000, 20000):
+        rear = drive(kbps, sends=1234)["rear"]
+        assert (rear.scaling, rear.width, rear.height, rear.kbps) == (1, 848, 480, 1234)
+        assert rear.reason.startswith("1234 of 1234 kbit/s, as the camera encodes it")
+
+
+def test_what_does_not_fit_is_said() -> None:
+    made = drive(1000, sends=1500)
+    assert [made[name].kbps for name in ("front", "rear", "mast")] == [0, 1500, 0]
+    assert "cameras that encode by themselves send 1500 of 1000 kbit/s" in made["rear"].reason
+    assert "by themselves" not in drive(1500, sends=1500)["rear"].reason
+
+
+FLOORS = ("++cameras.front.floor_kbps=600", "++cameras.mast.floor_kbps=200")
+
+
+def test_it_is_given_up_when_the_rest_would_fall_below_their_floors() -> None:
+    def sent(kbps: float) -> dict[str, int]:
+        made = drive(kbps, *FLOORS, "++cameras.rear.shed=1", sends=1500, modes="safe")
+        return {name: made[name].kbps for name in ("front", "rear", "mast")}
+
+    assert sent(2300)["rear"] == 1500
+    assert sent(2299) == {"front": 1739, "rear": 0, "mast": 559} or sent(2299)["rear"] == 0
+
+
+def test_one_that_is_never_given_up_leaves_the_others_what_is_left() -> None:
+    made = drive(2000, *FLOORS, sends=1500, modes="safe")
+    assert made["rear"].kbps == 1500
+    assert made["front"].kbps + made["mast"].kbps <= 500
+
+
+def test_in_mode_s_too(tod: Command) -> None:
+    made = drive(3000, sends=900)
+    made.accept("mode_selected", mode="single")
+    assert made["rear"].kbps == 900
+    made.accept("stream_measured", camera="rear", kbps=1100)
+    assert (made["rear"].kbps, made["rear"].reason) == (1100, "1100 kbit/s, as the camera encodes it")
+
+
+@pytest.mark.parametrize(
+    "event, instead",
+    [
+        ({"event": "camera_configured", "kbps": 500}, "switch it off to send less"),
+        ({"event": "roi_set", "x": 0, "y": 0, "width": 400, "height": 200}, "choose the region on the page"),
+    ],
+)
+def test_what_only_the_camera_could_do_is_refused(event: dict[str, Any], instead: str) -> None:
+    made = drive(3000)
+    made.accept("mode_selected", mode="single")
+    refused = made.feed(camera="rear", **event).refused
+    assert refused is not None
+    assert str(refused) == f"the pictures of rear are sent as the camera encodes them; {instead}"
+
+
+def test_off_and_on_again() -> None:
+    made = drive(3000, sends=900)
+    made.accept("camera_switched", camera="rear", on=False)
+    assert (made["rear"].kbps, made["front"].kbps + made["mast"].kbps) == (0, 2999)
+    made.accept("camera_switched", camera="rear", on=True)
+    assert made["rear"].kbps == 900
+
+
+@pytest.mark.parametrize("graph, source", [("pass_through", "test"), ("pass_through", "appsrc")])
+def test_a_source_of_raw_pictures_has_nothing_to_pass_on(tod: Command, graph: str, source: str) -> None:
+    result = tod("validate", f"graph={graph}", f"source={source}")
+    assert result.status == 2
+    assert f"graph/{graph}.yaml: passes: h264: needs a source with `encoded`, such as rtsp or v4l2" in result.err
+
+
+# --- measured ---------------------------------------------------------------------------------------------------------
+
+
+def measured(*counts: tuple[float, int], known: dict[str, Fraction] | None = None, sending: bool = True) -> list[Any]:
+    """What is reported for (time, bytes so far) of a camera."""
+    streams, state = Streams({"rear"}), State.initial(drive(3000).vehicle, drive(3000).vehicle.mode)
+    found: list[Any] = []
+    for t, size in counts:
+        reading = CameraReading(applied={"sending": sending}, encoded=EncoderCounts(0, size))
+        for event in streams.events(state, {"rear": reading}, t):
+            assert isinstance(event, StreamMeasured)
+            found.append((t, int(event.kbps)))
+    return found
+
+
+def test_what_a_camera_sends_is_the_mean_of_some_seconds() -> None:
+    counts = [(t / 10, 12_500 * t) for t in range(31)]  # 1000 kbit/s
+    assert measured(*counts)[0] == (2.0, 1000)
+    assert measured(*counts, sending=False) == []
+
+
+def test_nothing_that_arrives_is_no_lower_rate() -> None:
+    counts = [(t / 10, 12_500 * min(t, 25)) for t in range(100)]
+    assert {kbps for t, kbps in measured(*counts) if t < 2.6} <= {1000, 1001}
+    assert all(kbps > 0 for _, kbps in measured(*counts))
