@@ -336,22 +336,21 @@ class _Tasks:
     def _is_selected(self, task: ValidationTask) -> bool:
         if self._named is None:
             return True
-        choices = (*task.choices, *self._given)
-        chosen = (find_file(self._directories, group, name) for group, name in choices)
+        chosen = (find_file(self._directories, group, name) for group, name in (*task.choices, *self._given))
         files = {file for path in chosen for file in built_on(path, self._directories)}
         return not files.isdisjoint(self._named) or (not task.choices and self._root in self._named)
 
     def _is_served(self, task: ValidationTask) -> bool:
         """Whether the source of a combination delivers what its graph passes on; what somebody chose is checked."""
         files = dict(self._given) | dict(task.choices)
-        passes = bool(task.choices) and self._states("graph", files.get("graph"), "passes")
-        return not passes or self._states("source", files.get("source"), "encoded")
+        passes = task.choices and self._states(files, "graph", "passes")
+        return not passes or self._states(files, "source", "encoded")
 
-    def _states(self, group: str, name: str | None, key: str) -> bool:
-        """Whether a file, or one that it builds on, states a key."""
+    def _states(self, files: Mapping[str, str], group: str, key: str) -> bool:
+        """Whether the file of a group, or one that it builds on, states a key."""
         with suppress(ConfigError):  # reported for the file alone
-            files = built_on(find_file(self._directories, group, name), self._directories) if name else ()
-            return any(key in load_file(file) for file in files)
+            path = find_file(self._directories, group, files.get(group, ""))
+            return any(key in load_file(file) for file in built_on(path, self._directories))
         return False
 
     @property
