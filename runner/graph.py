@@ -208,9 +208,10 @@ def compile_graph(
 
     stand_in = fill(source.stand_in, "source.stand_in")
     unrendered = bool(source.render) and clip is None
-    key = "encoded" if graph.passes else "elements"
-    if not (elements := getattr(source, key)):
-        raise ModelError("graph.passes", graph.passes, "needs a source with `encoded`, such as rtsp or v4l2")
+    passes = graph.passes
+    if passes and passes not in source.encoded:
+        raise ModelError("graph.passes", passes, "needs a source with `encoded` pictures of this format, such as rtsp")
+    elements, key = (source.encoded[passes], f"encoded.{passes}") if passes else (source.elements, "elements")
     frames = stand_in if unrendered else fill(elements, f"source.{key}")
     stands_in = bool(stand_in) and clip is None
     return Plan(
@@ -332,7 +333,8 @@ def may_lack_parameter_sets(plan: Plan) -> bool:
     codec = video_codec(plan.camera.graph)
     payloader = next((element for element in plan.vehicle if element.factory == f"rtp{codec}pay"), None)
     # rtph265pay does so only for IDR pictures, and x265 sends CRA pictures.
-    repeats = codec == "h264" and payloader is not None and payloader.properties.get("config-interval") == -1
+    places = ("rtph264pay", "h264parse")
+    repeats = any(e.properties.get("config-interval") == -1 for e in plan.vehicle if e.factory in places)
     return payloader is not None and not repeats
 
 
@@ -410,7 +412,7 @@ def _values(camera: Camera, media: Media, index: int, clip: str | None) -> dict[
     """The values of the placeholders of a camera's source and graph; None: the property keeps its default."""
     width, height = camera.source_size
     rate = f"{camera.fps.numerator}/{camera.fps.denominator}"
-    settings, passes = camera.graph.settings, camera.graph.passes
+    settings = camera.graph.settings
     port = settings.first_port + index
     values: dict[str, Value | None] = {
         **camera.source.settings,
@@ -422,7 +424,6 @@ def _values(camera: Camera, media: Media, index: int, clip: str | None) -> dict[
         "framerate": rate,
         "raw_caps": f"video/x-raw,format=I420,width={width},height={height},framerate={rate},{_PICTURE}",
         "capture_caps": _capture_caps(camera.capture),
-        "encoded_caps": _ENCODED[passes] if passes else None,
         "controls": _controls(camera.capture),
         "host": media.host,
         "url": rtsp_url(media, camera.name, feedback=bool(settings.retransmission_ms)),

@@ -105,7 +105,7 @@ def test_off_and_on_again() -> None:
 def test_a_source_of_raw_pictures_has_nothing_to_pass_on(tod: Command, graph: str, source: str) -> None:
     result = tod("validate", f"graph={graph}", f"source={source}")
     assert result.status == 2
-    assert f"graph/{graph}.yaml: passes: h264: needs a source with `encoded`, such as rtsp or v4l2" in result.err
+    assert f"graph/{graph}.yaml: passes: h264: needs a source with `encoded` pictures of this format" in result.err
 
 
 # --- measured ---------------------------------------------------------------------------------------------------------

@@ -98,6 +98,36 @@ def test_a_stream_that_is_joined_late_starts_grey_and_is_exact_after_two_periods
     assert recent.add(unit(3.1)).exact
 
 
+def keyed(*units):
+    recent = RecentUnits(refresh_s=10.0, keyed=True)
+    return recent, [recent.add(each) for each in units]
+
+
+def test_a_camera_that_encodes_by_itself_is_shown_from_its_next_key_picture_on():
+    sps = bytes.fromhex("6742c015a681e08fe7c05a83008320000003002000000303d1e2c5d4")
+    with_sets = AccessUnit(b"\0\0\0\1" + sps + PPS + SLICE, 0, 0, key=False)
+    recent, shown = keyed(with_sets, unit(1), unit(2))
+    assert (recent.burst(), [each.exact for each in shown]) == ([], [False] * 3)
+    assert recent.add(unit(3, key=True)).exact
+    recent.add(unit(4))
+    assert [each.arrived for each in recent.burst()] == [3, 4]
+
+
+def test_one_that_announces_waves_is_shown_from_the_next_one_on():
+    sps = bytes.fromhex("6742c015a681e08fe7c05a83008320000003002000000303d1e2c5d4")
+    begins = AccessUnit(b"\0\0\0\1" + sps + PPS + SLICE, 1, 1, key=False, recovery=2)
+    recent, shown = keyed(unit(0), begins, unit(2), unit(3), unit(4))
+    assert [each.exact for each in shown] == [False, False, False, True, True]
+    assert [each.arrived for each in recent.burst()] == [1, 1, 2, 3, 4]
+
+
+def test_what_follows_a_key_picture_that_is_too_old_cannot_be_begun_with():
+    recent, shown = keyed(unit(0, key=True), *(unit(second) for second in range(1, 24)))
+    assert (recent.burst(), [each.exact for each in shown[-3:]]) == ([], [True, False, False])
+    recent.add(unit(30, key=True))
+    assert len(recent.burst()) == 1
+
+
 def test_a_burst_begins_with_the_last_completed_wave():
     recent = RecentUnits(refresh_s=1.0)
     recent.add(unit(0, key=True))

@@ -475,7 +475,7 @@ def _source(data: Mapping[str, Any]) -> Source:
     render = data.get("render")
     return Source(
         elements=_elements(data["elements"]),
-        encoded=_elements(data.get("encoded")),
+        encoded={codec: _elements(elements) for codec, elements in (data.get("encoded") or {}).items()},
         settings={key: data[key] for key in MOUNT_KEYS if data.get(key) is not None},
         capture=data.get("capture") or {},
         plays_bags="bag" in data,

@@ -12,7 +12,7 @@ from decimal import Decimal
 from enum import StrEnum
 from fractions import Fraction
 from functools import lru_cache
-from itertools import islice, pairwise
+from itertools import chain, islice, pairwise
 from math import inf, nextafter
 from typing import Any, Protocol
 
@@ -269,7 +269,7 @@ def check_unique(key: str, names: list[str]) -> None:
 class Source:
     """Where a camera's frames come from: elements with {placeholders} for the mount's device, address, clip and size.
 
-    encoded     elements up to pictures as the origin encodes them, for graphs that pass these on; empty: it cannot
+    encoded     by format, elements up to pictures as the origin encodes them, for graphs that pass these on
     settings    values for cameras that name none, from the file itself: clip, device, address, bag, topic
     capture     format requested from its cameras unless they state another, see `Capture`
     credentials file with user name and password, for cameras that name none
@@ -289,7 +289,7 @@ class Source:
     """
 
     elements: tuple[Element, ...]
-    encoded: tuple[Element, ...] = ()
+    encoded: Mapping[str, tuple[Element, ...]] = field(default_factory=dict)
     settings: Mapping[str, Value] = field(default_factory=dict)
     capture: Mapping[str, Any] = field(default_factory=dict)
     credentials: str | None = None
@@ -315,7 +315,8 @@ class Source:
     @property
     def placeholders(self) -> frozenset[str]:
         """Names of the placeholders in its elements."""
-        values = (value for element in (*self.elements, *self.encoded) for value in element.properties.values())
+        elements = (*self.elements, *chain.from_iterable(self.encoded.values()))
+        values = (value for element in elements for value in element.properties.values())
         return frozenset(name for value in values if isinstance(value, str) for name in PLACEHOLDER.findall(value))
 
 

@@ -134,7 +134,9 @@ class Receiver:
         received = None if uplinks is None else _received_uplinks(uplinks, has_keys=login is not None)
         self.rtp = RtpSession(plan.camera.graph.settings, lambda what: on_report(name, what), received)
         self._codec = video_codec(plan.camera.graph)
-        self._damage, self._damaged = Damage(self._codec), 0
+        # Of a camera that encodes by itself, others have long received what its pictures refer to.
+        self._joins = plan.camera.graph.passes is not None
+        self._damage, self._damaged = Damage(self._codec, is_damaged=self._joins), 0
         self._frames = self._bytes = 0
         launch = plan.receiver_into(PICTURES.format(name=self._sink_name)) if on_picture else plan.receiver
         self._is_dialled = not plan.serves
@@ -234,7 +236,7 @@ class Receiver:
     def _on_built(self, pipeline: Gst.Pipeline) -> Gst.Pad:
         self._before = self._count() if self._built else Reception()
         # A stream that others watch continues: what was missed meanwhile shows until a picture is healed.
-        self._damage = Damage(self._codec, is_damaged=self._built)
+        self._damage = Damage(self._codec, is_damaged=self._built or self._joins)
         self._built = True
         self._close_filter()
         self._progress = (self._frames, time.monotonic())

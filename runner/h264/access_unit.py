@@ -135,13 +135,18 @@ class RecentUnits:
     from a grey one. After a long pause the units before it are gone, so a decoder that starts now shows the last IDR
     where no wave has passed yet; one that has been running does not.
 
+    A camera that encodes by itself (`keyed`) sends a whole key picture now and then. Before the first one there is
+    nothing to begin with, unless it announces refresh waves; nor is there once the last one is too old to be kept.
+
     Some encoders state their parameter sets only once; then key units are completed by those last seen (H.265).
 
     refresh_s  length of a refresh wave or keyframe interval, s; None if the graph does not state it
     codec      h264 or h265; an H.265 stream that others already watch starts with its next IRAP picture
+    keyed      whether only a key picture, or an announced wave, makes a picture whole
     """
 
-    def __init__(self, refresh_s: float | None, codec: str = "h264") -> None:
+    def __init__(self, refresh_s: float | None, codec: str = "h264", *, keyed: bool = False) -> None:
+        self._keyed = keyed
         self._states_sets, self._sets = codec == "h265", b""
         self._grey = grey_idr if codec == "h264" else lambda _unit: None
         self._window = LONGEST_S if refresh_s is None else PERIODS * refresh_s
@@ -163,7 +168,8 @@ class RecentUnits:
             self._since.clear()
             self._resumed, self._is_cut, self._has_waves = -inf, False, False
             return unit
-        if self._key is None and (grey := self._grey(unit.data)):
+        begins = not self._keyed or unit.recovery is not None
+        if self._key is None and begins and (grey := self._grey(unit.data)):
             self._key = AccessUnit(grey, None, unit.arrived, key=True, exact=False)
             self._grey_since = unit.arrived
         if self._key is None:
@@ -171,6 +177,8 @@ class RecentUnits:
         self._has_waves |= unit.recovery is not None
         self._since.append(unit)
         self._forget(unit.arrived)
+        if not self._since:
+            return unit._replace(exact=False)
         if self._grey_since is not None and not self._is_refreshing(self._grey_since):
             self._grey_since = None
         if self._grey_since is not None:
@@ -214,6 +222,9 @@ class RecentUnits:
             self._since.popleft()
             self._is_cut = True
             spare -= 1
+        if self._keyed and self._is_cut and self._wave() is None:
+            self._key = None
+            self._since.clear()
 
     def burst(self) -> list[AccessUnit]:
         """Units to decode, in order, the newest last; empty until a decoder can start."""

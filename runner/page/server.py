@@ -337,7 +337,8 @@ def _stated(state: VehicleState | None, station: Station) -> dict[str, Any]:
 
 
 def _recent(camera: Camera) -> RecentUnits:
-    return RecentUnits(camera.graph.settings.key_interval_s, video_codec(camera.graph))
+    graph = camera.graph
+    return RecentUnits(graph.settings.key_interval_s, video_codec(graph), keyed=graph.passes is not None)
 
 
 async def _send(ws: web.WebSocketResponse, viewer: PageViewer, turn: asyncio.Lock | None) -> None:
@@ -384,6 +385,7 @@ def _introduction(setup: Setup, shown: Sequence[int]) -> dict[str, Any]:
             "width": camera.width,
             "height": camera.height,
             "fps": float(camera.fps),
+            "passed": camera.graph.passes is not None,
             "wave_s": camera.graph.settings.key_interval_s,
             "pose": camera.pose and asdict(camera.pose),
             "fov_deg": camera.fov_deg,

@@ -3,7 +3,7 @@
 import { Beginning } from "./beginning.js";
 import { now } from "./clock.js";
 import { DAMAGED } from "./decoding.js";
-import { alarmText, frozenAfter, INTERVALS, judge, MOVING, slowText } from "./status.js";
+import { INTERVALS, MOVING, alarmText, frozenAfter, judge, keyText, slowText } from "./status.js";
 
 const LATE_HOLD_MS = 500; // how long one late picture is indicated, at least until it counts as frozen
 const WAITING = ["synchronising", "frozen"];
@@ -34,7 +34,7 @@ export class Liveness {
   beginning = new Beginning();
   frozen_ms = 0; // limit in force
 
-  /** @param {{fps: number, wave_s: number|null}} camera  @param {any} station see `Stream` */
+  /** @param {{fps: number, wave_s: number|null, passed?: boolean}} camera  @param {any} station see `Stream` */
   constructor(camera, station) {
     this.camera = camera;
     this.station = station;
@@ -137,6 +137,7 @@ export class Liveness {
   alarmText(time) {
     const late = this.isLateToo(time) ? `, ${alarmText("late", 0, this.late_age)}` : "";
     const { stood_since, waits_since } = this;
+    if (this.status === "synchronising" && this.camera.passed) return keyText(time - (waits_since ?? time));
     // Units may still arrive.
     const stood = this.status === "frozen" ? (this.drawn ? this.decoded : (stood_since ?? waits_since)) : Infinity;
     const since = Math.min(this.arrived, stood, this.failed_at ?? Infinity);

@@ -63,6 +63,9 @@ export const frozenAfter = (limits, fps) => Math.max(limits.frozen_ms, (INTERVAL
 /** The text of a note: "12 of 40 Hz". @param {number} slow_fps  @param {number} fps */
 export const slowText = (slow_fps, fps) => `${slow_fps} of ${Math.round(100 * fps) / 100} Hz`;
 
+/** The text while a camera that encodes by itself has sent no picture to begin with. @param {number} since_ms */
+export const keyText = (since_ms) => `WAITING FOR KEY PICTURE ${Math.floor(since_ms / 1000)} s`;
+
 /**
  * The text of an alarm: "FROZEN 0.4 s", "LATE 310 ms", "LOST 3 s".
  * @param {string} status
