@@ -110,6 +110,12 @@ def ip_camera(clip: Clip) -> Iterator[list[str]]:
 
 
 @contextmanager
+def passed_on(clip: Clip) -> Iterator[list[str]]:
+    with ip_camera(clip) as words:
+        yield [*words, "graph=pass_through"]
+
+
+@contextmanager
 def raw_bag(clip: Clip) -> Iterator[list[str]]:
     yield _bag(clip, raw)
 
@@ -140,6 +146,7 @@ WAYS = {
     "test": ("`test`: GStreamer's test picture", "", test_picture),
     "file": ("`file`: a clip in H.264", "", clip_file),
     "rtsp": ("`rtsp`: an IP camera, H.264", "", ip_camera),
+    "passed": ("`rtsp` with `graph=pass_through`: the same, passed on", "", passed_on),
     "bag": ("`bag`: MCAP, bgr8", "", raw_bag),
     "bag_jpeg": ("`bag`: MCAP, JPEG", "", jpeg_bag),
     "ros2": ("`ros`: a topic of ROS 2, bgr8", MISSING[2], ros(2)),

@@ -333,7 +333,7 @@ def may_lack_parameter_sets(plan: Plan) -> bool:
     codec = video_codec(plan.camera.graph)
     payloader = next((element for element in plan.vehicle if element.factory == f"rtp{codec}pay"), None)
     # rtph265pay does so only for IDR pictures, and x265 sends CRA pictures.
-    places = ("rtph264pay", "h264parse")
+    places = ("rtph264pay", "h264parse", "h265parse")
     repeats = any(e.properties.get("config-interval") == -1 for e in plan.vehicle if e.factory in places)
     return payloader is not None and not repeats
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from fractions import Fraction
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -106,6 +107,12 @@ def test_a_source_of_raw_pictures_has_nothing_to_pass_on(tod: Command, graph: st
     result = tod("validate", f"graph={graph}", f"source={source}")
     assert result.status == 2
     assert f"graph/{graph}.yaml: passes: h264: needs a source with `encoded` pictures of this format" in result.err
+
+
+def test_its_pictures_cannot_be_recorded_raw(tod: Command, tmp_path: Path) -> None:
+    result = tod("record", "vehicle=delivery_robot", *REAR, f"output={tmp_path}")
+    assert result.status == 2
+    assert "graph: rear: these cameras are passed on as they encode; record their raw pictures" in result.err
 
 
 # --- measured ---------------------------------------------------------------------------------------------------------

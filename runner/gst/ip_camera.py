@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable, Sequence
 
@@ -19,7 +20,8 @@ MARGIN_S = 5.0  # by which the client may notice late that no answer came
 def follow_cameras(pipeline: Gst.Bin, plan: Plan, on_stream: Callable[[], None] = lambda: None) -> list[CameraClient]:
     """Follow the RTSP clients of a newly built source; `on_stream` is called when one has streamed."""
     elements = (pipeline.get_by_name(element.name) for element in plan.source)
-    return [CameraClient(each, plan.camera.source, on_stream) for each in elements if each and is_rtsp_client(each)]
+    source, passes = plan.camera.source, plan.camera.graph.passes
+    return [CameraClient(each, source, on_stream, passes) for each in elements if each and is_rtsp_client(each)]
 
 
 class CameraClient:
@@ -28,13 +30,17 @@ class CameraClient:
     Only one video medium is set up. Until its first packet, each answer may take `first_reply_s`: cameras that are
     started on demand need 5 to 30 s. Then the limit of the source's file is in force.
 
+    passes      the format that the video must have, which is passed on; None: any
+
     has_failed  whether it has given up
 
     The client keeps this alive, not the other way round: its handlers would otherwise keep both for ever.
     """
 
-    def __init__(self, client: Gst.Element, source: Source, on_stream: Callable[[], None]) -> None:
-        self._on_first, self._medium = on_stream, source.medium
+    def __init__(
+        self, client: Gst.Element, source: Source, on_stream: Callable[[], None], passes: str | None = None
+    ) -> None:
+        self._on_first, self._medium, self._passes = on_stream, source.medium, passes
         self._usual_us = int(client.get_property("tcp-timeout"))
         self._reply_s = max(source.first_reply_s, self._usual_us / 1e6)
         self._chosen: int | None = None  # index in the description
@@ -84,8 +90,14 @@ class CameraClient:
         video = [number for number, kind in enumerate(kinds) if kind == "video"]
         self._chosen = video[self._medium] if self._medium < len(video) else None
         if self._chosen is None:
-            why = _why_none(kinds, len(video), self._medium)
-            client.post_message(Gst.Message.new_error(client, GLib.Error(why), ""))
+            self._fail(client, _why_none(kinds, len(video), self._medium))
+        elif self._passes and (other := _other_format(sdp.get_media(self._chosen), self._passes)):
+            self._chosen = None
+            self._fail(client, other)
+
+    @staticmethod
+    def _fail(client: Gst.Element, why: str) -> None:
+        client.post_message(Gst.Message.new_error(client, GLib.Error(why), ""))
 
     def _on_select(self, _client: Gst.Element, number: int, _caps: Gst.Caps) -> bool:
         return number == self._chosen
@@ -106,6 +118,17 @@ class CameraClient:
             client.set_property("tcp-timeout", round(self._reply_s * 1e6))  # not before: connecting has the usual limit
             self._asked = (name, self._heard)
         return True
+
+
+def _other_format(medium: GstSdp.SDPMedia, wanted: str) -> str | None:
+    """What a medium is, if it has another format than the one that is passed on; None if it has that."""
+    offered = re.search(
+        r"encoding-name=\(string\)\"?([\w-]+)", str(medium.get_caps_from_media(int(medium.get_format(0))))
+    )
+    found = offered[1] if offered else "an unnamed format"
+    if found.lower() == wanted:
+        return None
+    return f"the camera sends {found}, and the graph passes on {wanted.upper()}: set the camera to that, or decode it"
 
 
 def _why_none(kinds: Sequence[str], video: int, medium: int) -> str:

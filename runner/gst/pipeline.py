@@ -15,6 +15,7 @@ from runner.gst.arriving import CAPTURE_ID
 from runner.gst.held_up import HeldUp
 from runner.gst.knobs import KnobPanel
 from runner.gst.lost import LostCameras
+from runner.gst.passed import PassedStream
 from runner.gst.picture_rate import PictureRate
 from runner.gst.probes import BufferProbe, PassingBuffer, TypeProbe
 from runner.gst.rate_limit import RateLimits
@@ -104,6 +105,8 @@ class CameraPipeline:
         self._sent = pipeline.get_by_name("sent")  # None: nothing is counted
         self._rate, self._on_report = PictureRate(float(plan.camera.fps)), on_report
         self._restarts_after_gaps = is_restarted_after_gaps(plan.camera.graph)
+        passes = plan.camera.graph.passes and self._sent
+        self._passed = PassedStream(self._sent.get_static_pad("sink"), plan.camera, on_report) if passes else None
         self._is_gap = False
         self._pushed: PushedPictures | None = None  # those of a Python program
         self._elements = [pipeline.get_by_name(element.name) for element in plan.vehicle]
@@ -207,6 +210,8 @@ class CameraPipeline:
             self._look_at_rate(now, passed_counts(self._entered)[0])
         if self.sent_frames:
             self.sent_frames.look()
+        if self._passed:
+            self._passed.look()
 
     def _look_at_rate(self, now: float, entered: int) -> None:
         """entered: pictures before the encoder. Behind it, those that it leaves out would count as the camera's."""

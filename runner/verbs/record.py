@@ -229,6 +229,9 @@ def _check_sources(vehicle: Vehicle) -> None:
     if pushed:
         rule = "its frames must be pushed by a Python program; choose another source"
         raise ArgumentError("source", ", ".join(pushed), rule)
+    if vehicle.fixed:
+        rule = "these cameras are passed on as they encode; record their raw pictures with another graph"
+        raise ArgumentError("graph", ", ".join(sorted(vehicle.fixed)), rule)
 
 
 @contextmanager
