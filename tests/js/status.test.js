@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-import { alarmText, judge, slowText } from "../../runner/page/static/status.js";
+import { alarmText, judge, keyText, slowText } from "../../runner/page/static/status.js";
 
 const NOW = 100_000;
 const LIMITS = { frozen_ms: 120 };
@@ -81,4 +81,9 @@ test("a camera of a low rate is live between its pictures, and says its rate", (
   assert.equal(judged({ ...between, fps: 4 }), "live");
   assert.equal(slowText(12, 40), "12 of 40 Hz");
   assert.equal(slowText(12, 30000 / 1001), "12 of 29.97 Hz");
+});
+
+test("a wait for a key picture is counted in whole seconds", () => {
+  assert.equal(keyText(900), "WAITING FOR KEY PICTURE 0 s");
+  assert.equal(keyText(3100), "WAITING FOR KEY PICTURE 3 s");
 });

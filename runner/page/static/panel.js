@@ -2,7 +2,7 @@
 
 import { camera, decisionOf, inControl, listen, mode, store, whyUndecided } from "./store.js";
 import { pending, request, showProblem, whyNoControl } from "./requests.js";
-import { fullRegion, isLocked, isPart, sendRegion, toggleLocked } from "./roi.js";
+import { AS_ENCODED, fullRegion, isLocked, isPart, sendRegion, toggleLocked } from "./roi.js";
 import { RegionFrame } from "./region_frame.js";
 import { SMALLEST } from "./region.js";
 import { makeSlider } from "./slider.js";
@@ -24,8 +24,9 @@ const whyNot = () => (!decisionOf(name()) ? whyUndecided(name()) : inControl() ?
 const isPredicted = () => Number.isFinite(store.sample?.predicted_kbps);
 const whyNotByHand = () => whyNot() ?? setBy();
 
-/** What sets the bitrate in the mode in force; null: the operator does. */
+/** What sets the bitrate; null: the operator does. */
 function setBy() {
+  if (camera(name())?.passed) return `${capital(AS_ENCODED)}.`;
   if (mode() === "automatic") return `${setterWords(store.state, isPredicted())}${BY_HAND}`;
   return mode() === "collective" ? `Shared from the total${BY_HAND}` : null;
 }

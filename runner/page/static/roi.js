@@ -68,9 +68,12 @@ export function isPart(name) {
   return [decided, pendingRegion(name)].some((region) => region && !sameRegion(region, full));
 }
 
+export const AS_ENCODED = "it is sent as the camera encodes it; set region, size and bitrate in the camera";
+
 /** Why a region cannot be chosen on a camera's picture; null: it can. */
 export function whyNoRegion(name) {
   if (!inControl()) return whyNoControl();
+  if (camera(name)?.passed) return AS_ENCODED;
   const how = `${withKey("turn straightening off", "straighten")}, or type the numbers`;
   if (isStraight(name)) return `no ROI can be chosen on a straightened picture; ${how}`;
   return mode() === "single" ? null : "the ROI is set in mode S; choose S to set it by hand";
