@@ -55,7 +55,7 @@ def drive(address: str, word: str, options: argparse.Namespace, out: Path) -> tu
     words = [f"camera={address}", word, f"fps_max={options.fps}", "page.serve=false", f"log={out}"]
     words += [f"duration_s={options.seconds + SETTLE_S}", "pqos=constant", "pqos.kbps=20000"]
     with subprocess.Popen([sys.executable, "-m", "runner", "demo", *words], stdout=subprocess.DEVNULL) as demo:
-        (vehicle,) = until(lambda: children_named(demo.pid, "vehicle"))
+        (vehicle,) = until(lambda: children_named(demo.pid, "runner\0vehicle\0"))
         time.sleep(SETTLE_S)
         used_s, began = processor_s(vehicle), time.monotonic()
         time.sleep(options.seconds - 2)

@@ -42,6 +42,10 @@ const TABLE = [
   [{}, { mode: "collective", asked_kbps: 9000 }, `${SHARE} the link carries.`],
   [{}, { mode: "single" }, "Half size: 1181 of 6000 kbit/s."],
   [{}, { mode: "single", asked_kbps: 9000 }, "Half size: 1181 of 6000 kbit/s, less than was set: the link carries no more."],
+  [
+    { kbps: 900, demand_kbps: 900, scaling: 1, reason: "900 of 900 kbit/s, as the camera encodes it" }, {},
+    "Full size: 900 of 900 kbit/s, as the camera encodes it.",
+  ],
   [{ kbps: 6000, scaling: 1 }, {}, "Full size: 6000 of 6000 kbit/s, all that it can use."],
   [{ kbps: 7000 }, { mode: "single" }, "Half size: 7000 of 7000 kbit/s."],
   [{ roi: { x: 0, y: 0, width: 960, height: 520 }, demand_kbps: 1500, kbps: 300, scaling: 0.25 }, {}, "Quarter size of 25 % of the image: 300 of 1500 kbit/s, its share of the 6500 predicted."],

@@ -4,6 +4,7 @@ import { capital, KBPS, rate, sameRegion, whole } from "./format.js";
 
 const NAMED = { 1: "full size", 0.5: "half size", 0.25: "quarter size" };
 const PARTS = [2, 4, 8, 16]; // of a size that has a name: 3/8
+const AS_ENCODED = "as the camera encodes it";
 const PAUSED = "not sending: ";
 const TOTAL = "total ";
 
@@ -85,6 +86,7 @@ function pauseWords({ weight }, { mode }, common) {
 
 /** What limits its bitrate. */
 function causeWords({ kbps, demand_kbps, reason }, state, predicted) {
+  if (reason.includes(AS_ENCODED)) return `, ${AS_ENCODED}`;
   const { mode, total_kbps, asked_kbps } = state;
   const limit = mode !== "automatic" && total_kbps >= asked_kbps ? null : limitOf(reason.split("; "), state);
   if (mode === "single") return !limit ? "" : `, less than was set: ${limit === "link" ? "the link carries no more" : limit}`;
