@@ -15,7 +15,6 @@ from runner.gst.arriving import CAPTURE_ID
 from runner.gst.held_up import HeldUp
 from runner.gst.knobs import KnobPanel
 from runner.gst.lost import LostCameras
-from runner.gst.passed import PassedStream
 from runner.gst.picture_rate import PictureRate
 from runner.gst.probes import BufferProbe, PassingBuffer, TypeProbe
 from runner.gst.rate_limit import RateLimits
@@ -28,6 +27,7 @@ from runner.gst.watched import WatchedSource
 from runner.records.vehicle import NOTHING_ENCODED, EncoderCounts, SenderStages
 
 if TYPE_CHECKING:
+    from runner.gst.passed import PassedStream
     from runner.gst.pushed import PushedPictures
     from runner.gst.uplinks import CameraUplinks, VehicleUplinks
     from runner.ros.cameras import SharedPicture
@@ -105,8 +105,7 @@ class CameraPipeline:
         self._sent = pipeline.get_by_name("sent")  # None: nothing is counted
         self._rate, self._on_report = PictureRate(float(plan.camera.fps)), on_report
         self._restarts_after_gaps = is_restarted_after_gaps(plan.camera.graph)
-        passes = plan.camera.graph.passes and self._sent
-        self._passed = PassedStream(self._sent.get_static_pad("sink"), plan.camera, on_report) if passes else None
+        self._passed = self._passed_stream()
         self._is_gap = False
         self._pushed: PushedPictures | None = None  # those of a Python program
         self._elements = [pipeline.get_by_name(element.name) for element in plan.vehicle]
@@ -126,6 +125,14 @@ class CameraPipeline:
         self._first_packet.arm()
         for each in (_NOT_SEEKABLE, _NOT_RECONFIGURED):
             each.add_to(last)
+
+    def _passed_stream(self) -> PassedStream | None:
+        """What a camera that encodes by itself delivers; None if it does not."""
+        if self._sent is None or self._plan.camera.graph.passes is None:
+            return None
+        from runner.gst.passed import PassedStream
+
+        return PassedStream(self._sent.get_static_pad("sink"), self._plan.camera, self._on_report)
 
     @property
     def is_opening(self) -> bool:
