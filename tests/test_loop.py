@@ -246,6 +246,7 @@ EXAMPLES: tuple[dict[str, Any], ...] = (
     {"event": "moment_marked", "back_s": 10},
     {"event": "link_measured", "kbps": 780},
     {"event": "copies_counted", "copies": {"front": 2}},
+    {"event": "stream_measured", "camera": "front", "kbps": 900},
     {"event": "source_reported", "camera": "front", "works": False, "reason": "no such device"},
     {"event": "control_passed", "operator": "a-watcher"},
     {"event": "control_requested"},

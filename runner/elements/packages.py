@@ -11,12 +11,12 @@ from runner.graph import Plan
 PACKAGES = {  # elements by Debian package; `doctor` and messages on missing plugins name the package
     "gstreamer1.0-plugins-base": "videoconvert videoscale videorate videotestsrc decodebin appsrc appsink",
     "gstreamer1.0-plugins-good": "videocrop aspectratiocrop rtph264pay rtph264depay rtpjitterbuffer rtspsrc udpsrc"
-    " udpsink v4l2src rtpbin rtpsession jpegdec capssetter qtdemux matroskademux matroskamux vp8enc vp8dec rtpvp8pay"
-    " rtpvp8depay v4l2h264enc",
+    " rtph265pay rtph265depay udpsink v4l2src rtpbin rtpsession jpegdec capssetter qtdemux matroskademux matroskamux"
+    " vp8enc vp8dec rtpvp8pay rtpvp8depay v4l2h264enc",
     "gstreamer1.0-plugins-bad": "h264parse h265parse mpegtsmux tsdemux openh264enc x265enc srtsrc srtsink bayer2rgb"
     " vah264enc nvh264enc",
     "gstreamer1.0-plugins-ugly": "x264enc",
-    "gstreamer1.0-libav": "avdec_h264 avdec_ffv1 avenc_ffv1",
+    "gstreamer1.0-libav": "avdec_h264 avdec_h265 avdec_ffv1 avenc_ffv1",
     "gstreamer1.0-rtsp": "rtspclientsink",
     "gstreamer1.0-x": "textoverlay",
 }

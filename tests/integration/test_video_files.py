@@ -231,7 +231,7 @@ def stream_continues(sides, camera="front"):
         before = operator.sample({})[camera].frames
         until(lambda: operator.sample({})[camera].frames > before + 40)
         received = operator.sample({})
-        assert {c.rebuilt for c in received.values()} == {0}
+        assert {c.rebuilt for c in received.values()} == {0}, sides.reported
         sides.resize(160, 90)
         until(lambda: operator.sample({})[camera].width == 160)
     others = [line for line in sides.reported if "video is not recorded" not in line and "pipeline stopped" not in line]
