@@ -22,6 +22,7 @@ UNTIMED = ("test_keyframe", "test_model", "test_report_page")
 # Started first, in this order, so that no worker is left with a long file at the end: those of more than 20 s.
 LONGEST = (
     "test_feedback",
+    "test_who_drives",
     "test_page_layouts",
     "test_server",
     "test_two_uplinks",
