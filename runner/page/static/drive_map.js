@@ -8,12 +8,15 @@ const ACROSS_M = 250; // of the shorter side
 const BAR_M = 50; // the length that the scale bar shows
 const LINE_PX = 5;
 const ARROW_PX = 11;
-const NORTH_PX = 48; // of the word in the corner, and margins
+const NORTH = 4; // of the word in the corner, and margins, of the size of text
 const [TEXT, MUTED, UNKNOWN] = ["#e8edf2", "#a5b3c1", "#76879a"];
 
 const canvas = /** @type {HTMLCanvasElement} */ (byId("drive-map").firstElementChild);
 let size = { width: 0, height: 0 }; // CSS px; 0: it is not shown
 let drawn = 0; // time of the newest position drawn
+
+/** Size of text, px: it grows with the map. */
+const em = () => Math.max(12, Math.round(0.035 * size.width));
 
 function draw() {
   const context = canvas.getContext("2d");
@@ -23,7 +26,7 @@ function draw() {
   if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
   context.setTransform(ratio, 0, 0, ratio, 0, 0);
   context.clearRect(0, 0, size.width, size.height);
-  context.font = '12px system-ui, "DejaVu Sans", sans-serif';
+  context.font = `${em()}px system-ui, "DejaVu Sans", sans-serif`;
   const track = metres(store.series);
   if (!track) return write(context, "no position yet", size.width / 2, size.height / 2, "center");
   const px_per_m = Math.min(size.width, size.height) / ACROSS_M;
@@ -71,7 +74,7 @@ function drawScale(context, px_per_m) {
   context.fillStyle = MUTED;
   context.fillRect(x, y, BAR_M * px_per_m, 2);
   write(context, `${BAR_M} m`, x, y - 5, "start");
-  write(context, "N ↑", size.width - 8, 16, "end");
+  write(context, "N ↑", size.width - 8, 1.3 * em(), "end");
 }
 
 /** What the colours mean, beside or below the north. @param {[number, number]|null} range */
@@ -79,11 +82,11 @@ function drawLegend(context, range) {
   if (!range) return;
   const text = `received ${whole(range[0])} to ${rate(range[1])}`;
   const wide = context.measureText(text).width;
-  const y = wide + NORTH_PX > size.width ? 36 : 16;
+  const y = (wide + NORTH * em() > size.width ? 3 : 1.3) * em();
   write(context, text, 8, y, "start");
   for (let at = 0; at < wide; at++) {
     context.fillStyle = colourOfRate(at, [0, wide]);
-    context.fillRect(8 + at, y + 5, 1.5, 4);
+    context.fillRect(8 + at, y + 0.4 * em(), 1.5, 0.3 * em());
   }
 }
 

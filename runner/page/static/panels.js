@@ -4,6 +4,7 @@ import { byId, setBox } from "./format.js";
 
 const IDS = { figures: "drive-figures", messages: "messages", words: "drive-words", map: "drive-map", buttons: "drive-buttons" };
 const FITS = [1, 0.9, 0.8, 0.7, 0.6, 0.5]; // of the usual size of text
+const [FIGURES, WORDS] = [0.05, 0.037]; // size of text, of the width of its box
 const LEAST_PX = 11; // of text at its usual size
 
 /** Panels with text, each with what it showed when the size of its text was chosen. @type {Map<HTMLElement, string>} */
@@ -21,7 +22,8 @@ export function placePanels(panels) {
     }
     const isOnPage = name === "messages"; // other views show messages elsewhere
     setBox(element, isOnPage ? { ...box, x: area.x + scrollX + box.x, y: area.y + scrollY + box.y } : box);
-    element.style.setProperty("--unit", `${Math.max(LEAST_PX, Math.min(0.037 * box.width, 0.14 * box.height))}px`);
+    const share = name === "figures" ? FIGURES : WORDS;
+    element.style.setProperty("--unit", `${Math.max(LEAST_PX, Math.min(share * box.width, 0.14 * box.height))}px`);
   }
   if (panels) for (const panel of shown.keys()) fit(panel);
 }
