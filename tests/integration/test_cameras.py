@@ -123,7 +123,7 @@ def test_a_v4l2_device_is_streamed_with_the_times_of_its_driver():
         ):
             assert check_machine([plan]) == {}
             turn(side, sending=True, size=(480, 260), bitrate=500)
-            until(lambda: len(client.sizes) > 10)
+            until(lambda: client.frames_with_retry() > 10)
             pad = inside.sender(side, CAMERA).get_by_name("raw").get_static_pad("src")
             pad.add_probe(Gst.PadProbeType.BUFFER, lambda _, info: noted(captured, info.get_buffer().pts))
             until(lambda: len(captured) > 15)
@@ -148,7 +148,7 @@ def test_a_camera_that_is_unplugged_comes_back_when_it_is_plugged_in_again(tmp_p
         until_unplugged.enter_context(plugged_in(socket))
         with streaming(*words) as (side, _, (plan,), reported), watching(plan) as client:
             turn(side, sending=True, size=(480, 260), bitrate=500)
-            until(lambda: len(client.sizes) > 10)
+            until(lambda: client.frames_with_retry() > 10)
             until_unplugged.close()
             until(lambda: side.read()[CAMERA].fault)
             with plugged_in(socket):
@@ -204,7 +204,7 @@ def test_a_camera_that_asks_for_a_password_gets_it_from_a_file(credentials):
         with streaming(*words, cameras=("rear",)) as (side, _, (plan,), reported), watching(plan) as client:
             knobs = {"sending": True, "size": (424, 240), "bitrate": 500}
             side.turn([Command("rear", knob, value) for knob, value in knobs.items()])
-            until(lambda: len(client.sizes) > 10)
+            until(lambda: client.frames_with_retry() > 10)
             assert "same7" not in plan.pipeline
             assert faults(reported) == ["rear: pipeline built"]
 
