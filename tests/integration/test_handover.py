@@ -141,6 +141,7 @@ def two_operators(site: Site) -> Iterator[tuple[Driver, Driver]]:
         bob.kill()
 
 
+@pytest.mark.alone
 def test_control_is_handed_over_with_pictures(site: Site) -> None:
     with two_operators(site) as (alice, bob):
         assert bob.ask("mode_selected", mode="single") == ("refused", f"{alice.name} is in control")
