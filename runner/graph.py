@@ -31,12 +31,6 @@ _PLAIN_VALUE = re.compile(r"[\w./:,+=@%-]+")
 # Without colorimetry, decoders derive it from the picture size: colours would change when a picture is scaled.
 COLORIMETRY = "colorimetry=bt709"
 _PICTURE = f"pixel-aspect-ratio=1/1,{COLORIMETRY}"
-# From luma 0..255 to 16..235, chroma accordingly; videobalance computes 16 + (y - 16) * contrast + 255 * brightness.
-_TO_LIMITED: dict[str, Value] = {
-    "contrast": 219 / 255,
-    "brightness": 16 * 219 / 255**2,
-    "saturation": 224 / 255,
-}
 # Caps of encoded formats that a camera delivers; raw formats are named directly.
 _ENCODED = {"mjpeg": "image/jpeg", "h264": "video/x-h264", "h265": "video/x-h265"}
 SRT_MOST_BYTES = 1316  # of a packet; srtsink cuts longer ones unless its URI states a `payloadsize`
@@ -111,6 +105,14 @@ class Plan:
     bag: BagTopic | None = None
     needs: Mapping[str, str] = field(default_factory=dict)
     video: bool = False
+
+    @property
+    def name(self) -> str:
+        return self.camera.name
+
+    @property
+    def settings(self) -> GraphSettings:
+        return self.camera.graph.settings
 
     @property
     def serves(self) -> bool:
@@ -204,7 +206,7 @@ def compile_graph(
     values = _values(camera, media, index, clip)
 
     def fill(elements: Iterable[Element], where: str) -> tuple[Element, ...]:
-        return tuple(_filled(element, values, f"{where}[{i}]") for i, element in enumerate(elements))
+        return tuple(filled(element, values, f"{where}[{i}]") for i, element in enumerate(elements))
 
     stand_in = fill(source.stand_in, "source.stand_in")
     unrendered = bool(source.render) and clip is None
@@ -290,20 +292,6 @@ def turn_elements(camera: Camera, elements: Iterable[Element], knobs: Mapping[st
         for name, key, filled in assignments(camera, knob, value):
             by_element.setdefault(name, {})[key] = filled
     return tuple(replace(e, properties={**e.properties, **by_element.get(e.name, {})}) for e in elements)
-
-
-def to_limited_range(colorimetry: str) -> tuple[Element, ...]:
-    """Elements behind the decoder of a full-range clip, whose names cannot be those of a graph.
-
-    colorimetry  in limited range: videoconvert, which mistakes the range, only sees the result; "": none are needed
-    """
-    if not colorimetry:
-        return ()
-    return (
-        Element("range-stated", "capssetter", {"caps": f"video/x-raw,colorimetry=(string){colorimetry}"}),
-        Element("range-format", "videoconvert", {}),  # videobalance has 8 bits
-        Element("range-limited", "videobalance", _TO_LIMITED),
-    )
 
 
 def launch(elements: Iterable[Element]) -> str:
@@ -453,9 +441,11 @@ def _controls(capture: Capture) -> str | None:
     return ",".join(["controls", *given]) if given else None
 
 
-def _filled(element: Element, values: Mapping[str, Value | None], where: str) -> Element:
-    filled = {key: _fill_value(value, values, f"{where}.properties.{key}") for key, value in element.properties.items()}
-    return replace(element, properties={key: value for key, value in filled.items() if value is not None})
+def filled(element: Element, values: Mapping[str, Value | None], where: str) -> Element:
+    """An element with the placeholders of its properties resolved; where: its key."""
+    given = element.properties.items()
+    known = {key: _fill_value(value, values, f"{where}.properties.{key}") for key, value in given}
+    return replace(element, properties={key: value for key, value in known.items() if value is not None})
 
 
 def _fill_value(value: Value, values: Mapping[str, Value | None], where: str) -> Value | None:

@@ -7,12 +7,16 @@ from contextlib import closing
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from runner.clips import View, cache_directory, rendered, view
 from runner.core.model import Camera, Progress, Vehicle
 from runner.errors import RunError
 from runner.graph import Plan, compile_graph
 from runner.settings import Setup
+
+if TYPE_CHECKING:
+    from runner.sound import SoundPlan
 
 
 def compile_plans(setup: Setup) -> list[Plan]:
@@ -21,6 +25,15 @@ def compile_plans(setup: Setup) -> list[Plan]:
         compile_graph(camera, setup.media, index, clip=rendered(camera), recording=setup.recording)
         for index, camera in enumerate(setup.vehicle.cameras.values())
     ]
+
+
+def sound_plan(setup: Setup) -> SoundPlan | None:
+    """That of the vehicle's sound; None: it sends none."""
+    if setup.sound is None:
+        return None
+    from runner.sound import compile_sound
+
+    return compile_sound(setup.sound, setup.media)
 
 
 def as_offered(setup: Setup, report: Callable[[str], None]) -> Setup:

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from runner.core.model import Camera, Element, ModelError, Vehicle, check_unique
+from runner.core.budget import sound_kbps
+from runner.core.model import Camera, Element, Kbps, ModelError, Vehicle, check_unique
 from runner.redact import has_password
 
 if TYPE_CHECKING:
@@ -287,6 +288,46 @@ class Recording:
 
 
 @dataclass(frozen=True, slots=True)
+class Sound:
+    """The vehicle's sound, as defined in YAML: elements may hold {placeholders}.
+
+    kbps              of the Opus stream, without headers
+    packet_ms         of sound in a packet
+    header_bytes      of a packet on the wire
+    jitter_buffer_ms  how long the operator waits for a missing packet
+    dscp              DiffServ code point of the packets; -1 leaves it to the system
+    port              UDP port in the lines that `print` shows
+    source            elements that produce raw sound; `vehicle` and `operator` follow as in a camera's graph
+    device, clip      microphone and file, for the source; None: none is named
+    needs             by element that only the vehicle may have, the Debian package that provides it
+    """
+
+    kbps: int
+    packet_ms: int
+    header_bytes: int
+    jitter_buffer_ms: int
+    dscp: int
+    port: int
+    source: tuple[Element, ...]
+    vehicle: tuple[Element, ...]
+    operator: tuple[Element, ...]
+    wire_vehicle: tuple[Element, ...]
+    wire_operator: tuple[Element, ...]
+    device: str | None = None
+    clip: str | None = None
+    needs: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def wire_kbps(self) -> Kbps:
+        """Of one copy, with headers."""
+        return sound_kbps(self.kbps, self.packet_ms, self.header_bytes)
+
+    @property
+    def needs_clip(self) -> bool:
+        return any(value == "{clip}" for element in self.source for value in element.properties.values())
+
+
+@dataclass(frozen=True, slots=True)
 class Dimensions:
     """The vehicle seen from above, m: what the page draws on the ground.
 
@@ -342,6 +383,7 @@ class Setup:
     dimensions  None: unknown
     inputs      keys and buttons of the operator's page
     uplinks     by name, in order; none: the system's routes decide by which way the vehicle sends
+    sound       of the vehicle; None: none is sent
     """
 
     vehicle: Vehicle
@@ -361,6 +403,7 @@ class Setup:
     dimensions: Dimensions | None = None
     inputs: Inputs = Inputs()
     uplinks: Mapping[str, Uplink] = field(default_factory=dict)
+    sound: Sound | None = None
 
     def with_cameras(self, cameras: Mapping[str, Camera]) -> Setup:
         """The same, of a vehicle with these cameras."""

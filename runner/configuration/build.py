@@ -5,24 +5,24 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from ipaddress import IPv4Network, IPv6Network, ip_network
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from runner import schema
 from runner.clips import view
-from runner.configuration.origin import GRAPH_PARTS, Composed
+from runner.configuration.graphs import MOUNT_KEYS, given, read_graph, read_recording, read_source
+from runner.configuration.origin import Composed
 from runner.configuration.rule_lists import call_entry, check_order
 from runner.configuration.uplinks import Ways, built_uplinks, reserves_kbps, uplink_problems
+from runner.core.budget import SOUND
 from runner.core.commands import KnobValue
 from runner.core.model import (
     Camera,
     Capture,
-    Element,
     Graph,
-    GraphSettings,
-    KnobTarget,
+    Kbps,
     Mode,
     ModelError,
     Place,
@@ -52,28 +52,26 @@ from runner.settings import (
     RosQos,
     RosSettings,
     Setup,
+    Sound,
     address_rule,
 )
 
 if TYPE_CHECKING:
     from runner.configuration.experiment import LinkSettings, TimedRequest
+    from runner.sound import SoundPlan
 
 SAMPLE_KNOBS: Mapping[str, KnobValue] = {"sending": True, "roi": Roi(0, 0, 16, 16), "size": (16, 16), "bitrate": 1}
-MOUNT_KEYS = ("device", "address", "clip", "bag", "topic")
 TOPIC = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")  # design.ros2.org, topic and service names
 TOPIC_RULE = "must be the name of a topic: letters, digits and _ between slashes, no part beginning with a digit"
 CAMERA_NEEDS = ("width_px", "height_px", "fps", "rate_quality")  # keys that the schema requires, set by the kind
-GRAPH_STRUCTURE = (
-    *("defaults", "transport", "verified", "passes", "key_frame", "vehicle", "operator", "wire", "knobs", "mutable"),
-    *("effort", "efforts", "needs"),
+SECTIONS = (
+    *("media", "control", "page", "log", "latency", "keys", "insecure", "metrics", "ros", "strict", "uplinks"),
+    "sound",
 )
-GRAPH_SETTINGS = [part.name for part in fields(GraphSettings)]
-SECTIONS = ("media", "control", "page", "log", "latency", "keys", "insecure", "metrics", "ros", "strict", "uplinks")
-ONLY_EFFORT = "medium"  # of graphs without `efforts`
 
 T = TypeVar("T")
 
-PlanCheck = Callable[[Plan], Iterable[ModelError]]
+PlanCheck = Callable[["Plan | SoundPlan"], Iterable[ModelError]]
 
 
 @dataclass
@@ -112,7 +110,7 @@ class Builder:
         private = None if isinstance(insecure, bool) else self.part(("insecure",), _network)
         media = replace(media, secure=keys is not None)
         built = {name: camera for name, camera in cameras.items() if camera}
-        recording = self.part(("recording",), _recording)
+        recording = self.part(("recording",), read_recording)
         page = PageSettings(**document["page"])
         inputs = self.part(("inputs",), lambda data: Inputs(**data)) if "inputs" in document else None
         ways = document.get("uplinks") or {}  # older drives have none
@@ -123,9 +121,10 @@ class Builder:
         for error in ros.misplaced():
             self._report(("ros",), error)
         listening = {"page.port": page.port} if page.serve else {}
+        sound = self._sound(media, built) if "sound" in document else None
         self._check_places(built)
         self._check_ports(built, {"media.port": media.port, "control.port": control.port, **listening})
-        self._check_rtp_ports(built, media)
+        self._check_rtp_ports(built, media, sound)
         for index, camera in enumerate(built.values()):
             self._check_compiles(camera, media, index, recording)
             if camera.source.render:
@@ -136,8 +135,9 @@ class Builder:
                 self._check_files(camera)
         if self.problems or recording is None:
             return None
+        taken = sound.wire_kbps if sound else Kbps(0)
         return Setup(
-            Vehicle(document["name"], built, Mode(document["mode"]), modes, reserves_kbps(ways)),
+            Vehicle(document["name"], built, Mode(document["mode"]), modes, reserves_kbps(ways), taken),
             media=media,
             control=control,
             page=page,
@@ -154,6 +154,7 @@ class Builder:
             dimensions=dimensions,
             inputs=inputs or Inputs(),
             uplinks=built_uplinks(ways),
+            sound=sound,
         )
 
     def checked(self, built: T | None) -> T:
@@ -218,16 +219,16 @@ class Builder:
         document = self.composed.document
         data, path = document["cameras"][name], ("cameras", name)
         # Parts that the schema accepts are checked further, whatever the problems elsewhere.
-        graph = self.part(self._place(path, "graph"), _graph)
-        source = self.part(self._place(path, "source"), _source)
+        graph = self.part(self._place(path, "graph"), read_graph)
+        source = self.part(self._place(path, "source"), read_source)
         model = self.part((*path, "rate_quality"), lambda data: _rate_quality(data, graph))
         if graph is None or source is None or model is None or not (self.is_valid(*path) and self.is_valid("fps_max")):
             return None
         fps, limit = _rate(data["fps"]), document.get("fps_max")
         native = data.get("native")
         pose, place = data.get("pose"), data.get("place")
-        options = _given(data, ("fov_deg", "lens", "shed", "framing", "calibrated", "redundant"))
-        options |= {key: exact(value) for key, value in _given(data, ("weight", "floor_kbps")).items()}
+        options = given(data, ("fov_deg", "lens", "shed", "framing", "calibrated", "redundant"))
+        options |= {key: exact(value) for key, value in given(data, ("weight", "floor_kbps")).items()}
         return self.attempt(
             path,
             lambda: Camera(
@@ -240,7 +241,7 @@ class Builder:
                 source=source,
                 native=(native["width_px"], native["height_px"]) if native else None,
                 crop=_crop(native, data["width_px"], data["height_px"]) if native else None,
-                mount=_given(data, MOUNT_KEYS),
+                mount=given(data, MOUNT_KEYS),
                 capture=_capture(source, data),
                 credentials=data.get("credentials", source.credentials),
                 place=Place(**place) if place else None,
@@ -370,19 +371,29 @@ class Builder:
                 self._report((), ModelError(key, str(port - index), rule, other))
             taken[port] = f"camera {name}", key
 
-    def _check_rtp_ports(self, cameras: Mapping[str, Camera], media: Media) -> None:
+    def _sound(self, media: Media, cameras: Mapping[str, Camera]) -> Sound | None:
+        """The sound, checked: it compiles, and no camera has its name."""
+        from runner.configuration.sound import read_sound, sound_problems
+
+        sound = self.part(("sound",), read_sound)
+        if sound is None:
+            return None
+        if SOUND in cameras:
+            rule = "is the name of the vehicle's sound; give this camera another one, or choose no sound"
+            self.problems.append(self.composed.problem(("cameras", SOUND), None, rule))
+        for error in sound_problems(sound, media, self.check, runnable=self.runnable, files=self.files):
+            self._report(("sound",), error)
+        return sound
+
+    def _check_rtp_ports(self, cameras: Mapping[str, Camera], media: Media, sound: Sound | None) -> None:
         """Check that each camera behind the RTSP server finds its ports: an even one for RTP, the next for RTCP."""
         first, last = media.rtp_ports
         pairs = (last + 1) // 2 - (first + 1) // 2
         served = sum(camera.graph.transport == "rtsp" for camera in cameras.values())
-        if pairs < served:
-            rule = f"must hold two ports, of which the first is even, for each of {served} cameras"
+        if pairs < served + bool(sound):
+            of_sound = " and for the sound" if sound else ""
+            rule = f"must hold two ports, of which the first is even, for each of {served} cameras{of_sound}"
             self._report((), ModelError("media.rtp_ports", f"[{first}, {last}]", rule))
-
-
-def _given(data: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
-    """The given keys among `keys`; the model has defaults for the others."""
-    return {key: data[key] for key in keys if key in data}
 
 
 def _media(data: Mapping[str, Any]) -> Media:
@@ -413,7 +424,7 @@ def _capture(source: Source, data: Mapping[str, Any]) -> Capture:
             stated = (f"capture.{key}", f"source.capture.{key}")
             raise ModelError("capture.format", "null", f"must be given where {key} is", *stated)
     fps = requested.get("fps")
-    size = _given(requested, ("format", "width", "height"))
+    size = given(requested, ("format", "width", "height"))
     return Capture(**size, fps=None if fps is None else _rate(fps), controls=controls)
 
 
@@ -431,64 +442,6 @@ def _rate(fps: float) -> Fraction:
 
 def _crop(native: Mapping[str, int], width: int, height: int) -> Roi:
     return Roi(native.get("left_px", 0), native.get("top_px", 0), width, height)
-
-
-def _elements(data: Sequence[Mapping[str, Any]] | None) -> tuple[Element, ...]:
-    return tuple(Element(e["name"], e["element"], e.get("properties") or {}, **e.get("pads") or {}) for e in data or ())
-
-
-def _effort(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings for a graph's `effort`, by key; None for an element's own default."""
-    efforts: Mapping[str, Mapping[str, Any]] = data.get("efforts") or {}
-    elements = str(data["vehicle"])
-    is_used = any(f"{{{key}}}" in elements for values in efforts.values() for key in values)
-    known = list(efforts) if is_used else [ONLY_EFFORT]
-    effort = data.get("effort", ONLY_EFFORT)
-    if effort not in known:
-        expected = f"one of {', '.join(known)}" if known[1:] else known[0]
-        stated = ["efforts"] if is_used else []
-        raise ModelError("effort", effort, f"must be {expected}, which this graph's encoder supports", *stated)
-    return dict(efforts.get(effort, {}))
-
-
-def _graph(data: Mapping[str, Any]) -> Graph:
-    for key, side in GRAPH_PARTS.items():
-        if key in data:
-            raise ModelError(key, None, f"is unused; include it in {side} as ${{..{key}}}")
-    wire = data.get("wire") or {}
-    named = {key: value for key, value in data.items() if key not in GRAPH_STRUCTURE} | _effort(data)
-    return Graph(
-        transport=data["transport"],
-        vehicle=_elements(data["vehicle"]),
-        operator=_elements(data["operator"]),
-        wire_vehicle=_elements(wire.get("vehicle")),
-        wire_operator=_elements(wire.get("operator")),
-        knobs={knob: tuple(KnobTarget(**target) for target in targets) for knob, targets in data["knobs"].items()},
-        settings=GraphSettings(**_given(named, GRAPH_SETTINGS)),
-        placeholders=named,
-        mutable=tuple((entry["element"], entry["property"]) for entry in data.get("mutable") or ()),
-        **_given(data, ("verified", "passes", "key_frame", "needs")),
-    )
-
-
-def _source(data: Mapping[str, Any]) -> Source:
-    render = data.get("render")
-    return Source(
-        elements=_elements(data["elements"]),
-        encoded={codec: _elements(elements) for codec, elements in (data.get("encoded") or {}).items()},
-        settings={key: data[key] for key in MOUNT_KEYS if data.get(key) is not None},
-        capture=data.get("capture") or {},
-        plays_bags="bag" in data,
-        subscribes=data.get("ros", False),
-        **_given(data, ("loop", "frozen_s", "repeated_s", "depth_m", "credentials", "medium", "first_reply_s")),
-        needs=data.get("needs") or {},
-        **({"render": render["drive"], "render_s": render["seconds"]} if render else {}),
-        stand_in=_elements(data.get("stand_in")),
-    )
-
-
-def _recording(data: Mapping[str, Any]) -> Recording:
-    return Recording(data["codec"], data["of_raw"], _elements(data["elements"]), data.get("needs") or {})
 
 
 def _split(key: str) -> schema.Path:

@@ -15,7 +15,10 @@ ROOT = "config"  # the file that chooses all others
 SITE = "tod-runner-site"  # name of the site file to Hydra, like that of no file of a directory
 SITE_VARIABLE = "TOD_SITE"  # of the environment: names the site file
 LAYOUT = "layout"  # folder in the user's directory where the operator's page saves layouts; not a group
-GROUPS = ("vehicle", "cameras", "modes", "graph", "source", "pqos", "recording", "study", "link", "experiment")
+GROUPS = (
+    *("vehicle", "cameras", "modes", "graph", "source", "pqos", "recording", "study", "sound", "link"),
+    "experiment",
+)
 
 
 def conf_directories(user: Path | None) -> list[Path]:

@@ -1,14 +1,40 @@
-"""Converts between kbit/s of encoded video and on the wire, where headers share the uplink. Pure."""
+"""Converts between kbit/s of encoded video and on the wire, where headers and sound share the uplink. Pure."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from fractions import Fraction
 from functools import lru_cache
 
-from runner.core.model import Camera, Graph, Kbps
+from runner.core.model import Camera, Graph, Kbps, Vehicle
 
 INSIDE_MTU = 14  # RTP header (RFC 3550) and fragmentation header (RFC 6184, FU-A), which count as part of the MTU
+
+
+SOUND = "sound"  # its name among the streams of a vehicle, which no camera then has
+
+
+def sound_kbps(kbps: int, packet_ms: int, header_bytes: int) -> Kbps:
+    """kbit/s on the wire of sound with a constant bitrate: each packet has headers."""
+    return Kbps(kbps) + Fraction(8 * header_bytes, packet_ms)
+
+
+def beside_sound(vehicle: Vehicle, copies: Mapping[str, int], total: Kbps, uplinks: int = 1) -> Kbps:
+    """What sound leaves of a total to the cameras, at least 0; every copy that leaves the vehicle counts.
+
+    copies   by stream, how many leave the vehicle; 1 for others
+    uplinks  that the total is for; each carries the sound
+    """
+    return max(Fraction(0), total - _taken(vehicle, copies, uplinks)) if vehicle.sound else total
+
+
+def with_sound(vehicle: Vehicle, copies: Mapping[str, int], total: Kbps) -> Kbps:
+    """The total of which sound leaves this much to the cameras."""
+    return total + _taken(vehicle, copies, max(1, len(vehicle.uplinks)))
+
+
+def _taken(vehicle: Vehicle, copies: Mapping[str, int], uplinks: int) -> Kbps:
+    return vehicle.sound * copies.get(SOUND, 1) * uplinks
 
 
 def on_the_wire(graph: Graph, size: int) -> int:

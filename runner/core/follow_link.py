@@ -9,11 +9,11 @@ from typing import NamedTuple
 
 from runner.core import belief as beliefs
 from runner.core.belief import Belief
-from runner.core.budget import video_kbps, wire_kbps
+from runner.core.budget import beside_sound, video_kbps, wire_kbps
 from runner.core.decision import Believed, Draft
 from runner.core.events import Evidence, LinkMeasured
 from runner.core.learned import WRONG
-from runner.core.model import Camera, Kbps, exact, plain
+from runner.core.model import Camera, Kbps, Vehicle, exact, plain
 from runner.core.state import State
 
 START_S = 5.0  # until the first pictures of all cameras have arrived and are reported
@@ -62,13 +62,14 @@ def _is_recent(belief: Belief, t: float) -> bool:
     return t - belief.reported < START_S
 
 
-def predicted(state: State, cameras: tuple[Camera, ...], after_s: Fraction) -> Prediction:
-    """The newest prediction, unless it is stale."""
+def predicted(vehicle: Vehicle, state: State, cameras: tuple[Camera, ...], after_s: Fraction) -> Prediction:
+    """The newest prediction, unless it is stale: of what cameras can have, as reports are."""
     made, (age, limit) = state.prediction, _age(state, after_s)
     if made is None or age > limit:
         return NO_PREDICTION
     error = WRONG if made.error is None else made.error
-    return Prediction(float(wire_kbps(cameras, made.kbps)), made.bias or 0.0, error)
+    left = beside_sound(vehicle, state.copies, made.kbps)
+    return Prediction(float(wire_kbps(cameras, left)), made.bias or 0.0, error)
 
 
 def updated(
@@ -155,7 +156,9 @@ def _why(belief: Belief, believed: Believed, link: LinkMeasured | None) -> str:
 # --- while it is not --------------------------------------------------------------------------------------------------
 
 
-def faded(state: State, draft: Draft, cameras: int, after_s: Fraction, halve_s: Fraction, floor: Kbps) -> Draft:
+def faded(
+    vehicle: Vehicle, state: State, draft: Draft, cameras: int, after_s: Fraction, halve_s: Fraction, floor: Kbps
+) -> Draft:
     """At most the lower bound of the prediction, less the older it is.
 
     After a prediction of nothing it is `floor`: with nothing sent, the link could never be measured.
@@ -164,6 +167,7 @@ def faded(state: State, draft: Draft, cameras: int, after_s: Fraction, halve_s: 
     """
     assert draft.total is not None
     lower = None if state.prediction is None else state.prediction.lower_kbps
+    lower = None if lower is None else beside_sound(vehicle, state.copies, lower)
     if lower is not None and lower < draft.total:
         draft = draft.limited(lower, "lower bound of the prediction")
     age, limit = _age(state, after_s)

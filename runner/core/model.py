@@ -315,8 +315,8 @@ class Source:
     @property
     def placeholders(self) -> frozenset[str]:
         """Names of the placeholders in its elements."""
-        elements = (*self.elements, *chain.from_iterable(self.encoded.values()))
-        values = (value for element in elements for value in element.properties.values())
+        every = (*self.elements, *chain(*self.encoded.values()))
+        values = (value for element in every for value in element.properties.values())
         return frozenset(name for value in values if isinstance(value, str) for name in PLACEHOLDER.findall(value))
 
 
@@ -482,6 +482,7 @@ class Vehicle:
     mode     at the start
     modes    the rules of each mode, in order
     uplinks  by name, kbit/s that are left to other traffic; empty: there is one, without a name
+    sound    kbit/s on the wire of one copy of its sound; 0: it sends none
     fixed    cameras whose pictures are sent as their sources encode them, whatever the rules would choose
     """
 
@@ -490,11 +491,11 @@ class Vehicle:
     mode: Mode
     modes: Mapping[Mode, tuple[ModeRule, ...]]
     uplinks: Mapping[str, Kbps] = field(default_factory=dict)
+    sound: Kbps = Fraction(0)
     fixed: frozenset[str] = field(init=False)
 
     def __post_init__(self) -> None:
-        passed = (name for name, camera in self.cameras.items() if camera.graph.passes)
-        object.__setattr__(self, "fixed", frozenset(passed))
+        object.__setattr__(self, "fixed", frozenset(name for name, each in self.cameras.items() if each.graph.passes))
 
 
 Progress = Callable[[str, float], None]  # current step, share done in [0, 1]

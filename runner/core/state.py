@@ -10,6 +10,7 @@ from typing import Any, assert_never
 
 from runner.core import driving as dr
 from runner.core import events as ev
+from runner.core.budget import SOUND, with_sound
 from runner.core.decision import NOTHING, Decision
 from runner.core.events import Refused
 from runner.core.model import SMALLEST_SIDE_PX, Camera, Kbps, Mode, Roi, Vehicle, plain
@@ -105,7 +106,7 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
         case ev.BitratePredicted(uplink=uplink):
             return {"predictions": _of_uplink(vehicle, state.predictions, event)} if uplink else {"prediction": event}
         case ev.ModeSelected(mode=mode):
-            return _enter(state, mode, in_force)
+            return _enter(vehicle, state, mode, in_force)
         case ev.TotalSet(kbps=kbps):
             _only_in(Mode.COLLECTIVE, state, event)
             return {"total_set": kbps, "collective_total": kbps}
@@ -147,7 +148,8 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
             return {"attention": attention, "attention_since": event.t}
         case ev.CopiesCounted(copies=copies):
             for name in copies:
-                _known(vehicle, name)
+                if not (vehicle.sound and name == SOUND):
+                    _known(vehicle, name)
             return {"copies": copies}
         case ev.OperatorConnected():
             since = event.t if state.operator_since is None else state.operator_since
@@ -202,7 +204,7 @@ def keep(in_force: Decision, *names: str) -> dict[str, Manual]:
     return {name: Manual(s.given, s.scaling) for name, s in settings if s.scaling is not None}
 
 
-def _enter(state: State, mode: Mode, in_force: Decision) -> dict[str, Any]:
+def _enter(vehicle: Vehicle, state: State, mode: Mode, in_force: Decision) -> dict[str, Any]:
     """Change the mode without a jump: S keeps the settings, C keeps the total unless the operator has set one."""
     if mode is state.mode:
         return {}
@@ -210,7 +212,9 @@ def _enter(state: State, mode: Mode, in_force: Decision) -> dict[str, Any]:
         case Mode.SINGLE:
             return {"mode": mode, "manual": {**state.manual, **keep(in_force)}}
         case Mode.COLLECTIVE:
-            total = in_force.total if state.total_set is None else state.total_set
+            total = state.total_set
+            if total is None:
+                total = with_sound(vehicle, state.copies, in_force.total)
             return {"mode": mode, "collective_total": total}
         case Mode.AUTOMATIC:
             return {"mode": mode}

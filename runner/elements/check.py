@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 from runner.core.commands import KnobValue
 from runner.core.model import Element, ModelError, Value
@@ -16,16 +17,21 @@ from runner.elements.values import value_problem
 from runner.errors import suggest
 from runner.graph import Plan, assignments, text
 
+if TYPE_CHECKING:
+    from runner.sound import SoundPlan
+
 PARTS = ("vehicle", "operator", "recording")  # of a plan
 
 
-def check_plan(registry: Registry, plan: Plan, parts: Collection[str] = PARTS) -> list[ModelError]:
+def check_plan(registry: Registry, plan: Plan | SoundPlan, parts: Collection[str] = PARTS) -> list[ModelError]:
     """Everything a registry does not allow: unknown elements and properties, wrong types and ranges, fixed knobs.
 
     Known elements that are missing are reported by `missing_plugins` and `missing_recorders`.
 
     parts  to check; the plugins of the others are not loaded: a decoder takes 30 MB of a vehicle's memory
     """
+    if not isinstance(plan, Plan):
+        return _check_sound(registry, plan, parts)
     elements = [
         ("vehicle", "source.elements", plan.source),
         ("vehicle", "graph.vehicle", plan.vehicle),
@@ -44,6 +50,22 @@ def check_plan(registry: Registry, plan: Plan, parts: Collection[str] = PARTS) -
     if "vehicle" in parts:
         found += _check_knobs(registry, plan)
     return found or _check_links(registry, plan, parts)
+
+
+def _check_sound(registry: Registry, plan: SoundPlan, parts: Collection[str]) -> list[ModelError]:
+    """The same of the vehicle's sound, with keys below `sound`."""
+    elements = {
+        "vehicle": {"source": plan.source, "vehicle": plan.vehicle, "wire.vehicle": plan.wire_vehicle},
+        "operator": {"operator": plan.operator, "wire.operator": plan.wire_operator},
+    }
+    known, sides = {*PACKAGE_OF, *plan.needs}, [side for side in elements if side in parts]
+    lists = [pair for side in sides for pair in elements[side].items()]
+    found = [error for where, its in lists for error in _check_elements(registry, its, where, known)]
+    lines = {"vehicle": (*plan.source, *plan.vehicle), "operator": plan.operator}
+    for side in () if found else sides:
+        if not missing_plugins(registry, plan, [side]) and (message := registry.link_problem(lines[side])):
+            found.append(ModelError(side, None, message))
+    return found
 
 
 def _check_elements(

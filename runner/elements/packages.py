@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 from runner.core.model import Element
 from runner.elements.description import Registry
 from runner.graph import Plan
 
+if TYPE_CHECKING:
+    from runner.sound import SoundPlan
+
 PACKAGES = {  # elements by Debian package; `doctor` and messages on missing plugins name the package
-    "gstreamer1.0-plugins-base": "videoconvert videoscale videorate videotestsrc decodebin appsrc appsink",
+    "gstreamer1.0-plugins-base": "videoconvert videoscale videorate videotestsrc decodebin appsrc appsink"
+    " audioconvert audioresample audiotestsrc opusenc opusdec",
     "gstreamer1.0-plugins-good": "videocrop aspectratiocrop rtph264pay rtph264depay rtpjitterbuffer rtspsrc udpsrc"
     " rtph265pay rtph265depay udpsink v4l2src rtpbin rtpsession jpegdec capssetter qtdemux matroskademux matroskamux"
-    " vp8enc vp8dec rtpvp8pay rtpvp8depay v4l2h264enc",
+    " vp8enc vp8dec rtpvp8pay rtpvp8depay v4l2h264enc rtpopuspay rtpopusdepay level pulsesrc",
     "gstreamer1.0-plugins-bad": "h264parse h265parse mpegtsmux tsdemux openh264enc x265enc srtsrc srtsink bayer2rgb"
     " vah264enc nvh264enc",
     "gstreamer1.0-plugins-ugly": "x264enc",
     "gstreamer1.0-libav": "avdec_h264 avdec_h265 avdec_ffv1 avenc_ffv1",
     "gstreamer1.0-rtsp": "rtspclientsink",
     "gstreamer1.0-x": "textoverlay",
+    "gstreamer1.0-alsa": "alsasrc",
+    "gstreamer1.0-pipewire": "pipewiresrc",
 }
 HARDWARE = {  # plugin by element that exists only with its hardware
     "vah264enc": "va",
@@ -28,10 +35,13 @@ HARDWARE = {  # plugin by element that exists only with its hardware
 PACKAGE_OF = {element: package for package, elements in PACKAGES.items() for element in elements.split()}
 
 
-def missing_plugins(registry: Registry, plan: Plan, sides: Sequence[str] = ("vehicle", "operator")) -> list[str]:
+def missing_plugins(
+    registry: Registry, plan: Plan | SoundPlan, sides: Sequence[str] = ("vehicle", "operator")
+) -> list[str]:
     """One sentence for each known element that streaming needs on these sides and the registry lacks."""
     needed = {"vehicle": (*plan.source, *plan.vehicle), "operator": plan.operator}
-    elements = (*(element for side in sides for element in needed[side]), *plan.video_elements)
+    written = plan.video_elements if isinstance(plan, Plan) else ()
+    elements = (*(element for side in sides for element in needed[side]), *written)
     return _missing(registry, elements, plan.needs)
 
 

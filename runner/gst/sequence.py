@@ -8,8 +8,9 @@ from pathlib import Path
 
 from gi.repository import GLib, Gst, GstPbutils
 
+from runner.colour_range import to_limited_range
 from runner.errors import ArgumentError
-from runner.graph import Plan, to_limited_range
+from runner.graph import Plan
 from runner.gst.caps import structure
 from runner.gst.clip_range import full_range
 from runner.system.files import file_problem

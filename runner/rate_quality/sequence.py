@@ -9,9 +9,10 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+from runner.colour_range import to_limited_range
 from runner.core.model import DEPTH_M, BagTopic, Camera, ModelError
 from runner.errors import ArgumentError, RunError
-from runner.graph import COLORIMETRY, launch, to_limited_range
+from runner.graph import COLORIMETRY, launch
 from runner.lanes import BAG, FRAMES, LaneSet
 from runner.rate_quality.cache import Cache, digest, file_digest
 from runner.rate_quality.recordings import INDEX

@@ -33,9 +33,10 @@ from typing import Any
 from runner.configuration.config import configuration
 from runner.core.model import Camera, Vehicle
 from runner.errors import ArgumentError, MissingBindings, RunError, UserError, reason, suggest
+from runner.graph import Plan
 from runner.inputs import input_problem
 from runner.mqtt.broker import find_mosquitto
-from runner.plans import compile_plans, nearest_rate
+from runner.plans import compile_plans, nearest_rate, sound_plan
 from runner.security.keyring import HOLDER, Keyring
 from runner.security.validity import date, expiring, invalid
 from runner.settings import Endpoint, RosSettings, Setup
@@ -217,7 +218,8 @@ def _elements(verb: str, setup: Setup) -> Iterator[Diagnosis]:
     from runner.elements.packages import missing_plugins, missing_recorders
 
     lines, missing = [], dict[str, None]()
-    for plan in compile_plans(setup):
+    sound = sound_plan(setup)
+    for plan in (*compile_plans(setup), *((sound,) if sound else ())):
         if verb == "operator":
             lines += [plan.operator]
             missing |= dict.fromkeys(missing_plugins(LIVE, plan, ("operator",)))
@@ -225,8 +227,11 @@ def _elements(verb: str, setup: Setup) -> Iterator[Diagnosis]:
             lines += [plan.source, plan.vehicle]
             missing |= dict.fromkeys(missing_plugins(LIVE, plan, ("vehicle",)))
         else:
-            lines += [plan.source, plan.vehicle, plan.operator, plan.recorder]
-            missing |= dict.fromkeys((*missing_plugins(LIVE, plan), *missing_recorders(LIVE, plan)))
+            lines += [plan.source, plan.vehicle, plan.operator]
+            missing |= dict.fromkeys(missing_plugins(LIVE, plan))
+            if isinstance(plan, Plan):
+                lines += [plan.recorder]
+                missing |= dict.fromkeys(missing_recorders(LIVE, plan))
     names = {element.factory for line in lines for element in line}
     yield from (Diagnosis(False, sentence) for sentence in missing)
     if not missing:

@@ -25,7 +25,7 @@ import json
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from runner.configuration.config import configuration
 from runner.configuration.uplinks import KEYS, described, pqos_of_uplinks
@@ -36,11 +36,14 @@ from runner.core.model import Kbps, Mode, Vehicle, exact, plain
 from runner.core.step import start, step
 from runner.errors import ArgumentError, MissingBindings
 from runner.graph import Plan, may_lack_parameter_sets
-from runner.plans import compile_plans
+from runner.plans import compile_plans, sound_plan
 from runner.records import to_json
 from runner.records.decisions import CameraDecision, uplinks_decided
 from runner.redact import redacted
 from runner.verbs import Arguments
+
+if TYPE_CHECKING:
+    from runner.sound import SoundPlan
 
 Uplinks = Mapping[str, Mapping[str, str]]  # by name, what is to be said of each
 
@@ -51,10 +54,10 @@ def run(arguments: Arguments) -> int:
         return _sweep(arguments)
     if form == "yaml":
         return _print_configuration(arguments)
-    vehicle, plans, decision, uplinks = _plan(arguments)
-    text = json.dumps(as_json(plans, decision, uplinks), indent=2, ensure_ascii=False) if form == "json" else ""
+    vehicle, plans, sound, decision, uplinks = _plan(arguments)
+    text = json.dumps(as_json(plans, sound, decision, uplinks), indent=2, ensure_ascii=False) if form == "json" else ""
     notes = _notes(plans, uplinks) if form == "json" else []
-    _print(text or as_text(vehicle, plans, decision, uplinks), [*notes, *_parameter_sets(plans)])
+    _print(text or as_text(vehicle, plans, sound, decision, uplinks), [*notes, *_parameter_sets(plans)])
     return 0
 
 
@@ -72,10 +75,10 @@ def _sweep(arguments: Arguments) -> int:
 
     runs = prepare_all(arguments, _plan)
     lines = [
-        json.dumps({"overrides": words, **as_json(plans, decision, uplinks)}, ensure_ascii=False)
-        for words, (_, plans, decision, uplinks) in runs
+        json.dumps({"overrides": words, **as_json(plans, sound, decision, uplinks)}, ensure_ascii=False)
+        for words, (_, plans, sound, decision, uplinks) in runs
     ]
-    notes = (note for _, (_, plans, _, uplinks) in runs for note in _notes(plans, uplinks))
+    notes = (note for _, (_, plans, *_, uplinks) in runs for note in _notes(plans, uplinks))
     _print("\n".join(lines), list(dict.fromkeys(notes)))
     return 0
 
@@ -92,12 +95,12 @@ def _parameter_sets(plans: Sequence[Plan]) -> list[str]:
     return [f"{plan.camera.name}: {sentence}" for plan in suspected for sentence in parameter_set_notes(plan)]
 
 
-def _plan(arguments: Arguments) -> tuple[Vehicle, Sequence[Plan], Decision, Uplinks]:
+def _plan(arguments: Arguments) -> tuple[Vehicle, Sequence[Plan], SoundPlan | None, Decision, Uplinks]:
     total = arguments.number("total_kbps")
     config = configuration(arguments.overrides, arguments.conf, site=arguments.site)
     setup = config.setup()
     decision = decide(setup.vehicle, None if total is None else exact(total))
-    return setup.vehicle, compile_plans(setup), decision, _uplinks(config.document)
+    return setup.vehicle, compile_plans(setup), sound_plan(setup), decision, _uplinks(config.document)
 
 
 def _uplinks(document: Mapping[str, Any]) -> Uplinks:
@@ -133,7 +136,7 @@ def decide(vehicle: Vehicle, total: Kbps | None) -> Decision:
     return run.decision
 
 
-def as_json(plans: Sequence[Plan], decision: Decision, uplinks: Uplinks) -> dict[str, Any]:
+def as_json(plans: Sequence[Plan], sound: SoundPlan | None, decision: Decision, uplinks: Uplinks) -> dict[str, Any]:
     cameras = {
         plan.camera.name: {
             "vehicle": plan.vehicle_line(wanted(decision.settings[plan.camera.name])),
@@ -143,14 +146,23 @@ def as_json(plans: Sequence[Plan], decision: Decision, uplinks: Uplinks) -> dict
         }
         for plan in plans
     }
-    document = {"mode": decision.mode.value, "total_kbps": plain(decision.total), "cameras": cameras}
+    document: dict[str, Any] = {"mode": decision.mode.value, "total_kbps": plain(decision.total), "cameras": cameras}
+    if sound:
+        document["sound"] = {
+            "vehicle": sound.vehicle_line(),
+            "operator": sound.operator_line(),
+            "server": sound.server,
+            "kbps_on_the_wire": plain(sound.wire_kbps),
+        }
     if not uplinks:
         return document
     shares = to_json(uplinks_decided(decision)) if decision.uplinks else {}
     return {**document, "uplinks": {name: {**way, **shares.get(name, {})} for name, way in uplinks.items()}}
 
 
-def as_text(vehicle: Vehicle, plans: Sequence[Plan], decision: Decision, uplinks: Uplinks) -> str:
+def as_text(
+    vehicle: Vehicle, plans: Sequence[Plan], sound: SoundPlan | None, decision: Decision, uplinks: Uplinks
+) -> str:
     lines = [f"# {vehicle.name}, mode {decision.mode}, total {plain(decision.total)} kbit/s"]
     for name, way in uplinks.items():
         share = decision.uplinks.get(name)
@@ -166,6 +178,11 @@ def as_text(vehicle: Vehicle, plans: Sequence[Plan], decision: Decision, uplinks
         lines.append(f"gst-launch-1.0 {plan.operator_line()}")
         if plan.server:
             lines.append(f"# server: {plan.server}")
+    if sound:
+        lines += ["", f"# sound: {plain(sound.wire_kbps)} kbit/s on the wire, taken from the total"]
+        lines.append(f"gst-launch-1.0 {sound.vehicle_line()}")
+        lines.append(f"gst-launch-1.0 {sound.operator_line()}")
+        lines.append(f"# server: {sound.server}")
     return "\n".join(lines)
 
 

@@ -66,6 +66,8 @@ from runner.verbs import Arguments
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
+    from runner.sound import SoundPlan
+
 FOLDERS = (*GROUPS, LAYOUT)  # of checked files
 DATA = ("maps", "traces")  # folders for data that pqos files name; a bandwidth map may be YAML
 CROSSED = ("vehicle", "graph", "source")  # groups whose files are combined with each other
@@ -465,13 +467,14 @@ def _registry_check(notes: dict[str, None], target: str | None) -> PlanCheck | N
         notes[f"nothing was checked against the GStreamer registry: {error}"] = None
         return None
 
-    def check(plan: Plan) -> list[ModelError]:
-        missing = (*missing_plugins(registry, plan), *missing_recorders(registry, plan))
+    def check(plan: Plan | SoundPlan) -> list[ModelError]:
+        records = missing_recorders(registry, plan) if isinstance(plan, Plan) else ()
+        missing = (*missing_plugins(registry, plan), *records)
         notes.update({f"not checked: {sentence}": None for sentence in missing})
         if registry.origin:
             notes[f"checked against {registry.origin}"] = None
         problems = check_plan(registry, plan)
-        if not problems and target is None and may_lack_parameter_sets(plan):
+        if isinstance(plan, Plan) and not problems and target is None and may_lack_parameter_sets(plan):
             from runner.apply import parameter_set_notes
 
             notes.update(dict.fromkeys(parameter_set_notes(plan)))

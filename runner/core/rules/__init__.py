@@ -9,7 +9,8 @@ from functools import cache
 from typing import Any
 
 from runner.core import allocation, scaling
-from runner.core.decision import NOTHING, Decision, Draft, Setting
+from runner.core.budget import beside_sound
+from runner.core.decision import NOTHING, Decision, Draft, Setting, short
 from runner.core.model import Mode, Roi, Vehicle
 from runner.core.rules import spread, steady  # noqa: F401  (register their rules, as the imports below do theirs)
 from runner.core.rules.paper import whole
@@ -59,7 +60,11 @@ def decide(vehicle: Vehicle, state: State, memory: Memories) -> tuple[Decision, 
         if problem := _draft_problem(seen, before, draft):
             raise RuleFailed(f"rule {call.name} failed: {problem}")
         memory = memory if kept is own else {**memory, call.key: kept}
-        asked = draft.total if asked is None else asked
+        if asked is None and draft.total is not None:
+            asked = draft.total
+            if vehicle.sound and not draft.bitrate:  # in mode S the total is what the operator has set for cameras
+                left = beside_sound(vehicle, state.copies, asked, max(1, len(vehicle.uplinks)))
+                draft = draft.limited(left, f"sound takes {short(asked - left)}")
     assert draft.total is not None and asked is not None
     settings = _settings(
         vehicle,
@@ -124,7 +129,8 @@ PARTS = (
 @cache
 def reads(vehicle: Vehicle, mode: Mode) -> frozenset[str]:
     """Fields of the state whose change triggers a new decision."""
-    return frozenset({"mode", "on", "lost", "rois"}).union(*(call.reads for call in vehicle.modes[mode]))
+    of_sound = {"copies"} if vehicle.sound else set[str]()
+    return frozenset({"mode", "on", "lost", "rois", *of_sound}).union(*(call.reads for call in vehicle.modes[mode]))
 
 
 @Last

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from runner.core import allocation, scaling
 from runner.core import follow_link as follow
 from runner.core.belief import LOWEST, Belief
-from runner.core.budget import video_kbps, wire_kbps
+from runner.core.budget import beside_sound, video_kbps, wire_kbps
 from runner.core.decision import Draft, UplinkShare
 from runner.core.events import LinkState
 from runner.core.follow_link import FLOOR, Ceiling, Reports
@@ -222,7 +222,7 @@ def _follow(
     link = state.link if how.reports is Reports.FOLLOWED else None
     if not cameras or not follow.is_measured(state, link, past):
         if is_automatic:
-            draft = follow.faded(state, draft, len(cameras), how.after_s, how.halve_every_s, how.floor_kbps)
+            draft = follow.faded(vehicle, state, draft, len(cameras), how.after_s, how.halve_every_s, how.floor_kbps)
         return follow.started(state, draft, how.start), None
     limit = float(wire_kbps(cameras, asked) + how.reserve_kbps)
     has_limit = not is_automatic or how.ceiling is Ceiling.PREDICTION
@@ -234,7 +234,7 @@ def _follow(
         link,
         start=float(how.start * wire_kbps(cameras, begins)),
         most=float(wire_kbps(cameras, of_all_copies(state, _wanted(vehicle, state, draft)))),
-        prediction=follow.predicted(state, cameras, how.after_s) if is_predicted else follow.NO_PREDICTION,
+        prediction=follow.predicted(vehicle, state, cameras, how.after_s) if is_predicted else follow.NO_PREDICTION,
         floors=float(_wire_floors(vehicle, state, draft, cameras, how.reserve_kbps)),
         ceiling=limit if has_limit else inf,
     )
@@ -259,7 +259,9 @@ def _follow_each(vehicle: Vehicle, state: State, draft: Draft, memory: Memory, h
     alone, beliefs = {}, {}
     for name, reserve in vehicle.uplinks.items():
         own, past = state.over(name, len(vehicle.uplinks)), memory.get(name)
-        begins = own.prediction.kbps if own.prediction and is_automatic else Fraction(asked) / len(vehicle.uplinks)
+        begins = Fraction(asked) / len(vehicle.uplinks)
+        if own.prediction and is_automatic:
+            begins = beside_sound(vehicle, state.copies, own.prediction.kbps)
         if past and own.link and own.link.evidence.silent_s > FORGOTTEN_S:
             past = None  # it may be another cell, or another network
         follows = how._replace(reserve_kbps=how.reserve_kbps + reserve)

@@ -1,0 +1,82 @@
+"""Builds graphs, sources and recordings from plain data that their schemas accept."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields
+from typing import Any
+
+from runner.configuration.origin import GRAPH_PARTS
+from runner.core.model import Element, Graph, GraphSettings, KnobTarget, ModelError, Source
+from runner.settings import Recording
+
+MOUNT_KEYS = ("device", "address", "clip", "bag", "topic")
+GRAPH_STRUCTURE = (
+    *("defaults", "transport", "verified", "passes", "key_frame", "vehicle", "operator", "wire", "knobs", "mutable"),
+    *("effort", "efforts", "needs"),
+)
+GRAPH_SETTINGS = [part.name for part in fields(GraphSettings)]
+ONLY_EFFORT = "medium"  # of graphs without `efforts`
+
+
+def elements(data: Sequence[Mapping[str, Any]] | None) -> tuple[Element, ...]:
+    return tuple(Element(e["name"], e["element"], e.get("properties") or {}, **e.get("pads") or {}) for e in data or ())
+
+
+def _effort(data: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings for a graph's `effort`, by key; None for an element's own default."""
+    efforts: Mapping[str, Mapping[str, Any]] = data.get("efforts") or {}
+    elements = str(data["vehicle"])
+    is_used = any(f"{{{key}}}" in elements for values in efforts.values() for key in values)
+    known = list(efforts) if is_used else [ONLY_EFFORT]
+    effort = data.get("effort", ONLY_EFFORT)
+    if effort not in known:
+        expected = f"one of {', '.join(known)}" if known[1:] else known[0]
+        stated = ["efforts"] if is_used else []
+        raise ModelError("effort", effort, f"must be {expected}, which this graph's encoder supports", *stated)
+    return dict(efforts.get(effort, {}))
+
+
+def read_graph(data: Mapping[str, Any]) -> Graph:
+    for key, side in GRAPH_PARTS.items():
+        if key in data:
+            raise ModelError(key, None, f"is unused; include it in {side} as ${{..{key}}}")
+    wire = data.get("wire") or {}
+    named = {key: value for key, value in data.items() if key not in GRAPH_STRUCTURE} | _effort(data)
+    return Graph(
+        transport=data["transport"],
+        vehicle=elements(data["vehicle"]),
+        operator=elements(data["operator"]),
+        wire_vehicle=elements(wire.get("vehicle")),
+        wire_operator=elements(wire.get("operator")),
+        knobs={knob: tuple(KnobTarget(**target) for target in targets) for knob, targets in data["knobs"].items()},
+        settings=GraphSettings(**given(named, GRAPH_SETTINGS)),
+        placeholders=named,
+        mutable=tuple((entry["element"], entry["property"]) for entry in data.get("mutable") or ()),
+        **given(data, ("verified", "passes", "key_frame", "needs")),
+    )
+
+
+def read_source(data: Mapping[str, Any]) -> Source:
+    render = data.get("render")
+    return Source(
+        elements=elements(data["elements"]),
+        encoded={codec: elements(its) for codec, its in (data.get("encoded") or {}).items()},
+        settings={key: data[key] for key in MOUNT_KEYS if data.get(key) is not None},
+        capture=data.get("capture") or {},
+        plays_bags="bag" in data,
+        subscribes=data.get("ros", False),
+        **given(data, ("loop", "frozen_s", "repeated_s", "depth_m", "credentials", "medium", "first_reply_s")),
+        needs=data.get("needs") or {},
+        **({"render": render["drive"], "render_s": render["seconds"]} if render else {}),
+        stand_in=elements(data.get("stand_in")),
+    )
+
+
+def read_recording(data: Mapping[str, Any]) -> Recording:
+    return Recording(data["codec"], data["of_raw"], elements(data["elements"]), data.get("needs") or {})
+
+
+def given(data: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
+    """The given keys among `keys`; the model has defaults for the others."""
+    return {key: data[key] for key in keys if key in data}

@@ -1,0 +1,116 @@
+"""The vehicle's sound as a `SoundPlan`: plain elements for both sides. Pure text, as `runner.graph` is for cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+from runner.core.budget import SOUND
+from runner.core.model import Element, GraphSettings, Kbps, ModelError, Value
+from runner.graph import filled, launch, rtsp_url, shell
+from runner.settings import Endpoint, Media, Sound
+
+
+@dataclass(frozen=True, slots=True)
+class SoundPlan:
+    """The compiled sound: everything resolved, nothing started.
+
+    settings   what the RTSP server and the receiver's session read themselves, as of a camera's graph
+    source     elements that produce raw sound
+    vehicle    elements after the source
+    operator   elements of the operator's side
+    wire_*     what `print` adds in place of RTSP server and client
+    packet_ms  of sound in a packet
+    wire_kbps  of one copy, with headers
+    needs      by element that only the vehicle may have, the package that provides it
+    """
+
+    settings: GraphSettings
+    source: tuple[Element, ...]
+    vehicle: tuple[Element, ...]
+    operator: tuple[Element, ...]
+    wire_vehicle: tuple[Element, ...]
+    wire_operator: tuple[Element, ...]
+    packet_ms: int
+    wire_kbps: Kbps
+    needs: Mapping[str, str] = field(default_factory=dict)
+    name: str = SOUND
+
+    @property
+    def pipeline(self) -> str:
+        """The vehicle's side as GStreamer parses it."""
+        return launch((*self.source, *self.vehicle))
+
+    @property
+    def server(self) -> str:
+        """The launch string of the RTSP factory."""
+        return f"( {self.pipeline} )"
+
+    @property
+    def receiver(self) -> str:
+        """The operator's side as GStreamer parses it."""
+        return launch(self.operator)
+
+    def receiver_into(self, sink: str) -> str:
+        """The same with another sink, given as text."""
+        return f"{launch(self.operator[:-1])} ! {sink}"
+
+    def vehicle_line(self) -> str:
+        """Arguments for gst-launch-1.0, quoted for a shell, ending in a network sink."""
+        return shell((*self.source, *self.vehicle, *self.wire_vehicle))
+
+    def operator_line(self) -> str:
+        """Arguments for gst-launch-1.0, quoted for a shell, starting at a network source."""
+        return shell((*self.wire_operator, *self.operator[1:]))
+
+
+def compile_sound(sound: Sound, media: Media) -> SoundPlan:
+    """Resolve the placeholders of all elements.
+
+    raises  ModelError for an unknown placeholder, a name that two elements have, or a last element that is not pay0
+    """
+    values: dict[str, Value | None] = {
+        "device": sound.device,
+        "clip": sound.clip,
+        "bps": 1000 * sound.kbps,
+        "packet_ms": sound.packet_ms,
+        "jitter_buffer_ms": sound.jitter_buffer_ms,
+        "host": media.host,
+        "url": rtsp_url(media, SOUND),
+        "port": sound.port,
+        "endpoint": str(Endpoint(media.host, sound.port)),
+    }
+
+    def fill(elements: Iterable[Element], where: str) -> tuple[Element, ...]:
+        return tuple(filled(element, values, f"{where}[{i}]") for i, element in enumerate(elements))
+
+    _check_names(sound)
+    return SoundPlan(
+        settings=GraphSettings(
+            sound.port, header_bytes=sound.header_bytes, jitter_buffer_ms=sound.jitter_buffer_ms, dscp=sound.dscp
+        ),
+        source=fill(sound.source, "source"),
+        vehicle=fill(sound.vehicle, "vehicle"),
+        operator=fill(sound.operator, "operator"),
+        wire_vehicle=fill(sound.wire_vehicle, "wire.vehicle"),
+        wire_operator=fill(sound.wire_operator, "wire.operator"),
+        packet_ms=sound.packet_ms,
+        wire_kbps=sound.wire_kbps,
+        needs=sound.needs,
+    )
+
+
+def _check_names(sound: Sound) -> None:
+    """Source and vehicle become one pipeline, in which elements are found by name."""
+    taken: dict[str, str] = {}
+    for where, elements in (("source", sound.source), ("vehicle", sound.vehicle)):
+        for index, element in enumerate(elements):
+            key = f"{where}[{index}].name"
+            if element.name in taken:
+                raise ModelError(key, repr(element.name), "is already the name of another element", taken[element.name])
+            taken[element.name] = key
+    if sound.vehicle[-1].name != "pay0":
+        key = f"vehicle[{len(sound.vehicle) - 1}].name"
+        raise ModelError(key, repr(sound.vehicle[-1].name), "must be pay0, as the RTSP server requires")
+    if "received" not in (element.name for element in sound.operator):
+        raise ModelError("operator", None, "must have an identity named received, behind the depayloader")
