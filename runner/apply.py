@@ -8,14 +8,14 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from runner.core.budget import SOUND
 from runner.core.commands import Command, KnobValue
 from runner.core.decision import NOTHING
-from runner.errors import RunError, suggest
+from runner.errors import suggest
 from runner.graph import Plan
 from runner.gst import TYPELIBS, GLib, Gst
 from runner.gst.arrivals import take_arrivals
@@ -25,6 +25,7 @@ from runner.gst.decoders import DecoderWatch
 from runner.gst.glib_thread import GlibThread
 from runner.gst.ip_camera import follow_cameras
 from runner.gst.lost import LostCameras
+from runner.gst.machine import check_machine, stream_problem, with_clip_range, with_video
 from runner.gst.outage import ReportMerger
 from runner.gst.pipeline import CameraPipeline, OnReport, Openings
 from runner.gst.probes import PassingBuffer
@@ -36,18 +37,16 @@ from runner.gst.registry import (
     check_plan,
     check_recorders,
     check_vehicle,
-    require_plugins,
     versions,
 )
 from runner.gst.rtspsrc import limit_teardown
 from runner.gst.server import CameraServer
-from runner.gst.source import source_problem
 from runner.gst.supervised import CameraCaller
 from runner.gst.timers import Guarded, every, later
 from runner.gst.video_files import VideoFile, VideoFiles
 from runner.gst.watched import WatchedSource
 from runner.records.reception import Arrivals, SentFrame, UplinkReceived, UplinkSent
-from runner.records.vehicle import CameraReading, SenderStages
+from runner.records.vehicle import NOTHING_ENCODED, CameraReading, SenderStages, SoundReading
 from runner.settings import Media, Uplink
 
 if TYPE_CHECKING:
@@ -60,9 +59,11 @@ if TYPE_CHECKING:
     from runner.gst.recording_side import RecordingSide
     from runner.gst.secure import StreamLogin
     from runner.gst.sequence import discover
+    from runner.gst.sound_pipeline import SoundPipeline
     from runner.gst.video_reader import Unit, read_video
     from runner.ros.cameras import SharedPicture
     from runner.security.keyring import Keyring
+    from runner.sound import SoundPlan
 
 __all__ = [
     "LIVE",
@@ -105,43 +106,8 @@ LOOK_MS = 20  # how often it looks which frames have left: their times are known
 TAILS_MS = 10  # how often receivers check for frames whose end is missing
 
 
-def check_machine(plans: Sequence[Plan], *, strict: bool = True) -> dict[str, str]:
-    """Check that every plugin of the vehicle's side is installed and every source (file, device) opens.
-
-    strict   a source that does not open is an error
-    returns  by camera whose source does not open, why
-    raises   RunError with the remedy, for all cameras at once
-    """
-    require_plugins(plans, ("vehicle",))
-    refused = {plan.camera.name: why for plan in plans if (why := source_problem(plan))}
-    if refused and strict:
-        raise RunError("\n".join(f"camera {name}: {why}" for name, why in refused.items()))
-    return refused
-
-
-def _with_video(plans: Sequence[Plan], video: VideoFiles | None, side: str) -> Sequence[Plan]:
-    """The plans to build: each with a video file, if requested.
-
-    raises  RunError with the packages to install
-    """
-    if video is None:
-        return plans
-    plans = [replace(plan, video=True) for plan in plans]
-    require_plugins(plans, (side,))
-    return plans
-
-
 def _captured(pad: Gst.Pad, unit: PassingBuffer) -> float | None:
     return None if unit.pts is None else captured_at(pad, unit.pts)
-
-
-def _with_clip_range(plans: Sequence[Plan]) -> Sequence[Plan]:
-    """The plans, those of full-range clips with the conversion to limited range."""
-    if not any(element.factory == "filesrc" for plan in plans for element in plan.source):
-        return plans
-    from runner.gst import sequence  # cameras need none of it
-
-    return [sequence.with_clip_range(plan) for plan in plans]
 
 
 class VehicleSide:
@@ -153,6 +119,7 @@ class VehicleSide:
     lost       by camera whose source does not open, why: it is tried again, and started once it does
     uplinks    by name, see `runner.gst.uplinks`; none: the system's routes decide
     may_listen  whether viewers may connect at an address of an uplink, too
+    sound      served beside the cameras; None: there is none
     raises     RunError if the port is in use, or a plugin that `video` needs is not installed
 
     `on_turned` is called, from any thread, after knobs were set and read back: `applied` may have changed.
@@ -168,12 +135,13 @@ class VehicleSide:
         lost: Mapping[str, str] = NOTHING,
         uplinks: Mapping[str, Uplink] = NOTHING,
         may_listen: Callable[[str], bool] = lambda address: False,
+        sound: SoundPlan | None = None,
     ) -> None:
         self._on_report, self._video = on_report, video
         kind: Any = uplinks and import_module("runner.gst.uplinks").VehicleUplinks
         self._uplinks = kind(uplinks, on_report, may_listen) if kind else None
         passphrase = keyring.watched_passphrase(lambda what: on_report("keys", what)).get if keyring else None
-        plans = _with_clip_range(_with_video(plans, video, "vehicle"))
+        plans = with_clip_range(with_video(plans, video, "vehicle"))
         self._lock = threading.Lock()
         self._logins = {p.camera.name: Login(p, partial(on_report, p.camera.name)) for p in plans}
         self._left_out: dict[str, set[str]] = {plan.camera.name: set() for plan in plans}  # decoders
@@ -181,13 +149,14 @@ class VehicleSide:
         self.on_turned: Callable[[], None] = lambda: None
         self._glib = GlibThread()
         self._server: CameraServer | None = None
-        self._lost = LostCameras(plans, lost, source_problem, self._on_found)
+        streams = (*plans, *((sound,) if sound else ()))
+        self._lost = LostCameras(streams, lost, stream_problem, self._on_found)
         openings = Openings(self._build, self._lost, on_report, self._refusal, self._uplinks)
         self._callers = {p.camera.name: CameraCaller(p, openings, passphrase) for p in plans if not p.serves}
         self._looks = [self._guarded_look(plan.camera.name) for plan in plans]
         if self._uplinks:
             self._looks.append(Guarded(self._uplinks.look, lambda what: on_report("uplinks", what)))
-        served = [plan for plan in plans if plan.serves]
+        served = [plan for plan in streams if not isinstance(plan, Plan) or plan.serves]
 
         def start() -> None:
             if served:
@@ -252,6 +221,16 @@ class VehicleSide:
         copies, refused = (server.copies(), server.admission.refused()) if server else (NOTHING, NOTHING)
         return {n: self._read(n, lost.get(n), copies.get(n, 0), refused.get(n, NOTHING)) for n in self._wanted}
 
+    def read_sound(self) -> SoundReading:
+        """What its elements say now. From any thread."""
+        server, pipeline = self._server, self._server and self._server.pipelines.get(SOUND)
+        return SoundReading(
+            encoded=pipeline.counters() if pipeline else NOTHING_ENCODED,
+            lost=self._lost.reasons().get(SOUND),
+            copies=server.copies().get(SOUND, 0) if server else 0,
+            refused=server.admission.refused().get(SOUND, NOTHING) if server else NOTHING,
+        )
+
     def stages(self) -> dict[str, SenderStages]:
         """By camera, latency from capture to the encoder, and through it, ms; unknown ones are omitted.
 
@@ -302,10 +281,14 @@ class VehicleSide:
         if name in self._callers:
             self._glib.call(f"starting {name}", self._callers[name].start)
 
-    def _build(self, pipeline: Gst.Bin, plan: Plan) -> CameraPipeline:
+    def _build(self, pipeline: Gst.Bin, plan: Plan | SoundPlan) -> CameraPipeline | SoundPipeline:
         """Set up a newly built pipeline, with every knob at its wanted value."""
-        name = plan.camera.name
+        name = plan.name
         report = partial(self._on_report, name)
+        if not isinstance(plan, Plan):
+            from runner.gst.sound_pipeline import SoundPipeline
+
+            return SoundPipeline(pipeline, plan, report, self._uplinks.of(name) if self._uplinks else None)
         source = None
         limit_teardown(pipeline)
         if plan.frozen_s is not None:
@@ -338,7 +321,8 @@ class VehicleSide:
 
     def _refusal(self, camera: str) -> str | None:
         """Why a camera must not be asked now: it refuses the login, and would lock the vehicle out."""
-        return self._logins[camera].refusal
+        login = self._logins.get(camera)  # sound needs none
+        return login.refusal if login else None
 
     def _look(self) -> None:
         """Look which pictures of each camera have passed since it looked last."""
@@ -364,7 +348,8 @@ class VehicleSide:
     def _pipeline(self, name: str) -> CameraPipeline | None:
         if name in self._callers:
             return self._callers[name].pipeline
-        return self._server.pipelines.get(name) if self._server else None
+        found = self._server.pipelines.get(name) if self._server else None
+        return found if isinstance(found, CameraPipeline) else None
 
 
 class OperatorSide:
@@ -397,7 +382,7 @@ class OperatorSide:
         uplinks: Addresses | None = None,
         cameras: Collection[str] | None = None,
     ) -> None:
-        plans = _with_video(plans, video, "operator")
+        plans = with_video(plans, video, "operator")
         self._glib = GlibThread()
         self._reports = reports = ReportMerger(on_report)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from dataclasses import replace
 from fractions import Fraction
@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 from runner.clips import View, cache_directory, rendered, view
 from runner.core.model import Camera, Progress, Vehicle
 from runner.errors import RunError
-from runner.graph import Plan, compile_graph
-from runner.settings import Setup
+from runner.graph import Plan, compile_graph, rtsp_url
+from runner.settings import Media, Setup
 
 if TYPE_CHECKING:
     from runner.sound import SoundPlan
@@ -34,6 +34,14 @@ def sound_plan(setup: Setup) -> SoundPlan | None:
     from runner.sound import compile_sound
 
     return compile_sound(setup.sound, setup.media)
+
+
+def stream_addresses(media: Media, plans: Iterable[Plan], sound: SoundPlan | None) -> Iterator[str]:
+    """Where each stream of a vehicle is, in words."""
+    for plan in plans:
+        yield f"{plan.camera.name}: {rtsp_url(media, plan.camera.name) if plan.serves else 'connects to the operator'}"
+    if sound:
+        yield f"{sound.name}: {rtsp_url(media, sound.name)}"
 
 
 def as_offered(setup: Setup, report: Callable[[str], None]) -> Setup:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import weakref
+from typing import TYPE_CHECKING
 
 from gi.repository import Gst, GstRtsp, GstRtspServer, GstSdp
 
@@ -13,6 +14,10 @@ from runner.gst.pipeline import CameraPipeline
 from runner.gst.srtp import set_master_key, write_keys
 from runner.settings import Media
 from runner.system.ports import ip_address_of
+
+if TYPE_CHECKING:
+    from runner.gst.sound_pipeline import SoundPipeline
+    from runner.sound import SoundPlan
 
 QUEUE_BYTES = 2_000_000  # more than a viewer may lag at any bitrate
 
@@ -64,10 +69,13 @@ class CameraFactory(GstRtspServer.RTSPMediaFactory):  # type: ignore[misc]
     """
 
     def __init__(
-        self, plan: Plan, addresses: GstRtspServer.RTSPAddressPool, permissions: GstRtspServer.RTSPPermissions | None
+        self,
+        plan: Plan | SoundPlan,
+        addresses: GstRtspServer.RTSPAddressPool,
+        permissions: GstRtspServer.RTSPPermissions | None,
     ) -> None:
         super().__init__()
-        settings = plan.camera.graph.settings
+        settings = plan.settings
         self.set_media_gtype(CameraMedia.__gtype__)
         self.set_launch(plan.server)
         self.set_shared(True)  # otherwise a second viewer takes the pipeline from the first
@@ -103,7 +111,9 @@ def address_pool(media: Media) -> GstRtspServer.RTSPAddressPool:
     return pool
 
 
-def on_element(pipeline: Gst.Bin, parent: Gst.Bin, element: Gst.Element, built: weakref.ref[CameraPipeline]) -> None:
+def on_element(
+    pipeline: Gst.Bin, parent: Gst.Bin, element: Gst.Element, built: weakref.ref[CameraPipeline | SoundPipeline]
+) -> None:
     """Configure the elements that the server library adds around a pipeline."""
     factory = element.get_factory().get_name() if element.get_factory() else ""
     if parent is pipeline and factory == "queue":

@@ -6,12 +6,16 @@ import resource
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
+from typing import TYPE_CHECKING
 
 from gi.repository import GstRtspServer
 
 from runner.gst.connections import RtspConnection
 from runner.gst.pipeline import CameraPipeline
 from runner.gst.viewers import over_uplink
+
+if TYPE_CHECKING:
+    from runner.gst.sound_pipeline import SoundPipeline
 
 CLOSE_S = 2.0  # how long connections may take to end when the server stops
 # A connection and its thread take three descriptors, and some more until it has ended. Beyond this many connections the
@@ -91,7 +95,7 @@ class Clients:
             self._on_report(camera, f"disconnected the viewer at {connection}: {why}")
         connection.close()
 
-    def lag(self, connection: RtspConnection, pipelines: Mapping[str, CameraPipeline]) -> float:
+    def lag(self, connection: RtspConnection, pipelines: Mapping[str, CameraPipeline | SoundPipeline]) -> float:
         """See `RtspConnection.lag`."""
         others = (other for other in self.connections.values() if other is not connection)
         shared = any(other.cameras.keys() & connection.cameras.keys() for other in others)

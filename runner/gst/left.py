@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING
 
 from runner.gst.clients import Clients
 from runner.gst.pipeline import CameraPipeline
+
+if TYPE_CHECKING:
+    from runner.gst.sound_pipeline import SoundPipeline
 
 LEFT_S = 10.0  # how long a camera is monitored after a viewer has left
 BLOCKED_S = 0.4  # a camera that should send but does not for this long and three frame intervals is blocked
 
 
 class LeftCameras:
-    def __init__(self, clients: Clients, pipelines: Mapping[str, CameraPipeline]) -> None:
+    def __init__(self, clients: Clients, pipelines: Mapping[str, CameraPipeline | SoundPipeline]) -> None:
         self._clients, self._pipelines, self._changed = clients, pipelines, clients.changed
         self._left: dict[str, float] = {}  # until when each is monitored
         self._progress: dict[str, tuple[int, float]] = {}  # of each, frame count and when it last changed

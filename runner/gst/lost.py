@@ -1,4 +1,4 @@
-"""Cameras whose sources cannot be opened: why, and when each is tried again."""
+"""Cameras, and sound, whose sources cannot be opened: why, and when each is tried again."""
 
 from __future__ import annotations
 
@@ -7,11 +7,15 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import TYPE_CHECKING
 
 from runner.errors import RunError
 from runner.graph import Plan
 from runner.gst.aside import HUNG_STARTING, change_in_thread
 from runner.system.backoff import pause_s
+
+if TYPE_CHECKING:
+    from runner.sound import SoundPlan
 
 BACKOFF_S = (1.0, 10.0)  # between two attempts: doubled from the first value up to the second
 POLL_S = 0.25
@@ -41,12 +45,12 @@ class LostCameras:
 
     def __init__(
         self,
-        plans: Sequence[Plan],
+        plans: Sequence[Plan | SoundPlan],
         lost: Mapping[str, str],
-        problem: Callable[[Plan], str | None],
+        problem: Callable[[Plan | SoundPlan], str | None],
         on_found: Callable[[str], None],
     ) -> None:
-        self._plans, self._problem, self._on_found = {plan.camera.name: plan for plan in plans}, problem, on_found
+        self._plans, self._problem, self._on_found = {plan.name: plan for plan in plans}, problem, on_found
         self._changed = threading.Condition()
         due = time.monotonic() + BACKOFF_S[0]
         self._losses = {name: _Loss(why, due, is_tested=True) for name, why in lost.items()}

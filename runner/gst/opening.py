@@ -23,7 +23,9 @@ from runner.settings import Media
 
 if TYPE_CHECKING:
     from runner.gst.patient_media import PatientMedia
+    from runner.gst.sound_pipeline import SoundPipeline
     from runner.gst.uplinks import CameraUplinks
+    from runner.sound import SoundPlan
 
 OPEN_S = 0.9  # a request for a camera that delivers nothing within this is answered 503; the camera continues to open
 OPENING_S = 0.02  # between two looks whether an IP camera has answered
@@ -62,9 +64,9 @@ class _Opening:
 class ServedCamera:
     """One mount point and its pipeline, if built."""
 
-    def __init__(self, plan: Plan, factory: CameraFactory, url: str) -> None:
+    def __init__(self, plan: Plan | SoundPlan, factory: CameraFactory, url: str) -> None:
         self.plan, self.factory = plan, factory
-        self.name = plan.camera.name
+        self.name = plan.name
         self.url = GstRtsp.RTSPUrl.parse(url)[1]
         self.media: GstRtspServer.RTSPMedia | None = None
         self.stage = _Stage.NONE
@@ -78,7 +80,7 @@ class ServedCamera:
 
 
 class ServedCameras:
-    """The cameras of the server by name, each with its pipeline, if built.
+    """The cameras of the server by name, and the sound, each with its pipeline, if built.
 
     permissions  of viewers; None: anyone may watch, and nothing is encrypted
     stopped      set when the server stops
@@ -86,7 +88,7 @@ class ServedCameras:
 
     def __init__(
         self,
-        plans: Sequence[Plan],
+        plans: Sequence[Plan | SoundPlan],
         media: Media,
         openings: Openings,
         permissions: GstRtspServer.RTSPPermissions | None,
@@ -97,13 +99,11 @@ class ServedCameras:
         self._clients, self._changed, self._stopped = clients, clients.changed, stopped  # notified of a new stage, too
         self.threads = GstRtspServer.RTSPThreadPool()
         self.threads.set_max_threads(-1)  # one per client
-        self.pipelines: dict[str, CameraPipeline] = {}
+        self.pipelines: dict[str, CameraPipeline | SoundPipeline] = {}
         self._holds: list[tuple[float, GstRtspServer.RTSPClient, GstRtspServer.RTSPMedia]] = []
         addresses = address_pool(media)
         self.named = {
-            plan.camera.name: ServedCamera(
-                plan, CameraFactory(plan, addresses, permissions), rtsp_url(media, plan.camera.name)
-            )
+            plan.name: ServedCamera(plan, CameraFactory(plan, addresses, permissions), rtsp_url(media, plan.name))
             for plan in plans
         }
         for camera in self.named.values():
@@ -149,7 +149,9 @@ class ServedCameras:
                 camera.stage = _Stage.ENDING
                 self._changed.notify_all()
 
-    def _on_unprepared(self, media: GstRtspServer.RTSPMedia, camera: ServedCamera, pipeline: CameraPipeline) -> None:
+    def _on_unprepared(
+        self, media: GstRtspServer.RTSPMedia, camera: ServedCamera, pipeline: CameraPipeline | SoundPipeline
+    ) -> None:
         with self._changed:
             if camera.media is media:
                 camera.media = camera.bus = None

@@ -29,8 +29,10 @@ from runner.records.vehicle import NOTHING_ENCODED, EncoderCounts, SenderStages
 if TYPE_CHECKING:
     from runner.gst.passed import PassedStream
     from runner.gst.pushed import PushedPictures
+    from runner.gst.sound_pipeline import SoundPipeline
     from runner.gst.uplinks import CameraUplinks, VehicleUplinks
     from runner.ros.cameras import SharedPicture
+    from runner.sound import SoundPlan
 
 OnReport = Callable[[str, str], None]  # camera, what happened to it
 SRT_KEY_BYTES = 32  # AES-256
@@ -44,20 +46,20 @@ _NOT_RECONFIGURED = TypeProbe(Gst.PadProbeType.EVENT_UPSTREAM, {Gst.EventType.RE
 # A camera is reported as not seekable, by answering the query unchanged. The RTSP server relies on the source's answer:
 # it would seek a clip or a test picture for every PLAY with a Range, Scale or Speed, flush the stream of all viewers,
 # and wait for a frame that a closed gate never passes.
-_NOT_SEEKABLE = TypeProbe(Gst.PadProbeType.QUERY_UPSTREAM, {Gst.QueryType.SEEKING: Gst.PadProbeReturn.HANDLED})
+NOT_SEEKABLE = TypeProbe(Gst.PadProbeType.QUERY_UPSTREAM, {Gst.QueryType.SEEKING: Gst.PadProbeReturn.HANDLED})
 
 
 class Openings(NamedTuple):
     """How cameras are opened.
 
-    build      makes a `CameraPipeline` from each new pipeline
+    build      makes a `CameraPipeline` from each new pipeline, or a `SoundPipeline`
     lost       those that do not open: each is opened again when that is due
     on_report  called when pipelines start, stop or fail, and when viewers are disconnected
     refusal    returns why a camera must not be opened now; None: it may
     uplinks    of the vehicle; None: the system's routes decide by which way streams leave it
     """
 
-    build: Callable[[Gst.Bin, Plan], CameraPipeline]
+    build: Callable[[Gst.Bin, Plan | SoundPlan], CameraPipeline | SoundPipeline]
     lost: LostCameras
     on_report: OnReport
     refusal: Callable[[str], str | None]
@@ -117,13 +119,13 @@ class CameraPipeline:
         payloader = next((element for element in self._elements if isinstance(element, GstRtp.RTPBasePayload)), None)
         self.sent_frames = SentFrames(payloader) if payloader else None
         if payloader:
-            _add_capture_time(payloader)
+            add_capture_time(payloader)
         self.knobs.set_now(self._allowed(self._first))
         self._held_up = HeldUp(last)
         self.requests = RequestLimit(last, on_report)
         self._first_packet = BufferProbe(last, self._on_first_packet, in_lists=True)
         self._first_packet.arm()
-        for each in (_NOT_SEEKABLE, _NOT_RECONFIGURED):
+        for each in (NOT_SEEKABLE, _NOT_RECONFIGURED):
             each.add_to(last)
 
     def _passed_stream(self) -> PassedStream | None:
@@ -253,11 +255,7 @@ class CameraPipeline:
 
     def drop_queued_packet(self) -> None:
         """Drop the packet queued for an interleaved viewer, if any."""
-        pipeline = self._pipeline
-        while parent := pipeline.get_parent():
-            pipeline = parent
-        sinks = pipeline.iterate_all_by_element_factory_name("appsink")
-        sinks.foreach(lambda sink: sink.emit("try-pull-sample", 0))
+        drop_queued_packet(self._pipeline)
 
     def send_key_frame(self, *, begin_anew: bool = False) -> None:
         """Make the encoder send a key frame next, if the graph states how.
@@ -293,11 +291,19 @@ class CameraPipeline:
         return True
 
 
-def _add_capture_time(payloader: Gst.Element) -> None:
+def add_capture_time(payloader: Gst.Element) -> None:
     """Make room for the capture time in the first packet of each frame. An rtpsession after it fills in the time."""
     extension = GstRtp.RTPHeaderExtension.create_from_uri(CAPTURE_TIME)
     extension.set_id(CAPTURE_ID)
     payloader.emit("add-extension", extension)
+
+
+def drop_queued_packet(pipeline: Gst.Bin) -> None:
+    """Drop the packet that the server's sinks around a pipeline hold for an interleaved viewer, if any."""
+    while parent := pipeline.get_parent():
+        pipeline = parent
+    sinks = pipeline.iterate_all_by_element_factory_name("appsink")
+    sinks.foreach(lambda sink: sink.emit("try-pull-sample", 0))
 
 
 def _count_before(encoder: Gst.Element) -> Gst.Element:

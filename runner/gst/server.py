@@ -37,6 +37,7 @@ from runner.system.reports import LimitedReports
 if TYPE_CHECKING:
     from runner.gst.secure import ViewerCheck
     from runner.security.keyring import Keyring
+    from runner.sound import SoundPlan
 
 BACKLOG = 128  # connections waiting to be accepted; with the library's 5, further viewers would retry after 1 s
 MAX_BODY_BYTES = 65_536  # of a request; the library's limit is 4 GB ...
@@ -57,12 +58,14 @@ NO_CERTIFICATE, NO_PASSWORD, WRONG_PASSWORD = (
 
 
 class CameraServer:
-    """RTSP server with one mount point per camera, and a second one with feedback, which our own receivers use.
+    """RTSP server with mount points for the sound and for each camera: one plain, one with feedback for our receivers.
 
     keyring  of this vehicle; None: anyone may watch, and nothing is encrypted
     """
 
-    def __init__(self, plans: Sequence[Plan], media: Media, openings: Openings, keyring: Keyring | None) -> None:
+    def __init__(
+        self, plans: Sequence[Plan | SoundPlan], media: Media, openings: Openings, keyring: Keyring | None
+    ) -> None:
         check_port_free(media)
         on_report = openings.on_report
         self._keys: ViewerCheck | None = None
@@ -229,7 +232,7 @@ class CameraServer:
         name = camera_name(context)
         connection.cameras[name] = context.trans
         if context.trans.get_transport().lower_transport & GstRtsp.RTSPLowerTrans.TCP:
-            connection.carry_video(self._cameras.named[name].plan.camera.graph.settings.dscp)
+            connection.carry_video(self._cameras.named[name].plan.settings.dscp)
             if name in connection.refused_udp:
                 first, last = self._media.rtp_ports
                 is_ipv4_at_ipv6 = "." in connection.viewer.address and ":" in ip_address_of(self._media.host)

@@ -213,8 +213,10 @@ class CameraCaller:
         if self._passphrase:
             self._used = self._passphrase()
             encrypt(pipeline, self._used)
-        self.pipeline = self._build(pipeline, self._plan)
-        self.pipeline.catch_up()
+        built = self._build(pipeline, self._plan)
+        assert isinstance(built, CameraPipeline)
+        self.pipeline = built
+        built.catch_up()
         caller = pipeline.get_by_name(self._plan.vehicle[-1].name)
         self._acknowledgements = _AcknowledgementWatch(caller)
         return caller.get_static_pad("sink")

@@ -76,6 +76,16 @@ class CameraState(CameraDecision):
 
 
 @dataclass(frozen=True, slots=True)
+class SoundState:
+    """The vehicle's sound."""
+
+    fault: Annotated[str | None, "why its source does not open; None: it does, or nobody listens"] = None
+    refused: Annotated[
+        Mapping[str, str] | UnsetType, "by operator that is refused it, why, in words; absent: none is"
+    ] = UNSET
+
+
+@dataclass(frozen=True, slots=True)
 class VehicleState:
     """State of a vehicle that is online."""
 
@@ -99,6 +109,7 @@ class VehicleState:
         Mapping[str, int] | UnsetType,
         "by camera, how many leave the vehicle, if more than one: together they have the total; absent: one of each",
     ] = UNSET
+    sound: Annotated[SoundState | UnsetType, "absent: the vehicle sends none"] = UNSET
 
     @property
     def total_words(self) -> str:
@@ -183,6 +194,7 @@ class Telemetry:
     errors: Annotated[Count, "exceptions caught by the control loop since the start"] = 0
     speed_factor: Annotated[Share | None, "as in `SpeedAdvice`; None: not advised"] = None
     uplinks: Annotated[Mapping[str, UplinkTelemetry] | UnsetType, "by uplink; absent: there is one"] = UNSET
+    sound: Annotated[EncoderCounts | UnsetType, "packets of sound and their bytes; absent: it sends none"] = UNSET
 
 
 @dataclass(frozen=True, slots=True)
@@ -278,6 +290,19 @@ class CameraReading(NamedTuple):
     lost: str | None = None
     untimed: bool = False
     slow_fps: int | None = None
+    copies: int = 0
+    refused: Mapping[str, str] = NOTHING
+
+
+class SoundReading(NamedTuple):
+    """What is known of the vehicle's sound; without a pipeline, as the defaults.
+
+    encoded  packets and their bytes
+    others   as in `CameraReading`
+    """
+
+    encoded: EncoderCounts = NOTHING_ENCODED
+    lost: str | None = None
     copies: int = 0
     refused: Mapping[str, str] = NOTHING
 

@@ -27,7 +27,6 @@ from runner.core.driving import Driving
 from runner.core.model import Progress
 from runner.drive.log import Log, check_free
 from runner.errors import RunError, UserError
-from runner.graph import rtsp_url
 from runner.metrics.side import SideMetrics
 from runner.mqtt.link import ControlLink, login_of
 from runner.mqtt.messages import (
@@ -43,7 +42,7 @@ from runner.mqtt.messages import (
     run_of,
     topic,
 )
-from runner.plans import as_offered, compile_plans, drive_steering, render_missing
+from runner.plans import as_offered, compile_plans, drive_steering, render_missing, sound_plan, stream_addresses
 from runner.records import to_json
 from runner.records.vehicle import ClockAnswer, Outcome, Settings, SpeedAdvice, SteeringAngle, Telemetry, VehicleState
 from runner.security.exposure import may_listen, vehicle_keyring
@@ -435,14 +434,14 @@ def live_vehicle(
     keyring = vehicle_keyring(setup)
     _check_ros(setup)
     render_missing(setup.vehicle, progress)
-    plans = compile_plans(setup)
-    lost, missing = apply.check_machine(plans, strict=setup.strict), missing_devices(setup)
+    plans, sound = compile_plans(setup), sound_plan(setup)
+    lost, missing = apply.check_machine(plans, sound, strict=setup.strict), missing_devices(setup)
     if log and setup.strict:
         check_free(log, "vehicle")
     console = _Console(say)
     with ExitStack() as ending:  # in reverse order, also of a vehicle that cannot start
         ending.callback(console.close)
-        versions = apply.versions(e for p in plans for e in (*p.source, *p.vehicle))
+        versions = apply.versions(e for p in (*plans, sound) if p for e in (*p.source, *p.vehicle))
         drive = Log(log, "vehicle", document if log else {}, versions, console.say)
         ending.callback(drive.close)
 
@@ -462,6 +461,7 @@ def live_vehicle(
             lost,
             setup.uplinks,
             partial(may_listen, setup),
+            sound,
         )
         ending.callback(side.stop)
         ending.enter_context(_embedded_broker(setup, report))
@@ -487,7 +487,6 @@ def live_vehicle(
             ros.start(patient=not setup.strict)
         metrics.serve(live.problem, control.link)
         control.connect(live)
-        for plan in plans:
-            address = rtsp_url(setup.media, plan.camera.name) if plan.serves else "connects to the operator"
-            console.say(f"{plan.camera.name}: {address}")
+        for line in stream_addresses(setup.media, plans, sound):
+            console.say(line)
         yield live

@@ -33,7 +33,7 @@ from runner.core.roles import CONTROL_EVENTS, STOP_REQUESTED
 from runner.core.step import Run, start, step
 from runner.pqos import Predictions
 from runner.records.reception import ReceptionReport, ReceptionReported, SentFrame, UplinkSent
-from runner.records.vehicle import CameraReading, CameraTelemetry, Outcome, SenderStages, Telemetry
+from runner.records.vehicle import CameraTelemetry, Outcome, SenderStages, Telemetry
 from runner.schema import event_problem
 from runner.settings import Setup
 from runner.system.held_up import LateCheck
@@ -46,6 +46,7 @@ from runner.vehicle.inbox import MAX_QUEUED, Answer, Inbox, Item, QueuedReport, 
 from runner.vehicle.noticed import Streams, copies_events, presence_events, source_events
 from runner.vehicle.operators import SILENT_S, Operators
 from runner.vehicle.publishing import Publish, Publisher
+from runner.vehicle.readings import Reader, Readings
 from runner.vehicle.refusals import Refusals
 from runner.vehicle.repair import KeyFrames, cut_off
 from runner.vehicle.replies import Replies
@@ -61,11 +62,10 @@ ASKED_BY = CONTROL_EVENTS | {"control_taken"}  # events that say which operator 
 TELEMETRY_TICKS = 2  # also the vehicle's heartbeat
 
 
-class Applier(Protocol):
+class Applier(Reader, Protocol):
     """What the loop needs from the streaming side."""
 
     def turn(self, commands: Iterable[Command]) -> None: ...
-    def read(self) -> Mapping[str, CameraReading]: ...
     def stages(self) -> Mapping[str, SenderStages]: ...
     def sent_frames(self) -> Mapping[str, Iterable[SentFrame]]: ...
     def sent(self) -> Mapping[str, Mapping[str, UplinkSent]]: ...
@@ -116,7 +116,8 @@ class ControlLoop:
 
     def __post_init__(self) -> None:
         self.vehicle = self.setup.vehicle
-        self._cameras: Mapping[str, CameraReading] = dict.fromkeys(self.vehicle.cameras, CameraReading())
+        has_sound = self.vehicle.sound is not None
+        self._readings = Readings(self.applier, self.vehicle.cameras, self.on_report, has_sound=has_sound)
         self._inbox = Inbox()
         self.refusals = Refusals(self._now, self._inbox.is_full, self.on_report)
         self._operators, self._attention = Operators(self.setup.expires_s), StatedAttention()
@@ -168,8 +169,8 @@ class ControlLoop:
         self.listener.begin()
         self._warned = set[str]()
         self._run = start(self.vehicle)
-        self._guarded("cameras", self._read)
-        self._guarded("sources", lambda: self._notice(source_events(self._run.state, self._cameras, 0.0)))
+        self._guarded("cameras", self._readings.read)
+        self._guarded("sources", lambda: self._notice(source_events(self._run.state, self._readings.cameras, 0.0)))
         self._guarded("start", lambda: self._take(ClockAdvanced(t=0.0)))
         if any(self.former):
             holder, stop = self.former
@@ -213,10 +214,10 @@ class ControlLoop:
         if self.steering is not None:
             self._guarded("steering_reported", lambda: self._steer(t))
         self._guarded("clock_advanced", lambda: self._take(ClockAdvanced(t=t)))
-        self._guarded("cameras", self._read)
-        self._guarded("sources", lambda: self._notice(source_events(self._run.state, self._cameras, t)))
-        self._guarded("copies_counted", lambda: self._notice(copies_events(self._run.state, self._cameras, t)))
-        self._guarded("streams", lambda: self._notice(self._streams.events(self._run.state, self._cameras, t)))
+        self._guarded("cameras", self._readings.read)
+        self._guarded("sources", lambda: self._notice(source_events(self._run.state, self._readings.cameras, t)))
+        self._guarded("copies_counted", lambda: self._notice(copies_events(self._run.state, self._readings.streams, t)))
+        self._guarded("streams", lambda: self._notice(self._streams.events(self._run.state, self._readings.cameras, t)))
         if self._ticks % TELEMETRY_TICKS == 0:
             self._guarded("telemetry", lambda: self._publish_measured(t))
         self._guarded("operators", lambda: self._watch_operators(t))
@@ -228,9 +229,6 @@ class ControlLoop:
             return  # somebody else steers
         self._steered = SteeringReported(t=t, rad=self.steering(self._began + t))
         self._take(self._steered)
-
-    def _read(self) -> None:
-        self._cameras = self.applier.read()
 
     def _notice(self, events: Iterable[Event]) -> None:
         for event in events:
@@ -379,7 +377,7 @@ class ControlLoop:
             self.on_report(now.why)
         self._guarded("driving", lambda: self.on_driving(now))
         if now.drivers != before.drivers:
-            self._notice(copies_events(self._run.state, self._cameras, t))
+            self._notice(copies_events(self._run.state, self._readings.streams, t))
             self._guarded("control", lambda: self.applier.give_control(now.drivers))
         if now.in_control != before.in_control:
             self._take(ControlPassed(t=t, operator=now.in_control))
@@ -420,15 +418,15 @@ class ControlLoop:
         now = self._now()
         if not (self._replies.is_awaited or self._publisher.is_state_due(now)):
             return
-        self._read()
-        self._publisher.state(self._run, self._cameras, now, has_viewer=bool(self._operators.present))
-        self._replies.settle(self._run, self._cameras, now)
+        self._readings.read()
+        self._publisher.state(self._run, self._readings, now, has_viewer=bool(self._operators.present))
+        self._replies.settle(self._run, self._readings.cameras, now)
 
     def _publish_measured(self, t: float) -> None:
         addresses = {name: addresses_by(each) for name, each in self.setup.uplinks.items()}
         sent = self.applier.sent() if addresses else {}
         telemetry = self._publisher.telemetry(
-            self._run, t, self._cameras, self.applier.stages(), self.refusals.count, self.errors, addresses, sent
+            self._run, t, self._readings, self.applier.stages(), self.refusals.count, self.errors, addresses, sent
         )
         self.listener.record(telemetry)
         self.publish(replace(telemetry, cameras=dict(_unsent(telemetry))) if sent else telemetry)

@@ -22,7 +22,7 @@ from runner.core.events import (
 from runner.core.model import Kbps
 from runner.core.roles import Role
 from runner.core.state import State
-from runner.records.vehicle import CameraReading
+from runner.records.vehicle import CameraReading, SoundReading
 
 STREAM_S = 4.0  # over which a stream is measured: many cameras send a key picture every two seconds
 LEAST_S = 2.0  # of these, before anything is said
@@ -90,13 +90,13 @@ class Streams:
                 yield StreamMeasured(t=t, camera=name, kbps=kbps)
 
 
-def copies_events(known: State, cameras: Mapping[str, CameraReading], t: float) -> Iterator[Event]:
-    """How many copies of each camera's stream leave the vehicle.
+def copies_events(known: State, streams: Mapping[str, CameraReading | SoundReading], t: float) -> Iterator[Event]:
+    """How many copies of each camera's stream, and of the sound, leave the vehicle.
 
     One for the operator to whom control is offered counts from the offer on: the uplink has room before it begins.
     """
     least = len(known.driving.drivers)
-    numbers = {name: max(camera.copies, least) if camera.copies else 0 for name, camera in cameras.items()}
+    numbers = {name: max(each.copies, least) if each.copies else 0 for name, each in streams.items()}
     copies = {name: number for name, number in numbers.items() if number > 1}
     if copies != known.copies:
         yield CopiesCounted(t=t, copies=copies)

@@ -20,6 +20,7 @@ from runner.records.vehicle import (
     CameraTelemetry,
     Position,
     SenderStages,
+    SoundState,
     SpeedAdvice,
     SteeringAngle,
     Telemetry,
@@ -28,6 +29,7 @@ from runner.records.vehicle import (
     VehicleState,
 )
 from runner.settings import LatencyLimit
+from runner.vehicle.readings import Readings
 
 STATE_S = 0.2  # between two states, unless a request waits for its answer: each takes some kB of a limited link
 REASONS_S, UNSEEN_REASONS_S = 1.0, 10.0  # between two that differ in reasons only; the second without an operator
@@ -63,12 +65,14 @@ class Publisher:
         """Whether to publish the state if it has changed."""
         return self._published is None or self.again or now - self._published.t >= STATE_S
 
-    def state(self, run: Run, cameras: Mapping[str, CameraReading], now: float, *, has_viewer: bool) -> None:
+    def state(self, run: Run, readings: Readings, now: float, *, has_viewer: bool) -> None:
         """Publish the decided and the applied values if either has changed.
 
         has_viewer  whether an operator is present
         """
-        state = vehicle_state(run, cameras, now, self.cause)
+        state = vehicle_state(run, readings.cameras, now, self.cause)
+        if (sound := readings.sound) is not None:
+            state = replace(state, sound=SoundState(sound.lost, sound.refused or UNSET))
         if self._is_news(state, REASONS_S if has_viewer else UNSEEN_REASONS_S) and self.publish(state):
             self.again, self._published = False, state
 
@@ -85,7 +89,7 @@ class Publisher:
         self,
         run: Run,
         t: float,
-        cameras: Mapping[str, CameraReading],
+        readings: Readings,
         stages: Mapping[str, SenderStages],
         refused: int,
         errors: int,
@@ -105,14 +109,15 @@ class Publisher:
                 applied=applied_to_json(name, camera.applied),
                 sent=sent.get(name, UNSET),
             )
-            for name, camera in cameras.items()
+            for name, camera in readings.cameras.items()
         }
         known = run.state.predicted_kbps
         predicted = None if known is None else plain(known)
         position, factor = self._current_position(t), self._speed_factor(run, t)
         links = run.state.links
         uplinks = {name: UplinkTelemetry(own, _measured(links.get(name))) for name, own in addresses.items()}
-        return Telemetry(t, predicted, position, measured, refused, errors, factor, uplinks or UNSET)
+        sound = UNSET if readings.sound is None else readings.sound.encoded
+        return Telemetry(t, predicted, position, measured, refused, errors, factor, uplinks or UNSET, sound)
 
     def _current_position(self, t: float) -> Position | None:
         """The position, while it is not stale; its speed becomes stale earlier."""

@@ -12,7 +12,7 @@ from runner.apply import Reception
 from runner.core.commands import Command, KnobValue
 from runner.graph import Plan
 from runner.records.reception import Arrivals, SentFrame, UplinkReceived, UplinkSent
-from runner.records.vehicle import CameraReading, EncoderCounts, SenderStages
+from runner.records.vehicle import CameraReading, EncoderCounts, SenderStages, SoundReading
 
 FRAMES = 5  # delivered by a sending camera between two samples
 FRAME_BYTES = 1000
@@ -67,6 +67,9 @@ class RecordingVehicle:
             name: CameraReading(knobs, encoded(self._sent[name]), lost=self.lost.get(name))
             for name, knobs in applied.items()
         }
+
+    def read_sound(self) -> SoundReading:
+        return SoundReading()
 
     def stages(self) -> dict[str, SenderStages]:
         return {}

@@ -105,6 +105,14 @@ export interface UplinkDecision {
   believed?: Believed;
 }
 
+/** The vehicle's sound */
+export interface SoundState {
+  /** why its source does not open; null: it does, or nobody listens */
+  fault: string | null;
+  /** by operator that is refused it, why, in words; absent: none is */
+  refused?: Record<string, string>;
+}
+
 /** State of a vehicle that is online */
 export interface VehicleState {
   /** s since the start of the run, or of the log that contains this */
@@ -136,6 +144,8 @@ export interface VehicleState {
   uplinks?: Record<string, UplinkDecision>;
   /** by camera, how many leave the vehicle, if more than one: together they have the total; absent: one of each */
   copies?: Record<string, number>;
+  /** absent: the vehicle sends none */
+  sound?: SoundState;
 }
 
 /** Position of the vehicle; None: unknown */

@@ -1,0 +1,74 @@
+"""The pipeline of the vehicle's sound, as the RTSP server serves it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from gi.repository import Gst
+
+from runner.graph import launch
+from runner.gst.pipeline import NOT_SEEKABLE, add_capture_time, drop_queued_packet, passed_counts
+from runner.gst.requests import RequestLimit
+from runner.records.vehicle import NOTHING_ENCODED, EncoderCounts
+from runner.sound import SoundPlan
+
+if TYPE_CHECKING:
+    from runner.gst.uplinks import CameraUplinks
+
+CHECK_S = 2.0  # how long a source may take to start when it is tried
+
+
+class SoundPipeline:
+    """Beside cameras' pipelines at the server; nothing of it changes while it plays.
+
+    on_report  called, from any thread, with requests of viewers beyond their limit
+    uplinks    None: the system's routes decide
+    """
+
+    is_opening = paused = False
+    source_fault = None
+
+    def __init__(
+        self, pipeline: Gst.Bin, plan: SoundPlan, on_report: Callable[[str], None], uplinks: CameraUplinks | None
+    ) -> None:
+        self._pipeline, self.uplinks = pipeline, uplinks
+        self.frame_s, self.kbps = plan.packet_ms / 1000, int(plan.wire_kbps)
+        self._sent = pipeline.get_by_name("sent")  # None: nothing is counted
+        payloader = pipeline.get_by_name(plan.vehicle[-1].name)
+        add_capture_time(payloader)
+        last = payloader.get_static_pad("src")
+        self.requests = RequestLimit(last, on_report)
+        NOT_SEEKABLE.add_to(last)
+
+    def catch_up(self) -> None:
+        """It has no knobs."""
+
+    def has_waited(self, seconds: float) -> bool:
+        return False
+
+    def counters(self) -> EncoderCounts:
+        """What the encoder has output so far, counted in C."""
+        return EncoderCounts(*passed_counts(self._sent)) if self._sent else NOTHING_ENCODED
+
+    def drop_queued_packet(self) -> None:
+        """Drop the packet queued for an interleaved viewer, if any."""
+        drop_queued_packet(self._pipeline)
+
+    def send_key_frame(self) -> None:
+        """Each packet can be decoded by itself."""
+
+
+def sound_problem(plan: SoundPlan) -> str | None:
+    """Why the source of sound does not open; None if it opens. Devices open on the way to PAUSED at the latest."""
+    pipeline = Gst.parse_launch(f"{launch(plan.source)} ! fakesink")
+    try:
+        changed = pipeline.set_state(Gst.State.PAUSED)
+        if changed is Gst.StateChangeReturn.ASYNC:
+            changed = pipeline.get_state(round(CHECK_S * Gst.SECOND))[0]
+        if changed in (Gst.StateChangeReturn.SUCCESS, Gst.StateChangeReturn.NO_PREROLL):
+            return None
+        message = pipeline.get_bus().pop_filtered(Gst.MessageType.ERROR)
+        return str(message.parse_error()[0].message) if message else "its source does not start"
+    finally:
+        pipeline.set_state(Gst.State.NULL)
