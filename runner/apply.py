@@ -60,6 +60,7 @@ if TYPE_CHECKING:
     from runner.gst.secure import StreamLogin
     from runner.gst.sequence import discover
     from runner.gst.sound_pipeline import SoundPipeline
+    from runner.gst.sound_receiver import OnSamples, OnSound, SoundPacket, SoundReceiver, SoundReception
     from runner.gst.video_reader import Unit, read_video
     from runner.ros.cameras import SharedPicture
     from runner.security.keyring import Keyring
@@ -68,11 +69,14 @@ if TYPE_CHECKING:
 __all__ = [
     "LIVE",
     "TYPELIBS",
+    "OnSound",
     "OnUnit",
     "OperatorSide",
     "Reception",
     "Recorded",
     "RecordingSide",
+    "SoundPacket",
+    "SoundReception",
     "Stage",
     "Unit",
     "VehicleSide",
@@ -92,8 +96,11 @@ __all__ = [
     "write_clip",
 ]
 
-OFFLINE = {  # by name, its module
+SELDOM = {  # by name, its module
     "RecordingSide": "recording_side",
+    "OnSound": "sound_receiver",
+    "SoundPacket": "sound_receiver",
+    "SoundReception": "sound_receiver",
     "decode_video": "pictures",
     "discover": "sequence",
     "parameter_set_notes": "parameter_sets",
@@ -365,6 +372,9 @@ class OperatorSide:
     vehicle     its name, which its certificate must state
     uplinks     addresses of the vehicle by uplink, as far as known; None: it has one way
     cameras     those to receive until `receive` names others; None: all
+    sound       received while any camera is; None: there is none
+    on_sound    called, from its streaming thread, with each packet of it
+    on_samples  called, from its streaming thread, with what is decoded of it
     raises      RunError if a plugin that `video` needs is not installed
     """
 
@@ -381,6 +391,9 @@ class OperatorSide:
         vehicle: str = "",
         uplinks: Addresses | None = None,
         cameras: Collection[str] | None = None,
+        sound: SoundPlan | None = None,
+        on_sound: OnSound | None = None,
+        on_samples: OnSamples | None = None,
     ) -> None:
         plans = with_video(plans, video, "operator")
         self._glib = GlibThread()
@@ -400,6 +413,12 @@ class OperatorSide:
         }
 
         self._running: Mapping[str, Receiver] = {}  # replaced as a whole: other threads read it
+        self._sound: SoundReceiver | None = None
+        self._hears = False  # whether it is received
+        if sound:
+            kind: Any = import_module("runner.gst.sound_receiver").SoundReceiver
+            self._sound = kind(sound, reports, on_sound, on_samples, operator, login(), uplinks)
+        self.sound: SoundReception | None = None  # as last sampled; None: there is none
 
         def start() -> None:
             self._run(frozenset(self._receivers if cameras is None else cameras))
@@ -418,16 +437,22 @@ class OperatorSide:
         self._running = running
         for name in before.keys() - running.keys():
             self._receivers[name].stop()
+        heard, self._hears = self._hears, bool(running)
+        if self._sound and self._hears != heard:
+            (self._sound.start if self._hears else self._sound.stop)()
 
     def sample(self, sending: Mapping[str, bool], anew: bool = False) -> dict[str, Reception]:
-        """Reception of each camera; to be called a few times a second.
+        """Reception of each camera, and of the sound, which is `sound` then; to be called a few times a second.
 
-        sending  which cameras should send; a silent one that should is rebuilt. Unknown ones are omitted
+        sending  which cameras should send, likewise the sound; a silent one that should is rebuilt. Unknown: omitted
         anew     ask at once for those that the vehicle has refused: it may decide otherwise now
         raises   RunError if GStreamer hangs
         """
 
         def sample() -> dict[str, Reception]:
+            if self._sound:
+                hears = self._hears
+                self.sound = self._sound.sample(sending.get(SOUND), anew) if hears else self._sound.stopped_at
             return {
                 name: receiver.sample(sending.get(name), anew) if name in self._running else receiver.stopped_at
                 for name, receiver in self._receivers.items()
@@ -437,7 +462,7 @@ class OperatorSide:
 
     def admit(self, uplinks: Addresses) -> None:
         """Receive from these addresses of the vehicle, by uplink, and from no others. From any thread."""
-        for receiver in self._receivers.values():
+        for receiver in (*self._receivers.values(), *((self._sound,) if self._sound else ())):
             receiver.admit(uplinks)
 
     def received(self) -> dict[str, dict[str, UplinkReceived]]:
@@ -464,7 +489,7 @@ class OperatorSide:
 if not TYPE_CHECKING:
 
     def __getattr__(name: str) -> Any:
-        """What is used offline only, and not loaded while driving."""
-        if name not in OFFLINE:
+        """What is used offline only, or with sound only, and not loaded otherwise."""
+        if name not in SELDOM:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        return getattr(import_module(f"runner.gst.{OFFLINE[name]}"), name)
+        return getattr(import_module(f"runner.gst.{SELDOM[name]}"), name)

@@ -112,5 +112,5 @@ def _check_names(sound: Sound) -> None:
     if sound.vehicle[-1].name != "pay0":
         key = f"vehicle[{len(sound.vehicle) - 1}].name"
         raise ModelError(key, repr(sound.vehicle[-1].name), "must be pay0, as the RTSP server requires")
-    if "received" not in (element.name for element in sound.operator):
-        raise ModelError("operator", None, "must have an identity named received, behind the depayloader")
+    if "depay" not in (element.name for element in sound.operator):
+        raise ModelError("operator", None, "must have a depayloader named depay, in front of which packets are counted")

@@ -42,7 +42,7 @@ def loaded(*words: str) -> tuple[int, set[str]]:
 RUNNING = {  # modules of the project and heavy packages; `validate` reads maps and queries GStreamer's registry
     "print": (56, COMPOSING),
     "replay": (63, COMPOSING),
-    "validate": (133, COMPOSING | {"numpy", "gi", "asyncio"}),  # asyncio: by PyGObject from 3.50 on
+    "validate": (136, COMPOSING | {"numpy", "gi", "asyncio"}),  # asyncio: by PyGObject from 3.50 on
 }
 HELP = {
     "vehicle": {"paho"},

@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 import json
+from argparse import Namespace
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import pytest
 from helpers import Command, Drive, UserConf
+from msgspec import UNSET, UnsetType
 
 from runner.configuration.config import configuration
 from runner.core.budget import sound_kbps
 from runner.core.events import parse
+from runner.core.model import Mode
 from runner.core.step import step
+from runner.operator.notes import change_notes
+from runner.operator.sound import UNEXPLAINED, sound_sample, sound_words
 from runner.plans import sound_plan
+from runner.records.vehicle import SoundState, VehicleState
+from runner.system.clocks import ClockDifference
 
 WIRE = Fraction("50.4")  # 60 bytes of Opus and 66 of headers, 50 times a second
 
@@ -154,3 +162,49 @@ def test_without_sound_no_copies_of_it_are_known() -> None:
     drive = Drive("modes=paper")
     event = parse({"t": 0, "event": "copies_counted", "copies": {"sound": 2}})
     assert step(drive.vehicle, drive.run, event).refused
+
+
+# --- what the operator reads ------------------------------------------------------------------------------------------
+
+
+def stated(**keys: Any) -> VehicleState:
+    return VehicleState(1.0, "", Mode.AUTOMATIC, 0, 0, {}, **keys)
+
+
+RECEIVED = Namespace(
+    packets=100, bytes=6000, lost=3, level_db=-15.04, latency_ms=52.26, foreign=0, rebuilt=1, refused=False
+)
+CLOCK = ClockDifference(ahead_s=-0.006, bound_s=0.001)
+
+
+@pytest.mark.parametrize(
+    ("received", "sound", "words"),
+    [
+        ({}, SoundState(), "sound: 46 ms old, -15 dB, 3 packets lost"),
+        ({"level_db": None}, SoundState(), "sound: nothing arrives"),
+        ({"level_db": None}, SoundState("no such device"), "sound: no such device"),
+        (
+            {"refused": True},
+            SoundState(refused={"anna": "one viewer per camera"}),
+            "sound: refused by the vehicle: one viewer per camera",
+        ),
+        ({"refused": True}, SoundState(), f"sound: refused by the vehicle: {UNEXPLAINED}"),
+        ({"latency_ms": None}, SoundState(), "sound: age unknown, -15 dB, 3 packets lost"),
+    ],
+)
+def test_the_table_has_a_line_for_it(received: dict[str, Any], sound: SoundState, words: str) -> None:
+    sample = sound_sample(Namespace(**{**vars(RECEIVED), **received}), stated(sound=sound), CLOCK, "anna")
+    assert not isinstance(sample, UnsetType)
+    assert sound_words(sample) == words
+
+
+def test_a_side_without_sound_states_none() -> None:
+    assert sound_sample(None, stated(), CLOCK, "anna") is UNSET
+
+
+def test_a_lost_source_is_noted_once() -> None:
+    works, lost = stated(sound=SoundState()), stated(sound=SoundState("no such device"))
+    assert list(change_notes(works, lost)) == ["sound lost: no such device"]
+    assert list(change_notes(lost, lost)) == []
+    assert list(change_notes(lost, works)) == ["sound found again"]
+    assert list(change_notes(stated(), works)) == []

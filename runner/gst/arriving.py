@@ -72,16 +72,18 @@ def _captured(extension: bytes) -> float | None:
 
 
 class ArrivingFrames:
-    """Groups the packets of one camera into frames, in order of arrival.
+    """Groups the packets of one camera into frames, in order of arrival. Of sound, each packet is one.
+
+    hz  of the RTP timestamps
 
     The thread in which packets arrive adds them; any one other thread takes frames and packets.
     """
 
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
+    def __init__(self, hz: int = RTP_HZ) -> None:
+        self._lock, self._hz = threading.Lock(), hz
         self._frames: deque[Arrival] = deque(maxlen=MAX_FRAMES)
         self._packets: deque[ArrivedPacket] = deque(maxlen=MAX_PACKETS)
-        self._clock = MediaClock(1 / RTP_HZ)
+        self._clock = MediaClock(1 / hz)
         self._newest: Packet | None = None
         self._handled = 0.0  # when the newest packet was added
         # When the kernel received the first packet of its frame, and the newest one; None: unknown.
@@ -106,7 +108,7 @@ class ArrivingFrames:
         with self._lock:
             self._packets.append((now if arrived is None else arrived, packet.bytes))
             ahead = 0 if self._newest is None else (packet.number - self._newest.number - 1) % NUMBERS
-            media_s = 0.0 if self._newest is None else signed(packet.stamp - self._newest.stamp) / RTP_HZ
+            media_s = 0.0 if self._newest is None else signed(packet.stamp - self._newest.stamp) / self._hz
             if ahead >= NUMBERS - max(MISORDER, _sent_in(-media_s)) or (retransmitted and ahead >= NUMBERS // 2):
                 self._add_older(packet, retransmitted)
                 return False
@@ -191,7 +193,7 @@ class ArrivingFrames:
     def _was_missing(self, packet: Packet) -> bool:
         """Whether this packet was noted as missing; it is no longer."""
         followed = self._missing.get(packet.number)
-        if followed is None or not 0 <= signed(followed - packet.stamp) <= OLDEST_S * RTP_HZ:
+        if followed is None or not 0 <= signed(followed - packet.stamp) <= OLDEST_S * self._hz:
             return False
         del self._missing[packet.number]
         return True
@@ -254,8 +256,8 @@ class Lateness:
     not age it.
     """
 
-    def __init__(self) -> None:
-        self._clock, self._usual = MediaClock(1 / RTP_HZ), ShortestTransit()
+    def __init__(self, hz: int = RTP_HZ) -> None:
+        self._clock, self._usual = MediaClock(1 / hz), ShortestTransit()
 
     def of(self, stamp: int, arrived: float) -> float:
         """How late a packet is, s, given its RTP timestamp and its arrival, s; never negative."""

@@ -31,11 +31,13 @@ MOST_STREAMS = 4  # whose numbers are remembered; a camera has two, that of repe
 class _Uplink:
     """What has come by one uplink.
 
+    hz     of the timestamps
     at     when its last packet of the camera came, s
     stamp  timestamp of the newest one
     """
 
-    frames: ArrivingFrames = field(default_factory=ArrivingFrames)
+    frames: ArrivingFrames
+    hz: int
     transit: ShortestTransit = field(default_factory=ShortestTransit)
     packets: int = 0
     twins: int = 0
@@ -46,7 +48,7 @@ class _Uplink:
     def add(self, packet: Packet, now: float, arrived: float | None) -> None:
         """Add a packet of the camera that was not requested again."""
         ahead = signed(packet.stamp - self.stamp)
-        if ahead > PAUSE_S * RTP_HZ:
+        if ahead > PAUSE_S * self.hz:
             self.frames.resume()
         if ahead > 0 or not self.at:
             self.stamp = packet.stamp
@@ -90,18 +92,19 @@ class Merge:
 
     is_authentic  whether whoever sends a packet is the vehicle. If that is decided behind it, a forged packet must not
                   replace the true one with its number: twins are only counted, and dropped there
+    hz            of the RTP timestamps
 
     payload_type  of the camera's packets; others are repeated on request. None: not known yet
     whole         frames of which all packets have come
     difference_s  how much longer packets take by the slowest uplink that carries the stream than by the fastest one
     """
 
-    def __init__(self, *, is_authentic: bool) -> None:
-        self._is_authentic = is_authentic
+    def __init__(self, *, is_authentic: bool, hz: int = RTP_HZ) -> None:
+        self._is_authentic, self._hz = is_authentic, hz
         self.payload_type: int | None = None
         self._uplinks: dict[str, _Uplink] = {}
         self._seen: dict[int, array[int]] = {}  # by stream (SSRC), and by number, the timestamp of the last packet
-        self._clock = MediaClock(1 / RTP_HZ)
+        self._clock = MediaClock(1 / hz)
         self._newest: tuple[int, float] | None = None  # timestamp, and when it came
         self.whole = WholeFrames()
         self._looked = self.difference_s = 0.0
@@ -117,7 +120,9 @@ class Merge:
         is_late = self._is_late(packet, now)
         is_twin = self._is_twin(int.from_bytes(header[8:12], "big"), packet)
         if uplink is not None:
-            own = self._uplinks.get(uplink) or self._uplinks.setdefault(uplink, _Uplink())
+            own = self._uplinks.get(uplink) or self._uplinks.setdefault(
+                uplink, _Uplink(ArrivingFrames(self._hz), self._hz)
+            )
             own.packets += 1
             own.twins, own.late = own.twins + is_twin, own.late + is_late
             if header[1] & 0x7F == self.payload_type:
@@ -165,7 +170,7 @@ class Merge:
         if self._newest is None:
             return False
         stamp, at = self._newest
-        return signed(stamp - packet.stamp) > LATE_S * RTP_HZ and now - at < RESTART_S
+        return signed(stamp - packet.stamp) > LATE_S * self._hz and now - at < RESTART_S
 
     def _is_twin(self, stream: int, packet: Packet) -> bool:
         """Number and timestamp together name a packet, for hours."""

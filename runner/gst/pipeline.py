@@ -11,7 +11,6 @@ from gi.repository import Gst, GstRtp, GstVideo
 from runner.core.commands import KnobValue
 from runner.errors import RunError
 from runner.graph import Plan, is_restarted_after_gaps
-from runner.gst.arriving import CAPTURE_ID
 from runner.gst.held_up import HeldUp
 from runner.gst.knobs import KnobPanel
 from runner.gst.lost import LostCameras
@@ -23,6 +22,7 @@ from runner.gst.requests import RequestLimit
 from runner.gst.sender_stages import EncoderWatch
 from runner.gst.sent_frames import SentFrames
 from runner.gst.source import loop_clip
+from runner.gst.streams import NOT_SEEKABLE, add_capture_time, drop_queued_packet, passed_counts
 from runner.gst.watched import WatchedSource
 from runner.records.vehicle import NOTHING_ENCODED, EncoderCounts, SenderStages
 
@@ -37,16 +37,11 @@ if TYPE_CHECKING:
 OnReport = Callable[[str, str], None]  # camera, what happened to it
 SRT_KEY_BYTES = 32  # AES-256
 GAP_S, GAP_INTERVALS = 0.4, 3  # without a picture, after which an encoder that would make up for it begins anew
-CAPTURE_TIME = "urn:ietf:params:rtp-hdrext:ntp-64"  # RTP header extension with the capture time (RFC 6051)
 # New caps must not make the source renegotiate: its output does not change. It would query caps between two frames,
 # while the next knobs are being turned, and see only some of them. Nor does a viewer that joins change caps. The RTSP
 # server (1.22) makes all elements negotiate again all the same, but what it adds behind the payloader may not be linked
 # yet: then they fail, and the pipeline ends for all viewers.
 _NOT_RECONFIGURED = TypeProbe(Gst.PadProbeType.EVENT_UPSTREAM, {Gst.EventType.RECONFIGURE: Gst.PadProbeReturn.DROP})
-# A camera is reported as not seekable, by answering the query unchanged. The RTSP server relies on the source's answer:
-# it would seek a clip or a test picture for every PLAY with a Range, Scale or Speed, flush the stream of all viewers,
-# and wait for a frame that a closed gate never passes.
-NOT_SEEKABLE = TypeProbe(Gst.PadProbeType.QUERY_UPSTREAM, {Gst.QueryType.SEEKING: Gst.PadProbeReturn.HANDLED})
 
 
 class Openings(NamedTuple):
@@ -291,21 +286,6 @@ class CameraPipeline:
         return True
 
 
-def add_capture_time(payloader: Gst.Element) -> None:
-    """Make room for the capture time in the first packet of each frame. An rtpsession after it fills in the time."""
-    extension = GstRtp.RTPHeaderExtension.create_from_uri(CAPTURE_TIME)
-    extension.set_id(CAPTURE_ID)
-    payloader.emit("add-extension", extension)
-
-
-def drop_queued_packet(pipeline: Gst.Bin) -> None:
-    """Drop the packet that the server's sinks around a pipeline hold for an interleaved viewer, if any."""
-    while parent := pipeline.get_parent():
-        pipeline = parent
-    sinks = pipeline.iterate_all_by_element_factory_name("appsink")
-    sinks.foreach(lambda sink: sink.emit("try-pull-sample", 0))
-
-
 def _count_before(encoder: Gst.Element) -> Gst.Element:
     """Put an identity in front of the encoder of a pipeline that does not play yet, which counts its pictures."""
     counter, entry = Gst.ElementFactory.make("identity"), encoder.get_static_pad("sink")
@@ -315,12 +295,6 @@ def _count_before(encoder: Gst.Element) -> Gst.Element:
     above.link(counter.get_static_pad("sink"))
     counter.get_static_pad("src").link(entry)
     return counter
-
-
-def passed_counts(identity: Gst.Element) -> tuple[int, int]:
-    """Number of buffers and bytes that an identity has passed."""
-    stats = identity.get_property("stats")
-    return stats.get_value("num-buffers"), stats.get_value("num-bytes")
 
 
 def encrypt(pipeline: Gst.Bin, passphrase: str) -> None:

@@ -13,7 +13,7 @@ from itertools import chain
 
 from gi.repository import Gst
 
-from runner.gst.arriving import FIXED_BYTES, HEADER_BYTES, ArrivingFrames, read_packet
+from runner.gst.arriving import FIXED_BYTES, HEADER_BYTES, RTP_HZ, ArrivingFrames, read_packet
 from runner.gst.merge import Merge
 from runner.gst.packet_senders import PacketSenders
 from runner.gst.packet_times import received_at
@@ -32,17 +32,18 @@ class ReceivedUplinks:
 
     addresses  of the vehicle, by uplink; none while they are unknown
     has_keys   whether packets are encrypted
+    hz         of the RTP timestamps
     """
 
-    def __init__(self, addresses: Addresses, *, has_keys: bool) -> None:
-        self._addresses, self._has_keys = addresses, has_keys
+    def __init__(self, addresses: Addresses, *, has_keys: bool, hz: int = RTP_HZ) -> None:
+        self._addresses, self._has_keys, self._hz = addresses, has_keys, hz
         self._lock = threading.Lock()  # elements are added in the client's thread
         self._attempts = itertools.count()
         self.begin()
 
     def begin(self) -> None:
         """The receiver has built a new pipeline."""
-        self.merge = Merge(is_authentic=not self._has_keys)
+        self.merge = Merge(is_authentic=not self._has_keys, hz=self._hz)
         self._counted: dict[str, tuple[int, int]] = {}
         self._source: _Source | None = None
         self._sinks: list[tuple[Gst.Element, socket.AddressFamily]] = []

@@ -5,9 +5,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING
 
 from gi.repository import Gst
@@ -16,36 +14,16 @@ from runner.graph import Plan, video_codec
 from runner.gst.arriving import NTP_EPOCH_S
 from runner.gst.caps import structure
 from runner.gst.probes import BufferProbe, PassingBuffer
-from runner.gst.repair import RtpSession
-from runner.gst.rtspsrc import (
-    NO_PLACE,
-    STREAM_ENDED,
-    Opening,
-    handle_stream_end,
-    is_rtsp_client,
-    limit_teardown,
-    status_of,
-)
-from runner.gst.sender_filter import SenderFilter
-from runner.gst.supervised import SupervisedPipeline
-from runner.gst.timers import later
+from runner.gst.stream_receiver import StreamReceiver
 from runner.gst.video_files import VideoFile, VideoFiles
-from runner.gst.viewers import user_agent
 from runner.h264.access_unit import AccessUnit, read_unit
 from runner.h264.damage import HEAD_BYTES, Damage
 from runner.records.reception import Arrival
-from runner.system.backoff import pause_s
-from runner.system.held_up import LateCheck
 from runner.system.recent import RecentValue
 
 if TYPE_CHECKING:
-    from runner.gst.received_uplinks import Addresses, ReceivedUplinks
+    from runner.gst.received_uplinks import Addresses
     from runner.gst.secure import StreamLogin
-
-STALL_S = 2.0  # a camera that should send but neither sends nor answers for longer is rebuilt
-DIALLED_STALL_S = 1.0  # likewise where the vehicle dials: it calls again, but a listener keeps its first caller
-REFUSED_S = (1.0, 30.0)  # from a refusal to the next request: doubled from the first value up to the second
-GRACE_S = 0.75  # time for the first frame once a camera is expected to send
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +75,7 @@ PICTURES = (
 )
 
 
-class Receiver:
+class Receiver(StreamReceiver):
     """Receives one camera. `sample` is to be called a few times a second; it also detects a silent stream.
 
     `rtp` is how its packets arrive.
@@ -123,42 +101,21 @@ class Receiver:
         login: StreamLogin | None = None,
         uplinks: Addresses | None = None,
     ) -> None:
-        self._on_report, self._video, self._operator, self._login = on_report, video, operator, login
-        self._client_name, self._sink_name = plan.operator[0].name, plan.operator[-1].name
+        launch = plan.receiver_into(PICTURES.format(name=plan.operator[-1].name)) if on_picture else plan.receiver
+        super().__init__(plan, launch, on_report, operator, login, uplinks)
+        self._video, self._sink_name = video, plan.operator[-1].name
         self._arrivals: deque[tuple[float, float | None]] | None = deque() if arrivals else None
         self._sampled = 0  # arrivals that have been read
-        self._late = LateCheck()
         self.newest: Arrival | None = None  # access unit, complete or not, that has left the jitter buffer
         self._on_unit, self._on_picture = on_unit, on_picture
-        self._name = name = plan.camera.name
-        received = None if uplinks is None else _received_uplinks(uplinks, has_keys=login is not None)
-        self.rtp = RtpSession(plan.camera.graph.settings, lambda what: on_report(name, what), received)
         self._codec = video_codec(plan.camera.graph)
         # Of a camera that encodes by itself, others have long received what its pictures refer to.
         self._joins = plan.camera.graph.passes is not None
         self._damage, self._damaged = Damage(self._codec, is_damaged=self._joins), 0
-        self._frames = self._bytes = 0
-        launch = plan.receiver_into(PICTURES.format(name=self._sink_name)) if on_picture else plan.receiver
-        self._is_dialled = not plan.serves
-        self._stall_s = DIALLED_STALL_S if self._is_dialled else STALL_S
-        self._supervised = SupervisedPipeline(launch, self._on_built, lambda what: on_report(name, what))
-        self._supervised.is_excused = self._is_refusal
-        self._supervised.must_wait = lambda: time.monotonic() < self._refused_until
-        self._refused, self._refused_until = 0, 0.0  # refusals in a row; until when the vehicle is not asked again
         self._before = Reception()  # counters of earlier pipelines
         self.stopped_at = Reception()  # counters when it was stopped
         self._latency, self._decode = RecentValue[float](), RecentValue[float]()  # ms, of a sampled frame
         self._entered: tuple[int | None, float] = (None, 0.0)  # PTS of the newest access unit, and when it arrived
-        self._foreign_reported = False
-        self._filter: SenderFilter | None = None
-        self._built = False
-        self._progress = (0, time.monotonic())  # frames at their last change, and when there was progress
-        self._last_unexpected = time.monotonic()  # when the camera was last not expected to send
-        self._was_expected = False  # whether it was expected to send at the last sample
-        self._should_send: bool | None = None  # as of the last sample
-
-    def start(self) -> None:
-        self._supervised.start()
 
     def stop(self) -> None:
         """Stop receiving; it may be started again, and its counters continue."""
@@ -175,10 +132,7 @@ class Receiver:
         should_send  whether the camera should; None: unknown while the vehicle is offline
         anew         ask the vehicle again now if it has refused this viewer
         """
-        self._should_send = should_send
-        if anew and self._refused:
-            self._refused, self._refused_until = 1, 0.0
-            self._supervised.hurry()
+        self._expect(should_send, anew=anew)
         buffer_ms = self.rtp.adapt()
         if self._begun:
             self.rtp.report_transport()
@@ -186,47 +140,9 @@ class Receiver:
         received = replace(
             received, buffer_ms=buffer_ms, waited_ms=self.rtp.waited_ms(), arrivals=self._arrived(received.frames)
         )
-        if received.foreign and not self._foreign_reported:
-            self._foreign_reported = True
-            self._on_report(self._name, "packets from hosts other than the vehicle are dropped")
-        now = time.monotonic()
-        is_excused = self._late.is_excused(now)
-        if self._login and (withdrawn := self._login.withdrawn()):
-            self._supervised.restart(withdrawn)
-        expected = self._was_expected = self._is_expected()
-        if not expected:
-            self._last_unexpected = now
-        if received.frames != self._progress[0] or self._should_send is False:
-            self._progress = (received.frames, now)
-        elif expected and not is_excused and self._has_stalled(now):
-            self._progress = (received.frames, now)
-            self._supervised.restart(f"no frame for {self._stall_s:g} s")
-        else:
-            return received
-        self._next_picture.arm()
+        if self._is_alive(received.frames, received.foreign):
+            self._next_picture.arm()
         return received
-
-    def _has_stalled(self, now: float) -> bool:
-        return now - self._progress[1] > self._stall_s and now - self._last_unexpected > GRACE_S
-
-    def _is_expected(self) -> bool:
-        """Whether frames should arrive.
-
-        Unknown while the vehicle is offline. But a caller may disappear together with its control link, and needs a
-        waiting listener when it is back: a stream that was flowing is expected until its pipeline is rebuilt.
-        """
-        if self._should_send is None and self._is_dialled:
-            return self._was_expected and self._begun
-        return bool(self._should_send)
-
-    def _is_refusal(self, error: Gst.Message) -> bool:
-        """Whether a receiver fails since the vehicle has no room for it, which its state explains. Begins a pause."""
-        if status_of(error) != NO_PLACE:
-            self._refused = 0
-            return False
-        self._refused_until = time.monotonic() + pause_s(self._refused, *REFUSED_S)
-        self._refused += 1
-        return True
 
     @property
     def is_damaged(self) -> bool:
@@ -237,31 +153,9 @@ class Receiver:
         self._before = self._count() if self._built else Reception()
         # A stream that others watch continues: what was missed meanwhile shows until a picture is healed.
         self._damage = Damage(self._codec, is_damaged=self._built or self._joins)
-        self._built = True
-        self._close_filter()
-        self._progress = (self._frames, time.monotonic())
-        pipeline.get_bus().connect("message::progress", self._on_progress)
         self._sink = pipeline.get_by_name(self._sink_name)
         self._next_picture = BufferProbe(self._sink.get_static_pad("sink"), self._on_frame)
-        self._begun = False
-        self.rtp.begin()
-        self._client = pipeline.get_by_name(self._client_name)
-        for element in pipeline.iterate_recurse():
-            self._on_element(pipeline, pipeline, element)
-        pipeline.connect("deep-element-added", self._on_element)
-        if self._login and (problem := self._login.prepare(pipeline, self._client)):
-            self._on_report(self._name, problem)
-        if is_rtsp_client(self._client):
-            if self.rtp.uplinks:
-                self.rtp.uplinks.direct(self._client)
-            self.rtp.follow(self._client)
-            handle_stream_end(self._client, self._on_source_gone)
-            limit_teardown(pipeline)
-            opening = Opening()
-            opening.follow(pipeline.get_bus())
-            self._supervised.before_stop = opening.wait
-        if self._operator and self._client.find_property("user-agent"):
-            self._client.set_property("user-agent", user_agent(self._operator))
+        self._follow(pipeline)
         if self._video:
             VideoFile(self._video, self._name, "operator", _captured, self._on_report).follow(pipeline)
         received = pipeline.get_by_name("received").get_static_pad("src")
@@ -270,49 +164,6 @@ class Receiver:
         if self._on_picture:
             self._sink.connect("new-sample", self._on_sample)
         return received
-
-    def _on_progress(self, _bus: Gst.Bus, _message: Gst.Message) -> None:
-        """The client is connecting and the server answers, which takes time over a slow link."""
-        self._progress = (self._progress[0], time.monotonic())
-
-    def _on_element(self, _pipeline: Gst.Pipeline, _parent: Gst.Bin, element: Gst.Element) -> None:
-        self.rtp.add(element)
-        if element.find_property("used-socket") and element.get_static_pad("src"):
-            self._filter_senders(element)
-
-    def _on_source_gone(self, client: Gst.Element, is_bye: bool) -> None:
-        """The stream has ended, or is silent, which `sample` finds sooner where the vehicle's state is known."""
-        if is_bye or self._should_send is None:
-            later(0, partial(self._on_stream_ended, client))
-
-    def _on_stream_ended(self, client: Gst.Element) -> None:
-        if client is self._client:
-            self._supervised.restart(STREAM_ENDED)
-
-    def _filter_senders(self, source: Gst.Element) -> None:
-        """Make a socket of the client accept packets from the vehicle only. From the client's thread."""
-        used_socket = source.get_property("used-socket")
-        if used_socket is None:
-            return
-        try:
-            if self._filter is None:
-                host = Gst.Uri.from_string(self._client.get_property("location")).get_host()
-                self._filter = SenderFilter(*((self.rtp.uplinks and self.rtp.uplinks.hosts) or [host]))
-            self._filter.attach(used_socket.get_fd())
-        except OSError as error:
-            self._on_report(self._name, f"packets from hosts other than the vehicle are not dropped: {error}")
-
-    def admit(self, addresses: Addresses) -> None:
-        """The addresses of the vehicle's uplinks are these from now on; none: they are unknown. From any thread."""
-        uplinks, current = self.rtp.uplinks, self._filter
-        if uplinks and uplinks.admit(addresses) and current and uplinks.hosts:
-            with suppress(OSError):  # it has just been closed
-                current.admit(*uplinks.hosts)
-
-    def _close_filter(self) -> None:
-        if self._filter:
-            self._filter.close()
-            self._filter = None
 
     def _count(self) -> Reception:
         before = self._before
@@ -382,12 +233,6 @@ class Receiver:
         data = buffer.extract_dup(0, buffer.get_size())  # a copy: the decoder reuses its memory
         self._on_picture(self._name, capture_time(buffer), width, height, data)  # type: ignore[misc]
         return Gst.FlowReturn.OK
-
-
-def _received_uplinks(addresses: Addresses, *, has_keys: bool) -> ReceivedUplinks:
-    from runner.gst.received_uplinks import ReceivedUplinks
-
-    return ReceivedUplinks(addresses, has_keys=has_keys)
 
 
 def _captured(_pad: Gst.Pad, unit: PassingBuffer) -> float | None:

@@ -15,9 +15,9 @@ from runner.gst.caps import structure
 from runner.gst.clocks import unix_time
 from runner.gst.credentials import log_in
 from runner.gst.ip_camera import CameraClient, follow_cameras
-from runner.gst.pipeline import passed_counts
 from runner.gst.rtspsrc import limit_teardown
 from runner.gst.source import fixed_rate, loop_clip
+from runner.gst.streams import passed_counts
 
 if TYPE_CHECKING:
     from runner.gst.bag_feed import BagFeed

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from gi.repository import GObject, Gst, GstRtsp, GstSdp
 
 from runner.core.model import GraphSettings
-from runner.gst.arriving import HEADER_BYTES, ArrivingFrames, Lateness, Packet, read_packet
+from runner.gst.arriving import HEADER_BYTES, RTP_HZ, ArrivingFrames, Lateness, Packet, read_packet
 from runner.gst.packet_times import received_at, state_arrivals
 from runner.gst.probes import BufferProbe, PassingBuffer
 from runner.records.reception import Arrival, ArrivedPacket
@@ -52,9 +52,18 @@ class RepairBuffer:
     reorder_ms    minimum wait
     kernel_times  whether the DTS of packets state when the kernel received them, see `runner.gst.packet_times`
     merge         of the uplinks by which packets come; None: they come one way
+    hz            of the RTP timestamps
     """
 
-    def __init__(self, buffer: Gst.Element, reorder_ms: int, *, kernel_times: bool, merge: Merge | None = None) -> None:
+    def __init__(
+        self,
+        buffer: Gst.Element,
+        reorder_ms: int,
+        *,
+        kernel_times: bool,
+        merge: Merge | None = None,
+        hz: int = RTP_HZ,
+    ) -> None:
         self._buffer, self._reorder_ms, self._kernel_times = buffer, reorder_ms, kernel_times
         self._merge, self._others_ms = merge, 0  # so long a packet may still come by another uplink
         if merge:
@@ -65,8 +74,8 @@ class RepairBuffer:
         self._pad = buffer.get_static_pad("sink")
         self._arriving = BufferProbe(self._pad, self._on_packet)
         self._arriving.arm()
-        self.frames = ArrivingFrames()
-        self._lateness = Lateness()
+        self.frames = ArrivingFrames(hz)
+        self._lateness = Lateness(hz)
         self._tail_requested = False
         self._ends: deque[tuple[int, float]] = deque(maxlen=FRAMES)  # of frames: timestamp, arrival of the last packet
         self._waited = RecentValue[float]()  # how long a frame waited here, ms
@@ -203,14 +212,19 @@ class RtpSession:
     Where the vehicle grants feedback over UDP, they repair: otherwise they reorder at most.
 
     uplinks  by which packets come; None: they come one way
+    hz       of the RTP timestamps
     """
 
     def __init__(
-        self, graph: GraphSettings, on_report: Callable[[str], None], uplinks: ReceivedUplinks | None = None
+        self,
+        graph: GraphSettings,
+        on_report: Callable[[str], None],
+        uplinks: ReceivedUplinks | None = None,
+        hz: int = RTP_HZ,
     ) -> None:
         from runner.gst.understanding import Understanding
 
-        self._graph, self._on_report, self.uplinks = graph, on_report, uplinks
+        self._graph, self._on_report, self.uplinks, self._hz = graph, on_report, uplinks, hz
         self._counted = (0, 0)  # packets received and missing, as last read
         self._understanding = Understanding(on_report)
         self.begin()
@@ -237,7 +251,8 @@ class RtpSession:
         if factory == "rtpjitterbuffer":
             reorder_ms = self._graph.jitter_buffer_ms
             merge = self.uplinks.merge if self.uplinks else None
-            self._buffers.append(RepairBuffer(element, reorder_ms, kernel_times=self._kernel_times, merge=merge))
+            buffer = RepairBuffer(element, reorder_ms, kernel_times=self._kernel_times, merge=merge, hz=self._hz)
+            self._buffers.append(buffer)
         if factory == "srtpdec":
             self._understanding.add(element)
         if factory == "udpsrc":

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from gi.repository import Gst
 
 from runner.graph import launch
-from runner.gst.pipeline import NOT_SEEKABLE, add_capture_time, drop_queued_packet, passed_counts
 from runner.gst.requests import RequestLimit
+from runner.gst.streams import NOT_SEEKABLE, add_capture_time, drop_queued_packet, passed_counts
 from runner.records.vehicle import NOTHING_ENCODED, EncoderCounts
 from runner.sound import SoundPlan
 
 if TYPE_CHECKING:
     from runner.gst.uplinks import CameraUplinks
 
-CHECK_S = 2.0  # how long a source may take to start when it is tried
+CHECK_S, LOOK_MS = 3.0, 20  # how long a source may take to start when it is tried; between two looks
 
 
 class SoundPipeline:
@@ -60,15 +61,16 @@ class SoundPipeline:
 
 
 def sound_problem(plan: SoundPlan) -> str | None:
-    """Why the source of sound does not open; None if it opens. Devices open on the way to PAUSED at the latest."""
-    pipeline = Gst.parse_launch(f"{launch(plan.source)} ! fakesink")
+    """Why the source of sound does not open, or gives none; None if it does."""
+    pipeline = Gst.parse_launch(f"{launch(plan.source)} ! fakesink name=sink-of-test sync=false")
+    sink, bus, until = pipeline.get_by_name("sink-of-test"), pipeline.get_bus(), time.monotonic() + CHECK_S
     try:
-        changed = pipeline.set_state(Gst.State.PAUSED)
-        if changed is Gst.StateChangeReturn.ASYNC:
-            changed = pipeline.get_state(round(CHECK_S * Gst.SECOND))[0]
-        if changed in (Gst.StateChangeReturn.SUCCESS, Gst.StateChangeReturn.NO_PREROLL):
-            return None
-        message = pipeline.get_bus().pop_filtered(Gst.MessageType.ERROR)
-        return str(message.parse_error()[0].message) if message else "its source does not start"
+        pipeline.set_state(Gst.State.PLAYING)
+        while time.monotonic() < until:
+            if message := bus.timed_pop_filtered(LOOK_MS * Gst.MSECOND, Gst.MessageType.ERROR):
+                return str(message.parse_error()[0].message)
+            if sink.get_property("last-sample"):
+                return None
+        return f"its source gives no sound within {CHECK_S:g} s"
     finally:
         pipeline.set_state(Gst.State.NULL)

@@ -28,7 +28,7 @@ from runner.errors import RunError
 from runner.metrics.side import SideMetrics
 from runner.operator.log import DriveLog
 from runner.operator.station import Listener, Station, holds_control
-from runner.plans import compile_plans
+from runner.plans import compile_plans, sound_plan
 from runner.records.operator import Sample
 from runner.records.vehicle import Outcome, VehicleState
 from runner.security.exposure import viewer_keyring
@@ -37,7 +37,7 @@ from runner.system.held_up import LateCheck
 from runner.system.service import notify
 
 if TYPE_CHECKING:
-    from runner.apply import OnUnit, OperatorSide
+    from runner.apply import OnSound, OnUnit, OperatorSide
     from runner.configuration.experiment import TimedRequest
     from runner.operator.demand import Demand
     from runner.ros.pictures import DecodedPictures
@@ -65,7 +65,7 @@ class LiveOperator:
         setup: Setup,
         station: Station,
         log: Log,
-        build: Callable[[OnUnit | None], OperatorSide],
+        build: Callable[[OnUnit | None, OnSound | None], OperatorSide],
         requests: Sequence[TimedRequest] = (),
         demand: Demand | None = None,
     ) -> None:
@@ -87,11 +87,14 @@ class LiveOperator:
         self._thread = threading.Thread(target=self._run, name="sampling", daemon=True)
         self._reporting = threading.Thread(target=self._report, name="reporting", daemon=True)
 
-    def start(self, on_unit: OnUnit | None = None, duration_s: float | None = None) -> None:
+    def start(
+        self, on_unit: OnUnit | None = None, duration_s: float | None = None, on_sound: OnSound | None = None
+    ) -> None:
         """Connect, receive, and sample, until stopped or for a given time.
 
         on_unit     called, from the camera's streaming thread, with each access unit that arrives
         duration_s  from the moment the vehicle is online, or START_S after this call; None: until stopped
+        on_sound    called, from its streaming thread, with each packet of sound
         """
         if self._demand:
             self._follow(self._demand)
@@ -99,7 +102,7 @@ class LiveOperator:
         if not self._demand:
             self._await_vehicle()
         with self._announcing():
-            self._side = self._build(on_unit)
+            self._side = self._build(on_unit, on_sound)
         self._log.begin()
         self._duration_s = inf if duration_s is None else duration_s
         self._latest_start = time.monotonic() + START_S
@@ -231,7 +234,7 @@ class LiveOperator:
         driving = state.driving if state else UNSET
         before, self._drivers = self._drivers, () if driving is UNSET else driving.drivers
         samples = side.sample(self.station.sending(), anew=self._drivers != before)
-        self.station.take(samples, side.received())
+        self.station.take(samples, side.received(), side.sound)
         self._sampled = time.monotonic()
         notify("WATCHDOG=1")
         while self._requests and self._elapsed_s() >= self._requests[0].at_s:
@@ -306,10 +309,10 @@ def live_operator(
 
     config = configuration(overrides, conf, runnable=False, check=apply.check_operator, site=site)
     setup, document = config.setup(), config.document
-    plans = compile_plans(setup)
+    plans, sound = compile_plans(setup), sound_plan(setup)
     keyring = viewer_keyring(setup)
     station = Station(setup, agreement.settings(document), keyring)
-    versions = apply.versions(element for plan in plans for element in plan.operator)
+    versions = apply.versions(element for plan in (*plans, sound) if plan for element in plan.operator)
     pictures, requests = _ros_pictures(setup, station), config.experiment().requests
     drive = Log(log, "operator", document if log else {}, versions, station.note)
     if log:
@@ -321,7 +324,7 @@ def live_operator(
         state = station.state
         pictures.put(camera, captured, width, height, data, state.cameras.get(camera) if state else None)
 
-    def build(on_unit: OnUnit | None) -> OperatorSide:
+    def build(on_unit: OnUnit | None, on_sound: OnSound | None) -> OperatorSide:
         logged = log is not None
         return apply.OperatorSide(
             plans,
@@ -335,6 +338,8 @@ def live_operator(
             vehicle=setup.vehicle.name,
             uplinks=station.addresses if setup.uplinks else None,
             cameras=() if on_demand else None,
+            sound=sound,
+            on_sound=on_sound,
         )
 
     operator = LiveOperator(setup, station, drive, build, requests, _demand() if on_demand else None)

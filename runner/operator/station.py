@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from msgspec import UNSET, UnsetType
 
 from runner.configuration import agreement
+from runner.core.budget import SOUND
 from runner.core.decision import NOTHING
 from runner.core.events import BACK_S, NAMES, Attention, Gear, MomentMarked
 from runner.mqtt.copies import Newest
@@ -35,10 +36,11 @@ from runner.operator.meter import MeasuredRates, ReceptionMeter
 from runner.operator.notes import Refusals, change_notes, driver_words
 from runner.operator.reception import ReceptionReports
 from runner.operator.requests import OnReply, Requests
+from runner.operator.sound import sound_sample, sound_words
 from runner.operator.uplinks import UplinkRow, uplink_rows
 from runner.records import combined, to_json
 from runner.records.lines import Note
-from runner.records.operator import CameraSample, Sample
+from runner.records.operator import CameraSample, Sample, SoundSample
 from runner.records.reception import NOTHING_ARRIVED, Arrivals, UplinkReceived
 from runner.records.vehicle import (
     NOTHING_ENCODED,
@@ -55,7 +57,7 @@ from runner.system.held_up import LateCheck
 from runner.system.kept import KeptIdentity
 
 if TYPE_CHECKING:
-    from runner.apply import Reception
+    from runner.apply import Reception, SoundReception
 
 MAX_VEHICLES = 100  # whose names are remembered
 ONE_WAY_S = 10.0  # how long a silent vehicle may still receive: an outage of one direction must not end its streams
@@ -170,6 +172,7 @@ class Station:
         fps = {name: float(camera.fps) for name, camera in vehicle.cameras.items()}
         self.meters = {name: ReceptionMeter(each) for name, each in fps.items()}
         self.samples: Mapping[str, Reception] = {}
+        self.sound: SoundSample | UnsetType = UNSET
         self._rates: dict[str, MeasuredRates] = {}
         self._refusals = Refusals(self.identity)
         self.uplinks: Sequence[UplinkRow] = ()  # none while the vehicle is offline
@@ -254,18 +257,26 @@ class Station:
         return state.cameras if state else {}
 
     def sending(self) -> dict[str, bool]:
-        """Which cameras should send, according to the vehicle; empty while the vehicle is offline.
+        """Which cameras, and whether the sound, should send, by the vehicle's word; empty while it is offline.
 
         A camera whose source is being replaced sends nothing, but keeps its session.
         """
-        return {name: camera.sending and not camera.fault for name, camera in self._cameras().items()}
+        sending = {name: camera.sending and not camera.fault for name, camera in self._cameras().items()}
+        state = self.state
+        if state and state.sound is not UNSET:
+            sending[SOUND] = state.sound.fault is None
+        return sending
 
     def take(
-        self, samples: Mapping[str, Reception], over: Mapping[str, Mapping[str, UplinkReceived]] = NOTHING
+        self,
+        samples: Mapping[str, Reception],
+        over: Mapping[str, Mapping[str, UplinkReceived]] = NOTHING,
+        sound: SoundReception | None = None,
     ) -> None:
         """Process a sample of all counters; to be called a few times a second, since it also checks timeouts.
 
-        over  by camera, what each uplink brought; no camera if the vehicle has one
+        over   by camera, what each uplink brought; no camera if the vehicle has one
+        sound  None: this side receives none
         """
         now = time.monotonic()
         is_excused = self._late.is_excused(now)
@@ -284,6 +295,7 @@ class Station:
         self.samples = samples
         for text in self._refusals.update(samples, cameras, now):
             self.note(text)
+        self.sound = sound_sample(sound, self.state, self.latency.clock, self.identity)
         sample, state = self._sample(over), self.state
         self.uplinks = uplink_rows(state, sample.uplinks) if state else []
         for listener in self.listeners:
@@ -316,9 +328,10 @@ class Station:
         clock = self.latency.clock
         latencies = f"latencies ± {1000 * clock.bound_s:.1f} ms" if clock else "latencies still unknown"
         totals = f"{self._vehicle.name}, mode {state.mode}, total {state.total_words} kbit/s, {latencies}"
-        if (driving := state.driving) is UNSET:
-            return totals
-        return f"{totals}\n{driver_words(driving, self.identity, self.own_time(driving.since))}"
+        lines, driving = [totals], state.driving
+        if driving is not UNSET:
+            lines.append(driver_words(driving, self.identity, self.own_time(driving.since)))
+        return "\n".join(lines if self.sound is UNSET else [*lines, sound_words(self.sound)])
 
     def _sample(self, over: Mapping[str, Mapping[str, UplinkReceived]]) -> Sample:
         telemetry, clock = self.telemetry if self.state else None, self.latency.clock
@@ -339,6 +352,7 @@ class Station:
             clock_ahead_ms=round(1000 * clock.ahead_s, 3) if clock else None,
             clock_bound_ms=round(1000 * clock.bound_s, 3) if clock else None,
             uplinks=_uplinks(telemetry),
+            sound=self.sound,
         )
 
     def _on_any_state(self, message: MqttMessage) -> None:

@@ -65,6 +65,23 @@ class CameraSample(EncoderCounts):
 
 
 @dataclass(frozen=True, slots=True)
+class SoundSample:
+    """Reception of the vehicle's sound; counters run since the start."""
+
+    packets: Annotated[Count, "received"]
+    bytes: Annotated[Count, "their payload"]
+    lost: Annotated[Count, "packets that never arrived, or too late"]
+    level_db: Annotated[float | None, "of the last quarter of a second, dB below full scale; None: nothing arrived"]
+    latency_ms: Annotated[float | None, "capture to arrival of the newest packet, ms; None: unknown"]
+    rebuilt: Annotated[Count, "how often the receiver's pipeline was rebuilt"] = 0
+    foreign: Annotated[Count, "packets from senders other than the vehicle, dropped"] = 0
+    fault: Annotated[str | UnsetType, "why its source does not open, in words; absent: it does"] = UNSET
+    refused: Annotated[
+        str | UnsetType, "why the vehicle refuses this operator the sound, in words; absent: it does not"
+    ] = UNSET
+
+
+@dataclass(frozen=True, slots=True)
 class Sample:
     """What the operator's side measures a few times a second."""
 
@@ -82,3 +99,4 @@ class Sample:
     clock_bound_ms: Annotated[NonNegative | None, "maximum error of that and of each latency, ms; None: unknown"] = None
     speed_factor: Annotated[Share | None, "as in `SpeedAdvice`; None: not advised"] = None
     uplinks: Annotated[Mapping[str, UplinkMeasured] | UnsetType, "by uplink; absent: there is one"] = UNSET
+    sound: Annotated[SoundSample | UnsetType, "absent: this side receives none"] = UNSET

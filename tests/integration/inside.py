@@ -35,25 +35,29 @@ def fail(pipeline: Any, why: str) -> None:
     pipeline.post_message(Gst.Message.new_error(source, error, ""))
 
 
-def losing(monkeypatch: Any, kind: str, pad: str, is_lost: Callable[[Any], bool]) -> None:
+def losing(monkeypatch: Any, kind: str, pad: str, is_lost: Callable[[Any], bool], stream: str | None = None) -> None:
     """Let each element of a kind in an operator's receivers lose packets at a pad.
 
     A relay would decide about packets of all cameras and of the control link, and could not know when it may.
 
     is_lost  called with each buffer
+    stream   camera, or sound, whose receiver it is; None: all
     """
-    from runner.gst import Gst, receiver
+    from runner.gst import Gst
+    from runner.gst.stream_receiver import StreamReceiver
+
+    before = StreamReceiver._on_element
 
     def lose(_pad: Any, info: Any) -> Any:
         return Gst.PadProbeReturn.DROP if is_lost(info.get_buffer()) else Gst.PadProbeReturn.OK
 
-    class Lossy(receiver.Receiver):
-        def _on_element(self, pipeline: Any, parent: Any, element: Any) -> None:
-            super()._on_element(pipeline, parent, element)
-            if element.get_factory() and element.get_factory().get_name() == kind:
-                element.get_static_pad(pad).add_probe(Gst.PadProbeType.BUFFER, lose)
+    def on_element(receiver: Any, pipeline: Any, parent: Any, element: Any) -> None:
+        before(receiver, pipeline, parent, element)
+        is_meant = stream in (None, receiver._name) and element.get_factory()
+        if is_meant and element.get_factory().get_name() == kind:
+            element.get_static_pad(pad).add_probe(Gst.PadProbeType.BUFFER, lose)
 
-    monkeypatch.setattr("runner.apply.Receiver", Lossy)
+    monkeypatch.setattr(StreamReceiver, "_on_element", on_element)
 
 
 def storing_video_at(monkeypatch: Any, directory: Path, device: str, queue_bytes: int = 8_000_000) -> None:

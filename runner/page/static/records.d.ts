@@ -242,6 +242,28 @@ export interface UplinkMeasured {
   rtt_ms: number;
 }
 
+/** Reception of the vehicle's sound; counters run since the start */
+export interface SoundSample {
+  /** received */
+  packets: number;
+  /** their payload */
+  bytes: number;
+  /** packets that never arrived, or too late */
+  lost: number;
+  /** of the last quarter of a second, dB below full scale; null: nothing arrived */
+  level_db: number | null;
+  /** capture to arrival of the newest packet, ms; null: unknown */
+  latency_ms: number | null;
+  /** how often the receiver's pipeline was rebuilt */
+  rebuilt: number;
+  /** packets from senders other than the vehicle, dropped */
+  foreign: number;
+  /** why its source does not open, in words; absent: it does */
+  fault?: string;
+  /** why the vehicle refuses this operator the sound, in words; absent: it does not */
+  refused?: string;
+}
+
 /** What the operator's side measures a few times a second */
 export interface Sample {
   /** s since the start of the run, or of the log that contains this */
@@ -267,4 +289,6 @@ export interface Sample {
   speed_factor: number | null;
   /** by uplink; absent: there is one */
   uplinks?: Record<string, UplinkMeasured>;
+  /** absent: this side receives none */
+  sound?: SoundSample;
 }
