@@ -372,7 +372,7 @@ class OperatorSide:
     vehicle     its name, which its certificate must state
     uplinks     addresses of the vehicle by uplink, as far as known; None: it has one way
     cameras     those to receive until `receive` names others; None: all
-    sound       received while any camera is; None: there is none
+    sound       received while any camera is, or without cameras; None: there is none
     on_sound    called, from its streaming thread, with each packet of it
     on_samples  called, from its streaming thread, with what is decoded of it
     raises      RunError if a plugin that `video` needs is not installed
@@ -437,7 +437,7 @@ class OperatorSide:
         self._running = running
         for name in before.keys() - running.keys():
             self._receivers[name].stop()
-        heard, self._hears = self._hears, bool(running)
+        heard, self._hears = self._hears, bool(running) or not self._receivers
         if self._sound and self._hears != heard:
             (self._sound.start if self._hears else self._sound.stop)()
 

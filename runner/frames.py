@@ -1,5 +1,6 @@
-"""Public: decoded pictures for programs, see docs/operator.md."""
+"""Public: decoded pictures and sound for programs, see docs/operator.md and docs/sound.md."""
 
 from runner.operator.frames import Frame, live_frames
+from runner.operator.sounds import Sound, live_sound
 
-__all__ = ["Frame", "live_frames"]
+__all__ = ["Frame", "Sound", "live_frames", "live_sound"]

@@ -151,3 +151,31 @@ def write_tone(path, seconds):
         file.setframerate(48000)
         samples = (int(8000 * math.sin(440 * 2 * math.pi * n / 48000)) for n in range(48000 * seconds))
         file.writeframes(b"".join(struct.pack("<h", each) for each in samples))
+
+
+def test_a_program_gets_samples_with_their_time():
+    from runner.apply import VehicleSide, check_plan
+    from runner.configuration.config import configuration
+    from runner.frames import live_sound
+    from runner.plans import sound_plan
+
+    words = [*ROBOT, "sound=test", f"media.port={free_port()}"]
+    setup = configuration(words, check=check_plan).setup()
+    side = VehicleSide([], setup.media, lambda *_: None, sound=sound_plan(setup))
+    try:
+        with live_sound(words) as sounds:
+            heard = [sounds.next(timeout_s=30) for _ in range(50)]
+    finally:
+        side.stop()
+    assert all(each and each.samples.dtype == "int16" and len(each.samples) for each in heard)
+    assert all(b.captured > a.captured for a, b in pairwise(heard))
+    assert min(time.time() - each.captured for each in heard) > 0
+    assert rms(heard[-1].samples.tobytes()) == pytest.approx(32768 * 10 ** (TONE_DB / 20), rel=0.1)
+
+
+def test_a_program_must_choose_sound():
+    from runner.errors import UserError
+    from runner.frames import live_sound
+
+    with pytest.raises(UserError, match="sound: null: must be chosen"), live_sound(ROBOT):
+        pass

@@ -1,0 +1,120 @@
+"""The vehicle's sound for programs: numpy arrays with the time of capture.
+
+    with live_sound(["vehicle=delivery_robot", "sound=alsa"]) as sounds:
+        for sound in sounds:                          # waits for the next one
+            detect(sound.samples, sound.captured)     # int16, 48 kHz, one channel
+
+Runs alone, or in addition to an operator as a listener like any other (`media.max_viewers`).
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.configuration.config import configuration
+from runner.core.budget import SOUND
+from runner.errors import UserError
+from runner.plans import sound_plan
+from runner.security.exposure import viewer_keyring
+
+CHECK_S = 0.25  # how often silence is checked
+KEPT = 100  # sounds that a slow program may be behind: 2 s; then it misses the oldest
+STOP_S = 1.0  # how long the last check may take
+
+
+class Sound(NamedTuple):
+    """What one packet held, or what conceals lost ones.
+
+    captured  when its first sample was, s since 1970 by the vehicle's clock; None: unknown
+    samples   int16, 48 kHz
+    """
+
+    captured: float | None
+    samples: NDArray[np.int16]
+
+
+class Sounds:
+    """Each sound once, in order."""
+
+    def __init__(self) -> None:
+        self._waiting: deque[Sound] = deque(maxlen=KEPT)
+        self._changed = threading.Condition()
+        self._closed = False
+
+    def __iter__(self) -> Iterator[Sound]:
+        while (sound := self.next()) is not None:
+            yield sound
+
+    def next(self, timeout_s: float | None = None) -> Sound | None:
+        """The next sound; None after the timeout, or once this is closed."""
+        with self._changed:
+            if not self._changed.wait_for(lambda: self._waiting or self._closed, timeout_s) or self._closed:
+                return None
+            return self._waiting.popleft()
+
+    def put(self, captured: float | None, data: bytes) -> None:
+        """Add samples from the decoder."""
+        with self._changed:
+            self._waiting.append(Sound(captured, np.frombuffer(data, np.int16)))
+            self._changed.notify()
+
+    def close(self) -> None:
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+
+@contextmanager
+def live_sound(
+    overrides: Sequence[str] = (),
+    conf: Path | str | None = None,
+    *,
+    report: Callable[[str], None] = lambda what: None,
+) -> Iterator[Sounds]:
+    """Receive and decode the sound of a streaming vehicle, losses concealed; a pipeline that fails is rebuilt.
+
+    overrides  Hydra overrides, as on the command line, also conf=DIR
+    conf       directory of files of your own, which shadow the packaged ones
+    report     called with what happened to it
+    raises     ConfigError; UserError for a configuration without sound, or missing keys
+    """
+    from runner import apply
+
+    setup = configuration(overrides, conf, runnable=False, check=apply.check_operator).setup()
+    plan = sound_plan(setup)
+    if plan is None:
+        raise UserError("", SOUND, "null", "must be chosen, as on the vehicle: sound=alsa")
+    sounds, stopped = Sounds(), threading.Event()
+    side = apply.OperatorSide(
+        [],
+        lambda _, what: report(what),
+        keyring=viewer_keyring(setup),
+        vehicle=setup.vehicle.name,
+        sound=plan,
+        on_samples=sounds.put,
+    )
+
+    def watch() -> None:
+        try:
+            while not stopped.wait(CHECK_S):
+                side.sample({SOUND: True})
+        finally:
+            sounds.close()  # release a caller that waits for a failed side
+
+    watcher = threading.Thread(target=watch, name="watch", daemon=True)
+    watcher.start()
+    try:
+        yield sounds
+    finally:
+        stopped.set()
+        sounds.close()
+        watcher.join(STOP_S)
+        side.stop()
