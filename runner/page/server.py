@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from socket import SO_SNDBUF, SOL_SOCKET
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from aiohttp import WSMsgType, web
 from msgspec import UNSET
@@ -40,6 +40,9 @@ from runner.records.vehicle import Outcome, VehicleState, state_to_json
 from runner.security.keyring import Keyring
 from runner.settings import Setup
 from runner.system.ports import check_port_free
+
+if TYPE_CHECKING:
+    from runner.apply import SoundPacket
 
 FROZEN_MS = 120  # a picture that is frozen for this long is marked within 150 ms
 NOTES = 50  # kept for pages that open later
@@ -142,6 +145,10 @@ class PageServer(Listener):
     def show(self, camera: str, unit: AccessUnit) -> None:
         """A newly received access unit."""
         self._call_soon(self._show, camera, unit)
+
+    def hear(self, packet: SoundPacket) -> None:
+        """A newly received packet of the vehicle's sound."""
+        self._call_soon(_hear, self._windows, packet, self._station)
 
     # --- in the page's thread -----------------------------------------------------------------------------------------
 
@@ -336,6 +343,13 @@ def _stated(state: VehicleState | None, station: Station) -> dict[str, Any]:
     return {**state_to_json(state), "held_since": since, "stop_since": stop, "absent_since": absent}
 
 
+def _hear(windows: Windows, packet: SoundPacket, station: Station) -> None:
+    captured = None if packet.captured is None else station.latency.own_time(packet.captured)
+    for viewer in windows:
+        if not viewer.monitor:
+            viewer.hear(packet.number, captured, packet.arrived, packet.data)
+
+
 def _recent(camera: Camera) -> RecentUnits:
     graph = camera.graph
     return RecentUnits(graph.settings.key_interval_s, video_codec(graph), keyed=graph.passes is not None)
@@ -405,7 +419,8 @@ def _introduction(setup: Setup, shown: Sequence[int]) -> dict[str, Any]:
     dimensions = setup.dimensions and asdict(setup.dimensions)
     limits = {"late_ms": setup.page.late_ms, "frozen_ms": FROZEN_MS}
     inputs = asdict(setup.inputs)
-    return {"vehicle": setup.vehicle.name, "cameras": cameras, "dimensions": dimensions, "inputs": inputs, **limits}
+    described = {"vehicle": setup.vehicle.name, "cameras": cameras, "dimensions": dimensions, "inputs": inputs}
+    return described | limits | ({"sound": True} if setup.sound else {})
 
 
 def _native(camera: Camera) -> dict[str, int]:

@@ -20,6 +20,8 @@ KEY, CATCH_UP, RESTART = 1, 2, 4  # flags: a decoder can start here; decode but 
 DAMAGED = 8  # flag: the picture shows that packets were lost
 MAX_UNITS = 30  # queued for one camera; a viewer that is further behind gets a burst in their place
 MAX_TEXTS = 500
+SOUND = 255  # in place of a camera's index
+MAX_SOUNDS = 25  # packets; older ones would be played too late
 
 Burst = Callable[[int], list[AccessUnit]]  # by camera index: the units that a decoder starting now needs
 
@@ -54,6 +56,7 @@ class PageViewer:
         self._burst = burst
         self._nonempty = asyncio.Event()
         self._texts: deque[str] = deque(maxlen=MAX_TEXTS)
+        self._sounds: deque[bytes] = deque(maxlen=MAX_SOUNDS)
         self._queues = {camera: _CameraQueue() for camera in cameras}
         self._next = 0  # index in `cameras` of the one whose turn it is
         self._sequence = 0
@@ -81,6 +84,12 @@ class PageViewer:
         elif len(queue.live) > MAX_UNITS:
             self.restart(camera)
 
+    def hear(self, number: int, captured: float | None, arrived: float, data: bytes) -> None:
+        """A newly received packet of the vehicle's sound; arguments as of `runner.gst.sound_receiver.SoundPacket`."""
+        head = HEADER.pack(SOUND, 0, 0, number % 2**32, _ms(captured), _ms(arrived))
+        self._sounds.append(head + data)
+        self._nonempty.set()
+
     def restart(self, camera: int) -> None:
         """Clear the queue; the next units sent for this camera are a burst."""
         if camera in self._queues:
@@ -95,9 +104,11 @@ class PageViewer:
         return message
 
     def pop(self) -> str | bytes | None:
-        """The next message to send, texts first, then the cameras in turn; None if all queues are empty."""
+        """The next message to send, texts first, then sound, then the cameras in turn; None if all queues are empty."""
         if self._texts:
             return self._texts.popleft()
+        if self._sounds:
+            return self._sounds.popleft()
         for _ in self.cameras:
             camera, self._next = self.cameras[self._next], (self._next + 1) % len(self.cameras)
             if self._queues[camera].is_behind and not self._queues[camera].burst:
@@ -125,8 +136,7 @@ class PageViewer:
     def _pack(self, camera: int, flags: int, unit: AccessUnit) -> bytes:
         self._sequence = (self._sequence + 1) % 2**32
         flags |= (KEY if unit.key else 0) | (0 if unit.exact else CATCH_UP) | (DAMAGED if unit.damaged else 0)
-        captured = math.nan if unit.captured is None else unit.captured * 1000
-        return HEADER.pack(camera, flags, 0, self._sequence, captured, unit.arrived * 1000) + unit.data
+        return HEADER.pack(camera, flags, 0, self._sequence, _ms(unit.captured), _ms(unit.arrived)) + unit.data
 
 
 @dataclass
@@ -142,6 +152,10 @@ class _CameraQueue:
     live: deque[AccessUnit] = field(default_factory=deque)
     is_behind: bool = False
     is_mixed: bool = False
+
+
+def _ms(time: float | None) -> float:
+    return math.nan if time is None else 1000 * time
 
 
 def text_of(kind: str, message: Mapping[str, Any]) -> str:

@@ -66,7 +66,7 @@ def run(arguments: Arguments) -> int:
         room = keeping_room(arguments.path("drives"), operator.setup.log, station.note)
         end = "Ctrl-C ends" if duration is None else f"ends after {duration:g} s, or with Ctrl-C"
         with room, _served(operator, arguments.conf, announce=lambda what: table.announce(f"{what} ({end})")) as page:
-            operator.start(page.show if page else None, duration)
+            operator.start(page.show if page else None, duration, page.hear if page else None)
             freeze_loaded()
             with stopping(action=operator.end) as stop:
                 running = True
@@ -97,7 +97,7 @@ def _run_behind(socket: Path, arguments: Arguments) -> int:
         with room, _served(operator, arguments.conf, socket=socket) as page:
             assert page
             operator.on_dropped = page.forget
-            operator.start(page.show)
+            operator.start(page.show, on_sound=page.hear)
             freeze_loaded()
             with stopping(action=operator.end) as stop:
                 while operator.runs(SHOW_S):

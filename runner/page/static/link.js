@@ -38,6 +38,7 @@ const handlers = {
   },
   asked: () => worker.postMessage({ order: "ready" }),
   login: () => location.assign(`/login${location.search}${location.hash}`),
+  hearing: ({ report }) => publish("hearing", report),
   crooked: (message) => publish("crooked", message),
   flat: (message) => publish("flat", message),
   sent: ({ id, sent }) => sent || publish("unsent", id),

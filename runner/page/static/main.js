@@ -16,6 +16,7 @@ import { startDriveMap } from "./drive_map.js";
 import { startBirdseye } from "./birdseye.js";
 import { startStraight } from "./straighten.js";
 import { startSound } from "./sound.js";
+import { hearing, startHearing } from "./hearing_page.js";
 import { startTotal } from "./total.js";
 import { startPanel } from "./panel.js";
 import { startTabs } from "./tabs.js";
@@ -49,6 +50,7 @@ startActions();
 startKeys();
 startGamepads();
 startSound();
+startHearing();
 if (store.view !== "monitor") for (const part of [startTotal, startPanel, startTabs, startCharts, startOthers]) part();
 start();
 
@@ -61,6 +63,7 @@ listen("reply", ({ id, result, reason }) => {
 globalThis.tod = {
   measure: () => ask("measure"),
   stages: () => ask("stages"),
+  hearing,
   picture: (name) => ask("picture", name),
   first: (name) => ask("first", name),
   guides: (name) => ask("guides", name),

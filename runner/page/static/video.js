@@ -5,11 +5,12 @@
  */
 
 import { ageOf, skewOf } from "./ages.js";
-import { isTopView } from "./arrange.js";
+import { isTopView, rolesOf } from "./arrange.js";
 import { Clock, now } from "./clock.js";
 import { described } from "./drawn_pictures.js";
 import { hasEnded } from "./ended.js";
 import { GroundView } from "./ground_view.js";
+import { Hearing, SOUND } from "./hearing.js";
 import { hasGpu } from "./picture.js";
 import { startWarps } from "./remote_warp.js";
 import { askPage, onPageReady } from "./resizing.js";
@@ -28,6 +29,8 @@ import "./guide_lines.js";
 import "./guides.js";
 import "./liveness.js";
 import "./pace.js";
+import "./placing.js";
+import "./playout.js";
 import "./projection.js";
 import "./overlay.js";
 import "./shown_region.js";
@@ -75,7 +78,10 @@ let guided = []; // cameras whose guides are shown
 let first = null; // camera whose picture is drawn first
 /** @type {string[]} */
 let straight = []; // cameras whose pictures are straightened
+const hearing = new Hearing(station.clock, (why) => console.warn(`the vehicle's sound: ${why}`));
 const ground = new GroundView(station.steering, (why) => toPage({ kind: "flat", why }));
+/** @type {string|null} */
+let front = null; // the front camera, with which sound keeps step
 let isAsleep = true; // no animation frame is requested
 let tickedAt = now();
 let wasLate = false; // at the last tick
@@ -164,6 +170,7 @@ function onHello(message) {
     station.dimensions = message.dimensions;
     streams.forEach((stream) => stream.dispose());
     streams = message.cameras.map((camera) => new Stream(camera, station));
+    front = rolesOf(message.cameras).front?.name ?? null;
     streamsKey = key;
     applyGuides();
     applyStraight();
@@ -204,7 +211,8 @@ function onStraightenFailed(stream, error) {
 function onUnit(buffer) {
   const view = new DataView(buffer);
   const index = view.getUint8(0);
-  streams.find(({ camera }) => camera.index === index)?.receive({
+  const receiver = index === SOUND ? hearing : streams.find(({ camera }) => camera.index === index);
+  receiver?.receive({
     flags: view.getUint8(1),
     sequence: view.getUint32(4, true),
     captured: view.getFloat64(8, true),
@@ -251,6 +259,7 @@ function reportAges() {
   const skew_ms = skewOf(streams.map(({ status, shown }) => ({ status, captured: shown?.meta.captured ?? NaN })));
   const slow = streams.filter((stream) => stream.isSlow()).length > 0; // not some(): every stream counts its pictures
   toPage({ kind: "ages", ages, skew_ms, slow, steering: station.steering.newest(station.clock.toStation(now())) });
+  toPage({ kind: "hearing", report: hearing.report(ages[front ?? ""]?.age_ms ?? null) });
   askPage();
   unanswered++;
   reportAttention();
@@ -299,6 +308,7 @@ const orders = {
     onPageReady(drawResized);
     reportAttention();
   },
+  hearing: ({ port, running, latency_ms }) => hearing.attach(port, running, latency_ms),
   attention({ state, focused }) {
     attention = { attention: state, focused };
     reportAttention();
