@@ -113,6 +113,7 @@ test("sound waits for a picture that is more than 80 ms older, and no longer tha
   assert.equal(waitFor(60, 200), 200); // then it is 60 ms ahead
   assert.equal(waitFor(200, 60), 200);
   assert.equal(waitFor(200, 30), 180);
+  assert.equal(waitFor(1000, -800), 160); // pictures are young again
   assert.equal(waitFor(60, -100), 60); // pictures never wait
   assert.equal(waitFor(60, 5000), 1000);
 });

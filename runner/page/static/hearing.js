@@ -9,7 +9,7 @@ export const SOUND = 255; // in place of a camera's index
 const CONFIG = { codec: "opus", sampleRate: 48_000, numberOfChannels: 1 };
 const MOST_AHEAD_MS = 80; // of the front camera's picture
 const NEAR_MS = 40; // once it is ahead by less, it need not wait
-const STEP_MS = 20; // by which a delay shrinks
+const STEP_MS = 20; // by which a delay changes at least
 const MOST_MS = 1000; // that sound waits for a picture
 const ADAPT_MS = 1000;
 const STALE_MS = 500; // since the audio thread's last report
@@ -22,7 +22,7 @@ const STALE_MS = 500; // since the audio thread's last report
 export function waitFor(target_ms, ahead_ms) {
   if (ahead_ms === null) return target_ms;
   if (ahead_ms > MOST_AHEAD_MS) return Math.min(MOST_MS, target_ms + ahead_ms - NEAR_MS - STEP_MS);
-  return ahead_ms < NEAR_MS ? Math.max(TARGET_MS, target_ms - STEP_MS) : target_ms;
+  return ahead_ms < NEAR_MS ? Math.max(TARGET_MS, target_ms - Math.max(STEP_MS, NEAR_MS - ahead_ms)) : target_ms;
 }
 
 export class Hearing {

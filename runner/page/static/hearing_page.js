@@ -80,11 +80,11 @@ function step(ahead_ms) {
 
 const lost = (counts) => `${whole(counts?.concealed ?? 0)} packets concealed, ${whole(counts?.dry ?? 0)} gaps`;
 
-/** Beside the alarm tones in the Drive view, in the header otherwise. */
+/** Beside the alarm tones, in either view. */
 function place() {
   const isDrive = store.view === "drive";
   if (isDrive) byId("sound").after(button);
-  else byId("theme").before(button);
+  else byId("sound-configure").after(button);
 }
 
 function onHello() {
