@@ -7,6 +7,7 @@ import random
 import struct
 import time
 import wave
+from collections import Counter
 from contextlib import contextmanager
 from itertools import pairwise
 from statistics import median
@@ -14,7 +15,9 @@ from statistics import median
 import inside
 import pytest
 
+from keyed import CONTROLLER, VEHICLE, issue
 from rig import free_port, until
+from runner.security.keyring import Keyring
 
 pytestmark = pytest.mark.gst
 ROBOT = ["vehicle=delivery_robot", "source=test", "fps_max=5"]
@@ -72,6 +75,19 @@ def test_packets_are_as_large_as_the_total_reckons_and_state_when_they_were_capt
     assert 0 < min(ages_ms) < 60
     steps = [b.captured - a.captured for a, b in pairwise(packets[20:])]
     assert median(steps) == pytest.approx(0.02, abs=0.0005)
+
+
+def test_with_keys_it_is_encrypted_and_what_is_on_the_wire_counts(monkeypatch, tmp_path):
+    keys = issue(tmp_path / "keys")
+    vehicle, operator = (Keyring(keys / name) for name in (VEHICLE, CONTROLLER))
+    sizes, packets = [], []
+    inside.losing(monkeypatch, "udpsrc", "src", lambda packet: sizes.append(packet.get_size()), "sound")
+    words = ["sound.packet_ms=40", f"keys={keys / VEHICLE}"]
+    with hearing(*words, keyring=vehicle, viewer=operator, on_sound=packets.append):
+        until(lambda: len(packets) > 50)
+    assert {len(packet.data) for packet in packets} == {120}
+    assert Counter(sizes).most_common(1)[0][0] == 120 + 66 - UDP_IP
+    assert any(packet.captured for packet in packets)
 
 
 def test_whoever_comes_hears_nothing_old():
