@@ -263,9 +263,9 @@ def test_take_control_back_from_another_page(typist, page, chromium, drive):
 
 
 def test_silence_the_tones(typist, page):
-    until(lambda: page.inner_text("#sound") == "Mute")
+    until(lambda: page.inner_text("#sound") == "Mute tones")
     typist.does("sound")
-    assert (page.inner_text("#sound"), typist.presses) == ("Unmute", 1)
+    assert (page.inner_text("#sound"), typist.presses) == ("Unmute tones", 1)
     assert page.inner_text("#line").endswith("✕ tones muted")
 
 

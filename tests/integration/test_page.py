@@ -805,7 +805,7 @@ def stopped(shared, chromium, demo):
         viewing(page, "drive")  # the key press allows the page to play sound
         count = "start(at) { globalThis.tones = (globalThis.tones ?? 0) + 1; super.start(at); }"
         page.evaluate(f"void (OscillatorNode = class extends OscillatorNode {{ {count} }})")
-        until(lambda: page.inner_text("#sound") == "Mute")
+        until(lambda: page.inner_text("#sound") == "Mute tones")
         page.evaluate("boot.worker.terminate()")
         yield page
 

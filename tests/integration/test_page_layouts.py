@@ -859,7 +859,7 @@ def test_a_monitor_passes_on_keys_for_what_only_the_page_shows(chromium, picture
         for muted in ("yes", "no"):
             monitor.keyboard.press("b")
             until(lambda muted=muted: page.evaluate("localStorage.getItem('tod-muted')") == muted)
-            until(lambda muted=muted: (page.inner_text("#sound") == "Unmute") == (muted == "yes"))
+            until(lambda muted=muted: (page.inner_text("#sound") == "Unmute tones") == (muted == "yes"))
             words = f"alarm tones of the page {'muted' if muted == 'yes' else 'on'}"
             until(lambda words=words: words in monitor.inner_text("#toasts"))
         monitor.keyboard.press("w")

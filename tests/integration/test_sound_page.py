@@ -35,16 +35,20 @@ def test_the_page_plays_a_tone_in_step_with_the_pictures_and_mutes_it(chromium):
         until(lambda: page.evaluate(HEARD)["fault"] == "")
         assert page.evaluate(HEARD)["state"] == "running"
         until(lambda: (page.evaluate(HEARD)["ahead_ms"] or 1000) <= 80)
-        until(lambda: page.inner_text("#hearing").startswith("Hearing "))
+        until(lambda: page.inner_text("#hearing").startswith("Sound "))
         shot(page, "sound-configure")
         page.click("#hearing")
         until(lambda: page.evaluate(HEARD)["gain"] < 0.01)
-        until(lambda: page.inner_text("#hearing").startswith("✕ Hearing muted"))
+        until(lambda: page.inner_text("#hearing").startswith("✕ Sound muted"))
         until(lambda: page.evaluate(HEARD)["level_db"] == pytest.approx(TONE_DB, abs=1))  # of what would be heard
         page.click("#hearing")
         until(lambda: page.evaluate(HEARD)["gain"] > 0.9)
         page.keyboard.press("v")
         until(lambda: page.evaluate("tod.view") == "drive")
+        page.keyboard.press("h")
+        until(lambda: page.inner_text("#line").endswith("✕ sound muted"))
+        page.keyboard.press("h")
+        until(lambda: "sound" not in page.inner_text("#line"))
         shot(page, "sound-drive")
 
 
@@ -58,7 +62,8 @@ def test_a_browser_that_blocks_sound_and_a_lost_source_are_named(chromium, tmp_p
     ):
         whys = ("Stream contains no data.", "its source gives no sound within 3 s")  # the second on a busy machine
         until(lambda: page.evaluate(HEARD)["fault"] in whys)
-        until(lambda: page.get_attribute("#hearing", "title") in [f"The vehicle's sound: {why}" for why in whys])
+        titles = [f"The vehicle's sound: {why}\nmute (h)" for why in whys]
+        until(lambda: page.get_attribute("#hearing", "title") in titles)
     with sides("sound=test") as (url, vehicle), opened(chromium, url, script=SOUND_BLOCKED) as page, vehicle():
         until(lambda: page.evaluate(HEARD)["fault"] == "blocked by the browser until a click or key press")
         assert "blocked" in page.inner_text("#hearing")

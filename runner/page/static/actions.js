@@ -12,6 +12,7 @@ import { cycleBirdseye } from "./birdseye.js";
 import { toggleGuides } from "./drive.js";
 import { toggleStraight } from "./straighten.js";
 import { toggleSound } from "./sound.js";
+import { toggleHearing } from "./hearing_page.js";
 import { toggleDrawer, toggleFullScreen, toggleTab, toggleView } from "./views.js";
 import { listMonitors } from "./monitors.js";
 import { request, showProblem, whyNoControl } from "./requests.js";
@@ -59,6 +60,7 @@ export const ACTIONS = {
   drawer: { description: "Drive view: open or close the drawer", run: toggleDrawer },
   map: { description: "the map; in the Drive view opens or closes the drawer with it", run: () => toggleTab("map") },
   sound: { description: "alarm tones on or off", run: toggleSound },
+  hear: { description: "the vehicle's sound on or off", run: toggleHearing },
   full_screen: { description: "full screen", run: toggleFullScreen },
   monitors: { description: "pictures in additional windows, for other monitors", run: listMonitors },
   switch: { description: "switch the selected camera on or off", run: () => store.selected && switchCamera(store.selected) },
@@ -72,7 +74,7 @@ export const ACTIONS = {
 
 // Only the page shows what these change, so a monitor passes them on to it.
 const OF_PAGE = ["camera_left", "camera_front", "camera_right", "camera_rear", "reverse", "view", "birdseye", "drawer",
-  "map", "monitors", "sound", "full_image", "total_lower", "total_raise", "keep"];
+  "map", "monitors", "sound", "hear", "full_image", "total_lower", "total_raise", "keep"];
 const channel = new BroadcastChannel(`tod-actions ${location.pathname}`);
 
 const KEPT_S = 60;

@@ -11,6 +11,7 @@ import { reportAttention } from "./link.js";
 import { monitored, ownPictures } from "./monitored.js";
 import { showProblem } from "./requests.js";
 import { soundFault } from "./sound.js";
+import { hearingFault } from "./hearing_page.js";
 import { SHAPES, showLines } from "./tiles.js";
 import { headingText } from "./track.js";
 import { fitPanels } from "./panels.js";
@@ -46,7 +47,8 @@ function refresh() {
   refreshSpeed();
   refreshMotion();
   setText(byId("drive-vehicle"), store.hello?.vehicle ?? "");
-  setText(byId("line"), [MODES[mode() ?? ""] ?? "no mode", totalWords(), linkWords(), soundFault()].filter(Boolean).join(" · "));
+  const parts = [MODES[mode() ?? ""] ?? "no mode", totalWords(), linkWords(), soundFault(), hearingFault()];
+  setText(byId("line"), parts.filter(Boolean).join(" · "));
   showUplinks(byId("drive-uplinks"), isOnline() ? uplinkLines(store.state, store.sample) : []);
   fitPanels();
 }
@@ -120,7 +122,7 @@ function totalWords() {
 function linkWords() {
   const fault = linkFault();
   if (fault) return fault;
-  const [pause, reason] = [pauseReason(), limitReasons().at(-1)];
+  const [pause, reason] = [pauseReason(), limitReasons().filter((each) => !each.includes(": sound takes ")).at(-1)];
   if (pause) return pause;
   return reason ? `limited: ${limitWords(reason)}` : "connected";
 }

@@ -1,13 +1,13 @@
 /**
  * The vehicle's sound in the worker: decodes its packets, and hands the samples to the browser's audio thread, past the
- * page's main thread. Sound is delayed so that it is not ahead of the front camera's picture by more than 80 ms.
+ * page's main thread. Sound is delayed so that it is not ahead of the main picture by more than 80 ms.
  */
 
 import { TARGET_MS } from "./playout.js";
 
 export const SOUND = 255; // in place of a camera's index
 const CONFIG = { codec: "opus", sampleRate: 48_000, numberOfChannels: 1 };
-const MOST_AHEAD_MS = 80; // of the front camera's picture
+const MOST_AHEAD_MS = 80; // of the main picture, the front camera's unless another is enlarged
 const NEAR_MS = 40; // once it is ahead by less, it need not wait
 const STEP_MS = 20; // by which a delay changes at least
 const MOST_MS = 1000; // that sound waits for a picture
@@ -103,7 +103,7 @@ export class Hearing {
 
   /**
    * What is heard now, and whether it is in step with a picture; a few times a second.
-   * @param {number|null} picture_ms age of the front camera's picture; null: unknown
+   * @param {number|null} picture_ms age of the main picture; null: unknown
    */
   report(picture_ms) {
     const { at, level_db, buffered_ms, counts } = this.#played;

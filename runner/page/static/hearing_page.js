@@ -1,10 +1,11 @@
 /** The vehicle's sound on the page: a button that mutes it, its level and its age. Silent until a click or key press. */
 
-import { listen, store } from "./store.js";
+import { listen, publish, store } from "./store.js";
+import { withKey } from "./hints.js";
 import { byId, make, setAttribute, setText, whole } from "./format.js";
 
 const { worker } = globalThis.boot;
-const KEY = "tod-vehicle-muted";
+const MUTED = "tod-vehicle-muted"; // in the browser's storage
 const FADE_S = 0.02;
 const QUIET_DB = -60; // the lower end of the level meter
 
@@ -16,10 +17,11 @@ let context = null;
 /** @type {GainNode|null} */
 let volume = null;
 let failure = "";
+let wasBlocked = true; // whether the browser blocked it when the last press began
 /** @type {{age_ms: number|null, ahead_ms: number|null, level_db: number|null, target_ms: number, counts: any}|null} */
 let heard = null;
 
-const isMuted = () => localStorage.getItem(KEY) === "yes";
+const isMuted = () => localStorage.getItem(MUTED) === "yes";
 const isBlocked = () => context?.state !== "running";
 
 async function build() {
@@ -42,40 +44,48 @@ function attach(port) {
   refresh();
 }
 
-function unlock() {
-  if (context && isBlocked()) context.resume().catch(() => refresh());
+/** @param {Event} event */
+function unlock(event) {
+  if (event instanceof KeyboardEvent && event.repeat) return;
+  wasBlocked = isBlocked();
+  if (context && wasBlocked) context.resume().catch(() => refresh());
 }
 
-function toggle() {
-  if (!isMuted() && isBlocked()) return; // this press allows it
-  localStorage.setItem(KEY, isMuted() ? "no" : "yes");
+/** Mute or unmute; a press that allows it does not mute it as well. */
+export function toggleHearing() {
+  if (!store.hello?.sound) return publish("toast", { text: "sound is not chosen: sound=", level: "hint" });
+  if (!isMuted() && isBlocked()) return;
+  localStorage.setItem(MUTED, isMuted() ? "no" : "yes");
   refresh();
 }
 
+const BLOCKED = "blocked by the browser until a click or key press";
+
 /** Why nothing is heard; "": it is. */
 function fault() {
+  if (isMuted()) return "muted";
   const sample = store.sample?.sound;
   if (failure) return failure;
   if (sample?.fault || sample?.refused) return sample.fault ?? sample.refused;
-  if (isBlocked()) return "blocked by the browser until a click or key press";
-  if (isMuted()) return "muted";
+  if (isBlocked()) return BLOCKED;
   return (heard?.age_ms ?? null) === null ? "nothing arrives" : "";
 }
 
 function refresh() {
   if (context && volume) volume.gain.setTargetAtTime(isMuted() ? 0 : 1, context.currentTime, FADE_S);
   const why = fault();
-  const short = isMuted() ? "muted" : why ? (isBlocked() ? "blocked" : "nothing") : `${whole(heard?.age_ms)} ms`;
-  setText(words, `${why ? "✕ " : ""}Hearing ${short}`);
+  const short = why === "muted" ? why : why === BLOCKED ? "blocked" : why ? "none" : `${whole(heard?.age_ms)} ms`;
+  setText(words, `${why ? "✕ " : ""}Sound ${short}`);
   setAttribute(button, "data-level", why ? "near" : "fine");
   level.value = heard?.level_db ?? QUIET_DB;
-  button.title = `The vehicle's sound: ${why || `${step(heard?.ahead_ms ?? null)}; ${lost(heard?.counts)}; click to mute`}`;
+  const title = `The vehicle's sound: ${why || `${step(heard?.ahead_ms ?? null)}; ${lost(heard?.counts)}`}`;
+  button.title = `${title}\n${withKey(isMuted() ? "unmute" : "mute", "hear")}`;
 }
 
 /** @param {number|null} ahead_ms */
 function step(ahead_ms) {
-  if (ahead_ms === null) return "difference to the front camera unknown";
-  return `${whole(Math.abs(ahead_ms))} ms ${ahead_ms < 0 ? "behind" : "ahead of"} the front camera`;
+  if (ahead_ms === null) return "difference to the main picture unknown";
+  return `${whole(Math.abs(ahead_ms))} ms ${ahead_ms < 0 ? "behind" : "ahead of"} the main picture`;
 }
 
 const lost = (counts) => `${whole(counts?.concealed ?? 0)} packets concealed, ${whole(counts?.dry ?? 0)} gaps`;
@@ -95,7 +105,7 @@ function onHello() {
 export function startHearing() {
   if (store.view === "monitor") return;
   button.append(words, level);
-  button.addEventListener("click", toggle);
+  button.addEventListener("click", () => (!wasBlocked || isMuted()) && toggleHearing()); // allowed since the press began
   for (const kind of ["pointerup", "keydown"]) addEventListener(kind, unlock, true);
   listen("hello", onHello);
   listen("view", place);
@@ -107,6 +117,9 @@ export function startHearing() {
   addEventListener("storage", refresh); // muted in another window
   place();
 }
+
+/** For the line of the Drive view. */
+export const hearingFault = () => (store.hello?.sound && fault() ? `✕ sound${isMuted() ? "" : ":"} ${fault()}` : "");
 
 /** For tests. */
 export const hearing = () => ({ ...heard, state: context?.state, gain: volume?.gain.value, fault: fault() });

@@ -75,7 +75,7 @@ export function toggleSound() {
 export const soundFault = () => (!isDriving ? "" : isMuted() ? "✕ tones muted" : isBlocked() ? "✕ tones blocked" : "");
 
 function refresh() {
-  const words = isMuted() ? "Unmute" : isBlocked() ? "Allow sound" : "Mute";
+  const words = isMuted() ? "Unmute tones" : isBlocked() ? "Allow sound" : "Mute tones";
   const isAllowed = isMuted() || !isBlocked();
   const title = isAllowed ? withKey("alarm tones on or off", "sound") : "the browser blocks sound until a click or key press";
   for (const button of buttons) {

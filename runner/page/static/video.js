@@ -5,7 +5,7 @@
  */
 
 import { ageOf, skewOf } from "./ages.js";
-import { isTopView, rolesOf } from "./arrange.js";
+import { isTopView } from "./arrange.js";
 import { Clock, now } from "./clock.js";
 import { described } from "./drawn_pictures.js";
 import { hasEnded } from "./ended.js";
@@ -29,7 +29,6 @@ import "./guide_lines.js";
 import "./guides.js";
 import "./liveness.js";
 import "./pace.js";
-import "./placing.js";
 import "./playout.js";
 import "./projection.js";
 import "./overlay.js";
@@ -75,13 +74,11 @@ let streamsKey = ""; // the vehicle that the streams were made for
 /** @type {string[]} */
 let guided = []; // cameras whose guides are shown
 /** @type {string|null} */
-let first = null; // camera whose picture is drawn first
+let first = null; // camera whose picture is drawn first, and with which sound keeps step
 /** @type {string[]} */
 let straight = []; // cameras whose pictures are straightened
 const hearing = new Hearing(station.clock, (why) => console.warn(`the vehicle's sound: ${why}`));
 const ground = new GroundView(station.steering, (why) => toPage({ kind: "flat", why }));
-/** @type {string|null} */
-let front = null; // the front camera, with which sound keeps step
 let isAsleep = true; // no animation frame is requested
 let tickedAt = now();
 let wasLate = false; // at the last tick
@@ -170,7 +167,6 @@ function onHello(message) {
     station.dimensions = message.dimensions;
     streams.forEach((stream) => stream.dispose());
     streams = message.cameras.map((camera) => new Stream(camera, station));
-    front = rolesOf(message.cameras).front?.name ?? null;
     streamsKey = key;
     applyGuides();
     applyStraight();
@@ -259,7 +255,7 @@ function reportAges() {
   const skew_ms = skewOf(streams.map(({ status, shown }) => ({ status, captured: shown?.meta.captured ?? NaN })));
   const slow = streams.filter((stream) => stream.isSlow()).length > 0; // not some(): every stream counts its pictures
   toPage({ kind: "ages", ages, skew_ms, slow, steering: station.steering.newest(station.clock.toStation(now())) });
-  toPage({ kind: "hearing", report: hearing.report(ages[front ?? ""]?.age_ms ?? null) });
+  toPage({ kind: "hearing", report: hearing.report(ages[first ?? ""]?.age_ms ?? null) });
   askPage();
   unanswered++;
   reportAttention();
