@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from gi.repository import Gst
 
+from runner.core.model import Element
 from runner.graph import launch
 from runner.gst.requests import RequestLimit
 from runner.gst.streams import NOT_SEEKABLE, add_capture_time, drop_queued_packet, passed_counts
@@ -68,9 +69,15 @@ def sound_problem(plan: SoundPlan) -> str | None:
         pipeline.set_state(Gst.State.PLAYING)
         while time.monotonic() < until:
             if message := bus.timed_pop_filtered(LOOK_MS * Gst.MSECOND, Gst.MessageType.ERROR):
-                return str(message.parse_error()[0].message)
+                return f"{_named(plan.source[0])}: {str(message.parse_error()[0].message).rstrip('.')}"
             if sink.get_property("last-sample"):
                 return None
-        return f"its source gives no sound within {CHECK_S:g} s"
+        return f"{_named(plan.source[0])} gives no sound within {CHECK_S:g} s"
     finally:
         pipeline.set_state(Gst.State.NULL)
+
+
+def _named(source: Element) -> str:
+    """The element and what it reads: alsasrc hw:1."""
+    read = (source.properties.get(key) for key in ("device", "location"))
+    return " ".join(str(each) for each in (source.factory, *read) if each)

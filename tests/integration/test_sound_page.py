@@ -60,7 +60,8 @@ def test_a_browser_that_blocks_sound_and_a_lost_source_are_named(chromium, tmp_p
         opened(chromium, url, script=SOUND_BLOCKED) as page,
         vehicle(),
     ):
-        whys = ("Stream contains no data.", "its source gives no sound within 3 s")  # the second on a busy machine
+        source = f"filesrc {missing}"  # on a busy machine, the second
+        whys = (f"{source}: Stream contains no data", f"{source} gives no sound within 3 s")
         until(lambda: page.evaluate(HEARD)["fault"] in whys)
         titles = [f"The vehicle's sound: {why}\nmute (h)" for why in whys]
         until(lambda: page.get_attribute("#hearing", "title") in titles)
