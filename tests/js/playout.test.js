@@ -1,7 +1,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 import { lastPeriod, Playout, RATE, TARGET_MS } from "../../runner/page/static/playout.js";
-import { waitFor } from "../../runner/page/static/hearing.js";
+import { Step, waitFor } from "../../runner/page/static/hearing.js";
 
 const LENGTH = RATE / 50; // samples of a packet
 const HZ = 440;
@@ -82,6 +82,17 @@ test("a buffer that stays too long is shortened, slowly or at once", () => {
   for (let number = 0; number < 40; number++) burst.push(chunk(number));
   drive(burst, 110, { from: 40 });
   assert.ok(burst.buffered_ms < TARGET_MS + 80, String(burst.buffered_ms));
+});
+
+test("sound does not wait for a picture that stands still for a moment", () => {
+  const step = new Step();
+  const look = (ahead_ms, from, to) => {
+    for (let now = from; now < to; now += 250) step.look(typeof ahead_ms === "function" ? ahead_ms(now) : ahead_ms, now);
+    return step.target_ms;
+  };
+  assert.equal(look((now) => (now % 2000 < 1000 ? 1500 : -100), 0, 20_000), 60);
+  assert.equal(look(null, 20_000, 30_000), 60); // it does not move
+  assert.equal(look(200, 30_000, 33_500), 200); // it has been older for a whole window
 });
 
 test("a stream that begins anew is played at once", () => {

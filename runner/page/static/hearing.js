@@ -11,7 +11,8 @@ const MOST_AHEAD_MS = 80; // of the main picture, the front camera's unless anot
 const NEAR_MS = 40; // once it is ahead by less, it need not wait
 const STEP_MS = 20; // by which a delay changes at least
 const MOST_MS = 1000; // that sound waits for a picture
-const ADAPT_MS = 1000;
+const WINDOW_MS = 3000; // in which the least lead counts: a picture that stands still for a moment does not delay sound
+const SETTLE_MS = 500; // after a change, before the next window
 const STALE_MS = 500; // since the audio thread's last report
 
 /**
@@ -23,6 +24,24 @@ export function waitFor(target_ms, ahead_ms) {
   if (ahead_ms === null) return target_ms;
   if (ahead_ms > MOST_AHEAD_MS) return Math.min(MOST_MS, target_ms + ahead_ms - NEAR_MS - STEP_MS);
   return ahead_ms < NEAR_MS ? Math.max(TARGET_MS, target_ms - Math.max(STEP_MS, NEAR_MS - ahead_ms)) : target_ms;
+}
+
+/** How long sound waits, by its lead over the pictures, which jumps where a picture was lost. Times are ms. */
+export class Step {
+  target_ms = TARGET_MS;
+  #least = Infinity; // lead in this window
+  #began = NaN;
+
+  /** @param {number|null} ahead_ms as of `waitFor`  @param {number} now */
+  look(ahead_ms, now) {
+    if (Number.isNaN(this.#began)) this.#began = now;
+    if (ahead_ms !== null && now >= this.#began) this.#least = Math.min(this.#least, ahead_ms);
+    if (now - this.#began < WINDOW_MS) return;
+    const before = this.target_ms;
+    if (this.#least < Infinity) this.target_ms = waitFor(before, this.#least);
+    this.#began = this.target_ms === before ? now : now + SETTLE_MS;
+    this.#least = Infinity;
+  }
 }
 
 export class Hearing {
@@ -39,8 +58,7 @@ export class Hearing {
   #waiting = []; // of packets in the decoder, which itself ignores times after the first one
   #played = { at: -Infinity, level_db: -100, buffered_ms: 0, counts: null };
   #heard = { at: -Infinity, age_ms: NaN }; // the same, of sound that was not concealed
-  #target_ms = TARGET_MS;
-  #adaptedAt = -Infinity;
+  #step = new Step();
 
   /** @param {import("./clock.js").Clock} clock  @param {(why: string) => void} onFailure */
   constructor(clock, onFailure) {
@@ -103,7 +121,7 @@ export class Hearing {
 
   /**
    * What is heard now, and whether it is in step with a picture; a few times a second.
-   * @param {number|null} picture_ms age of the main picture; null: unknown
+   * @param {number|null} picture_ms age of the main picture; null: unknown, or it does not move
    */
   report(picture_ms) {
     const { at, level_db, buffered_ms, counts } = this.#played;
@@ -112,15 +130,13 @@ export class Hearing {
     const age_ms = isRecent(this.#heard.at) ? this.#heard.age_ms : null;
     const ahead_ms = age_ms === null || picture_ms === null ? null : picture_ms - age_ms;
     this.#keepStep(ahead_ms);
-    return { age_ms, ahead_ms, level_db: isHeard ? level_db : null, buffered_ms, target_ms: this.#target_ms, counts };
+    return { age_ms, ahead_ms, level_db: isHeard ? level_db : null, buffered_ms, target_ms: this.#step.target_ms, counts };
   }
 
   #keepStep(ahead_ms) {
-    if (performance.now() - this.#adaptedAt < ADAPT_MS) return;
-    this.#adaptedAt = performance.now();
-    const target_ms = waitFor(this.#target_ms, ahead_ms);
-    if (target_ms === this.#target_ms) return;
-    this.#target_ms = target_ms;
-    this.#port?.postMessage({ target_ms });
+    const before = this.#step.target_ms;
+    this.#step.look(ahead_ms, performance.now());
+    const { target_ms } = this.#step;
+    if (target_ms !== before) this.#port?.postMessage({ target_ms });
   }
 }

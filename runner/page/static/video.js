@@ -15,6 +15,7 @@ import { hasGpu } from "./picture.js";
 import { startWarps } from "./remote_warp.js";
 import { askPage, onPageReady } from "./resizing.js";
 import { Steering } from "./steering.js";
+import { MOVING } from "./status.js";
 import { canStraighten } from "./straight.js";
 import { Stream } from "./stream.js";
 import { drawInTurn } from "./turns.js";
@@ -33,7 +34,6 @@ import "./playout.js";
 import "./projection.js";
 import "./overlay.js";
 import "./shown_region.js";
-import "./status.js";
 import "./straight_view.js";
 import "./stream_canvas.js";
 import "./warp.js";
@@ -255,7 +255,8 @@ function reportAges() {
   const skew_ms = skewOf(streams.map(({ status, shown }) => ({ status, captured: shown?.meta.captured ?? NaN })));
   const slow = streams.filter((stream) => stream.isSlow()).length > 0; // not some(): every stream counts its pictures
   toPage({ kind: "ages", ages, skew_ms, slow, steering: station.steering.newest(station.clock.toStation(now())) });
-  toPage({ kind: "hearing", report: hearing.report(ages[first ?? ""]?.age_ms ?? null) });
+  const main = ages[first ?? ""];
+  toPage({ kind: "hearing", report: hearing.report(main && MOVING.includes(main.status) ? main.age_ms : null) });
   askPage();
   unanswered++;
   reportAttention();
