@@ -357,11 +357,13 @@ class LogSettings:
     """What is logged of a drive, and which drives stay.
 
     video      whether that holds the video of every camera
+    sound      whether the operator's log holds the vehicle's sound
     keep_gb    what the drives of `drives=DIR` may take, 10^9 bytes; None: any size
     keep_days  age from which they are removed; None: none
     """
 
     video: bool = False
+    sound: bool = False
     keep_gb: float | None = None
     keep_days: float | None = None
 

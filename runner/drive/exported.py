@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+from base64 import b64decode
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, Protocol
@@ -13,7 +14,7 @@ from runner.drive.captures import ReadVideo, RecordedVideo, files
 from runner.drive.read import Drive, Side
 from runner.errors import RunError
 from runner.records import Json
-from runner.records.lines import KINDS, LinkSample, Note, Record, line_to_json
+from runner.records.lines import KINDS, LinkSample, Note, Record, SoundReceived, line_to_json
 from runner.records.operator import Sample
 from runner.records.vehicle import Position
 from runner.system.clocks import SECOND_NS
@@ -33,7 +34,7 @@ TOPICS = {
 VIDEO_TOPICS = {"vehicle": "/{camera}/video", "operator": "/{camera}/video_received"}
 
 
-POSITION_TOPIC, NOTE_TOPIC = "/position", "/notes"
+POSITION_TOPIC, NOTE_TOPIC, SOUND_TOPIC = "/position", "/notes", "/sound_received"
 
 
 class ExportTarget(Protocol):
@@ -50,6 +51,9 @@ class ExportTarget(Protocol):
 
     def picture(self, topic: str, camera: str, unit: Unit, ns: int) -> None:
         """An access unit of a camera, captured then."""
+
+    def sound(self, packet: bytes, ns: int) -> None:
+        """An Opus packet of the vehicle's sound, captured then."""
 
 
 class ExportMessage(NamedTuple):
@@ -97,6 +101,7 @@ def _streams(
     for name, side in drive.sides.items():
         # Without a log of the vehicle, its positions are in the operator's log.
         yield _lines(name, side, target, positions="vehicle" not in drive.sides)
+        yield _sound(side, target)
         for camera, recorded in files(side).items():
             yield _pictures(drive.path, VIDEO_TOPICS[name], camera, recorded, target, read_video, on_warning)
 
@@ -159,6 +164,16 @@ def _pictures(
         except RunError as error:
             more = "the rest of it" if last >= file.captured(0) else "it"
             on_warning(f"{error}; the export continues without {more}")
+
+
+def _sound(side: Side, target: ExportTarget) -> Iterator[ExportMessage]:
+    """The vehicle's sound, at its capture times; where one is unknown, when it arrived."""
+    last = -1
+    for line in side.of(SoundReceived):
+        for captured, packet in line.packets:
+            at = side.began_s + line.t if captured is None else side.corrected(captured, line.t)
+            last = max(round(at * SECOND_NS), last + 1)  # clocks may be set back
+            yield ExportMessage(last, lambda p=packet, ns=last: target.sound(b64decode(p), ns))  # type: ignore[misc]
 
 
 def cameras_of(drive: Drive) -> list[str]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 from msgspec import UNSET
 
 from runner.drive.captures import ReadVideo
-from runner.drive.exported import NOTE_TOPIC, POSITION_TOPIC, names_of, write_all
+from runner.drive.exported import NOTE_TOPIC, POSITION_TOPIC, SOUND_TOPIC, names_of, write_all
 from runner.drive.read import Drive
 from runner.errors import RunError, reason
 from runner.records import Json
@@ -132,6 +132,13 @@ class _Channels:
 
         video = CompressedVideo(timestamp=_timestamp(ns), frame_id=camera, data=unit.data, format=unit.codec)
         self._typed(topic, CompressedVideoChannel).log(video, log_time=ns)
+
+    def sound(self, packet: bytes, ns: int) -> None:
+        from foxglove.channels import CompressedAudioChannel
+        from foxglove.messages import CompressedAudio
+
+        audio = CompressedAudio(timestamp=_timestamp(ns), data=packet, format="opus")
+        self._typed(SOUND_TOPIC, CompressedAudioChannel).log(audio, log_time=ns)
 
     def _typed(self, topic: str, kind: Any) -> Any:
         if topic not in self._made:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from runner.drive.captures import ReadVideo
-from runner.drive.exported import NOTE_TOPIC, POSITION_TOPIC, VIDEO_TOPICS, cameras_of, write_all
+from runner.drive.exported import NOTE_TOPIC, POSITION_TOPIC, SOUND_TOPIC, VIDEO_TOPICS, cameras_of, write_all
 from runner.drive.read import Drive
 from runner.errors import RunError, os_errors_as
 from runner.records import Json
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from runner.apply import Unit
 
 TEXT, FIX, VIDEO = "std_msgs/msg/String", "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/CompressedImage"
+AUDIO_DATA, AUDIO = "audio_common_msgs/msg/AudioData", "audio_common_msgs/msg/AudioDataStamped"
+AUDIO_DEFINITIONS = {AUDIO_DATA: "uint8[] data", AUDIO: "std_msgs/Header header\naudio_common_msgs/AudioData audio"}
 GPS = 1  # SERVICE_GPS of sensor_msgs/NavSatStatus
 FRAME = "gps"
 LATEST_S = 2**31 - 1  # builtin_interfaces/Time counts in 32 bits
@@ -93,6 +95,16 @@ class _Topics:
     def picture(self, topic: str, camera: str, unit: Unit, ns: int) -> None:
         data = np.frombuffer(unit.data, np.uint8)
         self._write(ros_name(topic), VIDEO, ns, header=self._header(ns, camera), format=unit.codec, data=data)
+
+    def sound(self, packet: bytes, ns: int) -> None:
+        from rosbags.typesys import get_types_from_msg
+
+        types: Any = self._store.types
+        if AUDIO not in types:
+            for kind, definition in AUDIO_DEFINITIONS.items():
+                self._store.register(get_types_from_msg(definition, kind))
+        data = types[AUDIO_DATA](data=np.frombuffer(packet, np.uint8))
+        self._write(SOUND_TOPIC, AUDIO, ns, header=self._header(ns, "sound"), audio=data)
 
     def _header(self, ns: int, frame: str) -> Any:
         sec, nanosec = divmod(ns, SECOND_NS)

@@ -37,9 +37,10 @@ from runner.system.held_up import LateCheck
 from runner.system.service import notify
 
 if TYPE_CHECKING:
-    from runner.apply import OnSound, OnUnit, OperatorSide
+    from runner.apply import OnSound, OnUnit, OperatorSide, SoundPacket
     from runner.configuration.experiment import TimedRequest
     from runner.operator.demand import Demand
+    from runner.operator.recorded_sound import RecordedSound
     from runner.ros.pictures import DecodedPictures
 
 SAMPLE_S = 0.25
@@ -269,6 +270,23 @@ class _MetricsListener(Listener):
         self._metrics.take(sample)
 
 
+def _recorded_sound() -> RecordedSound:
+    from runner.operator.recorded_sound import RecordedSound
+
+    return RecordedSound()
+
+
+def _all_of(*handlers: OnSound | None) -> OnSound | None:
+    """Calls each handler that there is."""
+    given = [handler for handler in handlers if handler]
+
+    def handle(packet: SoundPacket) -> None:
+        for handler in given:
+            handler(packet)
+
+    return handle if given else None
+
+
 def _demand() -> Demand:
     from runner.operator.demand import Demand
 
@@ -315,8 +333,10 @@ def live_operator(
     versions = apply.versions(element for plan in (*plans, sound) if plan for element in plan.operator)
     pictures, requests = _ros_pictures(setup, station), config.experiment().requests
     drive = Log(log, "operator", document if log else {}, versions, station.note)
+    recorded = _recorded_sound() if log and setup.log.sound and sound else None
+    station.records_sound = recorded is not None
     if log:
-        station.listeners.append(DriveLog(station, drive))
+        station.listeners.append(DriveLog(station, drive, recorded))
     video = apply.VideoFiles(log, drive.video, drive.video_shift) if log and setup.log.video else None
 
     def publish(camera: str, captured: float | None, width: int, height: int, data: bytes) -> None:
@@ -339,7 +359,7 @@ def live_operator(
             uplinks=station.addresses if setup.uplinks else None,
             cameras=() if on_demand else None,
             sound=sound,
-            on_sound=on_sound,
+            on_sound=_all_of(on_sound, recorded.add if recorded else None),
         )
 
     operator = LiveOperator(setup, station, drive, build, requests, _demand() if on_demand else None)

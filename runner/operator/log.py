@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from runner.drive.log import Log
 from runner.operator.station import Listener, Station
-from runner.records.lines import Note
+from runner.records.lines import Note, SoundReceived
 from runner.records.operator import CameraSample, Sample
 from runner.records.vehicle import Offline, VehicleState
 
+if TYPE_CHECKING:
+    from runner.operator.recorded_sound import RecordedSound
+
 
 class DriveLog(Listener):
-    """Listens to a station and writes every change into a log."""
+    """Listens to a station and writes every change into a log.
 
-    def __init__(self, station: Station, log: Log) -> None:
-        self._station, self._log = station, log
+    sound  that is received; None: it is not recorded
+    """
+
+    def __init__(self, station: Station, log: Log, sound: RecordedSound | None = None) -> None:
+        self._station, self._log, self._sound = station, log, sound
 
     def on_state(self, state: VehicleState | None) -> None:
         now = self._log.now()
@@ -24,6 +31,8 @@ class DriveLog(Listener):
     def on_sample(self, sample: Sample) -> None:
         cameras = {name: self._with_arrivals(name, camera) for name, camera in sample.cameras.items()}
         self._log.record(replace(sample, t=self._log.now(), cameras=cameras))
+        if self._sound and (packets := self._sound.take()):
+            self._log.record(SoundReceived(self._log.now(), packets))
 
     def on_note(self, note: Note) -> None:
         self._log.note(note.text)

@@ -19,12 +19,18 @@ UNEXPLAINED = "the vehicle has no room for another listener"
 
 
 def sound_sample(
-    received: SoundReception | None, state: VehicleState | None, clock: ClockDifference | None, operator: str
+    received: SoundReception | None,
+    state: VehicleState | None,
+    clock: ClockDifference | None,
+    operator: str,
+    *,
+    recorded: bool = False,
 ) -> SoundSample | UnsetType:
     """What to state of it; absent: this side receives none.
 
     clock     the vehicle's against this machine's; None: unknown
     operator  id of this side's
+    recorded  whether the log of this side holds it
     """
     if received is None:
         return UNSET
@@ -40,6 +46,7 @@ def sound_sample(
         rebuilt=received.rebuilt,
         fault=UNSET if stated is UNSET or stated.fault is None else stated.fault,
         refused=refusals.get(operator, UNEXPLAINED) if received.refused else UNSET,
+        recorded=recorded,
     )
 
 
@@ -52,7 +59,8 @@ def sound_words(sound: SoundSample) -> str:
     if sound.level_db is None:
         return "sound: nothing arrives"
     age = "age unknown" if sound.latency_ms is None else f"{sound.latency_ms:.0f} ms old"
-    return f"sound: {age}, {sound.level_db:.0f} dB, {sound.lost} packets lost"
+    recorded = ", recorded" if sound.recorded else ""
+    return f"sound: {age}, {sound.level_db:.0f} dB, {sound.lost} packets lost{recorded}"
 
 
 def sound_notes(before: VehicleState, state: VehicleState) -> Iterator[str]:

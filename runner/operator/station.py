@@ -173,6 +173,7 @@ class Station:
         self.meters = {name: ReceptionMeter(each) for name, each in fps.items()}
         self.samples: Mapping[str, Reception] = {}
         self.sound: SoundSample | UnsetType = UNSET
+        self.records_sound = False
         self._rates: dict[str, MeasuredRates] = {}
         self._refusals = Refusals(self.identity)
         self.uplinks: Sequence[UplinkRow] = ()  # none while the vehicle is offline
@@ -295,7 +296,7 @@ class Station:
         self.samples = samples
         for text in self._refusals.update(samples, cameras, now):
             self.note(text)
-        self.sound = sound_sample(sound, self.state, self.latency.clock, self.identity)
+        self.sound = sound_sample(sound, self.state, self.latency.clock, self.identity, recorded=self.records_sound)
         sample, state = self._sample(over), self.state
         self.uplinks = uplink_rows(state, sample.uplinks) if state else []
         for listener in self.listeners:

@@ -66,6 +66,17 @@ class VideoShifted:
 
 
 @dataclass(frozen=True, slots=True)
+class SoundReceived:
+    """Packets of the vehicle's sound, as they arrived since the line before (`log.sound=true`).
+
+    packets  of each, when its first sample was captured, s since 1970 by the vehicle's clock, if known; Opus, base64
+    """
+
+    t: Time
+    packets: tuple[tuple[float | None, str], ...]
+
+
+@dataclass(frozen=True, slots=True)
 class LinkSample:
     """State of the limited link between the sides; counters run since it was made."""
 
@@ -114,6 +125,7 @@ Record = (
     | Note
     | VideoBegan
     | VideoShifted
+    | SoundReceived
     | LinkSample
     | ClockSet
     | LinesDropped
@@ -131,6 +143,7 @@ KINDS: dict[type[Any], str] = {  # value of a line's key `log`
     Note: "note",
     VideoBegan: "video",
     VideoShifted: "video_shift",
+    SoundReceived: "sound",
     LinkSample: "link",
     ClockSet: "clock_set",
     LinesDropped: "dropped",

@@ -79,6 +79,7 @@ class SoundSample:
     refused: Annotated[
         str | UnsetType, "why the vehicle refuses this operator the sound, in words; absent: it does not"
     ] = UNSET
+    recorded: Annotated[bool, "whether the log of this side holds it"] = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,10 +8,12 @@ names another path.
   /position               foxglove.LocationFix
   /CAMERA/video           foxglove.CompressedVideo, as sent, at capture times (drives with log.video=true)
   /CAMERA/video_received  the same, as received
+  /sound_received         foxglove.CompressedAudio, Opus, at capture times (drives with log.sound=true)
   /notes                  foxglove.Log
   /events/..., /decision, /telemetry, /operator/state, /operator/sample, /link    JSON with its schema
 
-In a ROS 2 bag positions are sensor_msgs/NavSatFix, video is sensor_msgs/CompressedImage, one access unit per message in
+In a ROS 2 bag positions are sensor_msgs/NavSatFix, sound is audio_common_msgs/AudioDataStamped, one Opus packet per
+message, video is sensor_msgs/CompressedImage, one access unit per message in
 the format h264 or h265, and everything else is std_msgs/String with the line of JSON.
 
 Video is exported as it was sent, mostly with one key frame, its first. Players that seek, such as Foxglove, need more:

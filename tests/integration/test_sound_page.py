@@ -19,27 +19,32 @@ HEARD = "() => tod.hearing()"
 
 
 @contextmanager
-def sides(*overrides):
-    """Vehicle and operator as two processes. Yields the page's address, and a way to start the vehicle."""
+def sides(*overrides, more=()):
+    """Vehicle and operator as two processes. Yields the page's address, and a way to start the vehicle.
+
+    more  words of the operator alone
+    """
     control, media, port = (free_port() for _ in range(3))
     words = (*ROBOT, f"control.port={control}", f"media.port={media}", f"page.port={port}")
-    with private_broker(Endpoint("127.0.0.1", control)), process("operator", *words, "sound=test"):
+    with private_broker(Endpoint("127.0.0.1", control)), process("operator", *words, "sound=test", *more):
         until(lambda: answers(port))
         yield f"http://127.0.0.1:{port}/", partial(process, "vehicle", *words, *overrides)
 
 
-def test_the_page_plays_a_tone_in_step_with_the_pictures_and_mutes_it(chromium):
-    with sides("sound=test") as (url, vehicle), opened(chromium, url) as page, vehicle():
+def test_the_page_plays_a_tone_in_step_with_the_pictures_and_mutes_it(chromium, tmp_path):
+    recorded = (f"log={tmp_path / 'drive'}", "log.sound=true")
+    with sides("sound=test", more=recorded) as (url, vehicle), opened(chromium, url) as page, vehicle():
         page.click("#vehicle")  # browsers play nothing before a press
         until(lambda: page.evaluate(HEARD)["level_db"] == pytest.approx(TONE_DB, abs=1))
         until(lambda: page.evaluate(HEARD)["fault"] == "")
         assert page.evaluate(HEARD)["state"] == "running"
         until(lambda: (page.evaluate(HEARD)["ahead_ms"] or 1000) <= 80)
         until(lambda: page.inner_text("#hearing").startswith("Sound "))
+        until(lambda: page.inner_text("#hearing").endswith(" ms · recorded"))
         shot(page, "sound-configure")
         page.click("#hearing")
         until(lambda: page.evaluate(HEARD)["gain"] < 0.01)
-        until(lambda: page.inner_text("#hearing").startswith("✕ Sound muted"))
+        until(lambda: page.inner_text("#hearing") == "✕ Sound muted · recorded")
         until(lambda: page.evaluate(HEARD)["level_db"] == pytest.approx(TONE_DB, abs=1))  # of what would be heard
         page.click("#hearing")
         until(lambda: page.evaluate(HEARD)["gain"] > 0.9)

@@ -75,7 +75,7 @@ function refresh() {
   if (context && volume) volume.gain.setTargetAtTime(isMuted() ? 0 : 1, context.currentTime, FADE_S);
   const why = fault();
   const short = why === "muted" ? why : why === BLOCKED ? "blocked" : why ? "none" : `${whole(heard?.age_ms)} ms`;
-  setText(words, `${why ? "✕ " : ""}Sound ${short}`);
+  setText(words, `${why ? "✕ " : ""}Sound ${short}${store.sample?.sound?.recorded ? " · recorded" : ""}`);
   setAttribute(button, "data-level", why ? "near" : "fine");
   level.value = heard?.level_db ?? QUIET_DB;
   const title = `The vehicle's sound: ${why || `${step(heard?.ahead_ms ?? null)}; ${lost(heard?.counts)}`}`;

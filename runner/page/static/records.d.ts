@@ -262,6 +262,8 @@ export interface SoundSample {
   fault?: string;
   /** why the vehicle refuses this operator the sound, in words; absent: it does not */
   refused?: string;
+  /** whether the log of this side holds it */
+  recorded: boolean;
 }
 
 /** What the operator's side measures a few times a second */
