@@ -90,7 +90,7 @@ def test_print_shows_both_sides(tod: Command) -> None:
     assert printed["kbps_on_the_wire"] == 50.4
     assert printed["vehicle"].startswith("alsasrc name=source device=default provide-clock=false")
     assert "opusenc name=encoder bitrate=24000 bitrate-type=cbr frame-size=20" in printed["vehicle"]
-    assert "rtpjitterbuffer name=jitterbuffer latency=60 do-lost=true" in printed["operator"]
+    assert "rtpjitterbuffer name=jitterbuffer latency=40 do-lost=true" in printed["operator"]
     text = tod("print", "sound=alsa", "source=test").out.splitlines()
     assert "# sound: 50.4 kbit/s on the wire, taken from the total" in text
     assert f"gst-launch-1.0 {printed['operator']}" in text
