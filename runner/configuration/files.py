@@ -65,6 +65,13 @@ def built_on(path: Path, directories: Sequence[Path]) -> set[Path]:
     return found
 
 
+def states(path: Path, directories: Sequence[Path], key: str) -> bool:
+    """Whether a file, or one that it builds on, states a key; one that cannot be read states none."""
+    with suppress(ConfigError):
+        return any(key in load_file(file) for file in built_on(path, directories))
+    return False
+
+
 def bases_of(path: Path) -> list[str]:
     """Files of its own group that a file builds on; raises ConfigError if it cannot be read."""
     content = load_file(path)

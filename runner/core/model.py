@@ -270,14 +270,13 @@ class Source:
     """Where a camera's frames come from: elements with {placeholders} for the mount's device, address, clip and size.
 
     encoded     by format, elements up to pictures as the origin encodes them, for graphs that pass these on
-    settings    values for cameras that name none, from the file itself: clip, device, address, bag, topic
+    settings    values for cameras that name none: clip, device, address, bag, topic
     capture     format requested from its cameras unless they state another, see `Capture`
     credentials file with user name and password, for cameras that name none
     medium      which of the video media that an IP camera offers, counted from 0
     first_reply_s  how long it may take for each answer until it streams
     loop        restart at the end without a gap (a clip, a bag)
-    frozen_s    without a frame for this long, and for 10 frame intervals, the source of a playing camera is replaced;
-                None: it is not monitored
+    frozen_s    without a frame for so long, and 10 frame intervals, a playing source is replaced; None: not monitored
     repeated_s  the same picture for this long is a fault; None: pictures are not compared
     render      name of the procedural drive that makes the clip, or ""
     render_s    length of that drive, s
@@ -482,7 +481,7 @@ class Vehicle:
     mode     at the start
     modes    the rules of each mode, in order
     uplinks  by name, kbit/s that are left to other traffic; empty: there is one, without a name
-    sound    kbit/s on the wire of one copy of its sound; 0: it sends none
+    sound    kbit/s on the wire of one copy of its sound; 0: none
     fixed    cameras whose pictures are sent as their sources encode them, whatever the rules would choose
     """
 

@@ -300,20 +300,12 @@ class PageServer(Listener):
         def answer(result: str, reason: str) -> None:
             viewer.post("reply", {"id": request_id, "result": result, "reason": reason})
 
-        if problem := self._refusal(viewer, request_id, document.get("event")):
+        if problem := _refusal(self._windows.holder_for(viewer), request_id, document.get("event")):
             answer("refused", problem)
         elif kind := next((kind for kind in ("layout", "drive") if kind in document), None):
             self._page_layouts.save(kind, document, answer)
         else:
             self._send_request(document, answer)
-
-    def _refusal(self, viewer: PageViewer, request_id: object, event: object) -> str | None:
-        """Why a viewer's request is refused; None: it is accepted."""
-        if not isinstance(request_id, str) or not 0 < len(request_id) <= 64:
-            return "id: must be given, as text of at most 64 characters"
-        if event != STOP_REQUESTED and self._windows.holder_for(viewer) != "you":
-            return "this page does not hold control; take it first"
-        return None
 
     def _send_request(self, document: dict[str, Any], answer: Answer) -> None:
         """Send a request to the vehicle."""
@@ -326,6 +318,18 @@ class PageServer(Listener):
             self._station.ask(document, on_reply)
         else:
             answer("refused", f"event: {event!r}: must be one of {', '.join(sorted(MAY_ASK))}")
+
+
+def _refusal(holder: str, request_id: object, event: object) -> str | None:
+    """Why a viewer's request is refused; None: it is accepted.
+
+    holder  of control, as that viewer sees it
+    """
+    if not isinstance(request_id, str) or not 0 < len(request_id) <= 64:
+        return "id: must be given, as text of at most 64 characters"
+    if event != STOP_REQUESTED and holder != "you":
+        return "this page does not hold control; take it first"
+    return None
 
 
 def _stated(state: VehicleState | None, station: Station) -> dict[str, Any]:

@@ -50,6 +50,7 @@ from runner.configuration.files import (
     conf_directories,
     find_file,
     options,
+    states,
 )
 from runner.configuration.overrides import choosable
 from runner.configuration.yaml_file import label, load_file, load_node
@@ -345,15 +346,9 @@ class _Tasks:
     def _is_served(self, task: ValidationTask) -> bool:
         """Whether the source of a combination delivers what its graph passes on; what somebody chose is checked."""
         files = dict(self._given) | dict(task.choices)
-        passes = task.choices and self._states(files, "graph", "passes")
-        return not passes or self._states(files, "source", "encoded")
-
-    def _states(self, files: Mapping[str, str], group: str, key: str) -> bool:
-        """Whether the file of a group, or one that it builds on, states a key."""
-        with suppress(ConfigError):  # reported for the file alone
-            path = find_file(self._directories, group, files.get(group, ""))
-            return any(key in load_file(file) for file in built_on(path, self._directories))
-        return False
+        graph, source = (find_file(self._directories, group, files.get(group, "")) for group in ("graph", "source"))
+        passes = task.choices and states(graph, self._directories, "passes")
+        return not passes or states(source, self._directories, "encoded")
 
     @property
     def _root(self) -> Path:
