@@ -14,13 +14,12 @@ answer at the link's address to whoever is on any network of this machine: rules
 
 from __future__ import annotations
 
-import errno
+import fcntl
 import ipaddress
 import json
 import os
 import random
 import signal
-import socket
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
@@ -38,6 +37,7 @@ from runner.settings import Endpoint
 from runner.system import children
 from runner.system.signals import urgent
 
+LOCKS = Path("/run/tod-runner-links")  # files that stand for the links of running processes
 NETWORK = ipaddress.IPv4Network("10.77.0.0/16")  # split into a network per link
 PREFIX = 28  # of that: room for this machine's address and MOST_ADDRESSES of the vehicle
 LINK = "link0"  # the vehicle's device
@@ -172,7 +172,7 @@ def _claimed_network(ip: str) -> Iterator[tuple[str, ipaddress.IPv4Network]]:
     networks = {f"tod-{number}": network for number, network in enumerate(NETWORK.subnets(new_prefix=PREFIX))}
     removed = set(_remove_left_behind(ip, networks))
     for name in sorted(networks, key=lambda name: (name in removed, random.random())):
-        with _claim(networks[name]) as is_free:
+        with _claim(name) as is_free:
             if is_free and not any(address in networks[name] for address in _addresses(ip)):
                 yield name, networks[name]
                 return
@@ -182,24 +182,24 @@ def _claimed_network(ip: str) -> Iterator[tuple[str, ipaddress.IPv4Network]]:
 def _remove_left_behind(ip: str, networks: Mapping[str, ipaddress.IPv4Network]) -> Iterator[str]:
     """Remove the namespaces of runs that were killed: those whose name is not claimed. Yields their names."""
     for name in networks.keys() & {path.name for path in RUN.glob("tod-*")}:
-        with _claim(networks[name]) as is_free:
+        with _claim(name) as is_free:
             if is_free:
                 _remove(ip, name, networks[name])
                 yield name
 
 
 @contextmanager
-def _claim(network: ipaddress.IPv4Network) -> Iterator[bool]:
-    """Claim addresses and the corresponding name machine-wide; yields whether they were free.
+def _claim(name: str) -> Iterator[bool]:
+    """Claim a name and its addresses machine-wide; yields whether they were free.
 
-    The claim is a bound abstract socket, which the kernel releases with the process.
+    The claim is a locked file, which the kernel unlocks with the process. The name of a socket would be known in one
+    network namespace only, while all share the names of `ip netns`.
     """
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as claim:
+    LOCKS.mkdir(exist_ok=True)
+    with (LOCKS / name).open("w") as claim:
         try:
-            claim.bind(f"\0tod-runner/{network}")
-        except OSError as error:
-            if error.errno != errno.EADDRINUSE:
-                raise
+            fcntl.flock(claim, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
             yield False
         else:
             yield True

@@ -355,6 +355,18 @@ def test_the_next_run_removes_what_a_killed_one_left():
     assert name not in _names()
 
 
+@needs_root
+def test_a_run_in_another_network_namespace_does_not_remove_a_link():
+    code = (
+        "from runner.link import *; from runner.settings import Endpoint\n"
+        "limit, end = Limit(lambda t: 100, 200, 0), Endpoint('127.0.0.1', 1)\n"
+        "with limited_link('netns', limit, end, end, print): print('a link')\n"
+    )
+    with limited_link("netns", WIDE, *_ends(), print) as link:
+        assert "a link" in _python(code, "unshare", "--net").stdout
+        assert link.vehicle_command[-1] in _names()
+
+
 def _runs(pid):
     try:
         return "\nState:\tZ" not in Path(f"/proc/{pid}/status").read_text()  # a zombie may lack a parent to reap it
@@ -362,9 +374,9 @@ def _runs(pid):
         return False
 
 
-def _python(code):
+def _python(code, *before):
     environment = {**os.environ, "PYTHONPATH": str(CHECKOUT)}
-    command = [sys.executable, "-c", code]
+    command = [*before, sys.executable, "-c", code]
     return subprocess.run(command, capture_output=True, text=True, check=False, timeout=60, env=environment)
 
 
