@@ -17,7 +17,7 @@ pytestmark = pytest.mark.gst  # the package runner.gst loads it
 
 @contextmanager
 def lost_cameras(problem, on_found, *names):
-    plans = [SimpleNamespace(camera=SimpleNamespace(name=name)) for name in names]
+    plans = [SimpleNamespace(name=name, camera=SimpleNamespace(name=name)) for name in names]
     cameras = LostCameras(plans, dict.fromkeys(names, "missing"), lambda plan: problem(plan.camera.name), on_found)
     try:
         yield cameras

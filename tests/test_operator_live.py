@@ -25,7 +25,7 @@ def operator(hangs: int, notes: list[str], samples: list[Any]) -> LiveOperator:
             raise left.pop()
         return {}
 
-    side: Any = SimpleNamespace(sample=sample, received=dict, stop=lambda: None)
+    side: Any = SimpleNamespace(sample=sample, received=dict, sound=None, stop=lambda: None)
     station: Any = SimpleNamespace(
         state=None,
         connect=lambda: None,
@@ -33,11 +33,11 @@ def operator(hangs: int, notes: list[str], samples: list[Any]) -> LiveOperator:
         link=SimpleNamespace(is_behind=lambda: True),
         sending=dict,
         addresses={},
-        take=lambda taken, _over: samples.append(taken),
+        take=lambda taken, _over, _sound: samples.append(taken),
         note=notes.append,
     )
     log: Any = SimpleNamespace(begin=lambda: None, close=lambda: None)
-    return LiveOperator(SimpleNamespace(), station, log, lambda _on_unit: side)  # type: ignore[arg-type]
+    return LiveOperator(SimpleNamespace(), station, log, lambda *_on_unit: side)  # type: ignore[arg-type]
 
 
 def test_a_view_survives_a_machine_that_is_overloaded_for_a_while(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -100,6 +100,8 @@ class RecordingVehicle:
 class RecordingOperator:
     """Stands in for `runner.apply.OperatorSide`: cameras that should send deliver frames of a fixed size."""
 
+    sound = None
+
     def __init__(self, plans: Sequence[Plan], *_: Any, **__: Any) -> None:
         self._received = {plan.camera.name: Reception() for plan in plans}
 
