@@ -2,8 +2,9 @@
 
   python bench/pass_through.py CLIP.mp4 [--pairs 3] [--seconds 20] [--fps 15]
 
-The clip is served as an IP camera in H.264. Processor time is that of the vehicle's process; latency is from the
-arrival at the vehicle to the operator, and to its decoder. Run it on an idle machine.
+The clip is served as an IP camera, which encodes it in H.264 as it plays, without B-frames, and ends the stream with
+the clip. Processor time is that of the vehicle's process; latency is from the arrival at the vehicle to the operator,
+and to its decoder. Run it on an idle machine.
 """
 
 from __future__ import annotations
@@ -17,18 +18,21 @@ import tempfile
 import time
 from pathlib import Path
 
-from ros import pictures_of
-from sources import HEIGHT, PICTURES, WIDTH, Clip, ip_camera
 from table import Row, show, spread
 from usage import processor_s
 
-from rig import children_named, until
+from rig import children_named, free_port, ip_camera, until
 from runner.drive.read import read_drive
 from runner.drive.series import series
 from runner.drive.statistics import CameraStatistics, statistics
 
 WAYS = {"decoded and encoded again": "graph=h264_rtsp", "passed on": "graph=pass_through"}
 SETTLE_S = 4.0
+CAMERA = (
+    "filesrc location={clip} ! decodebin force-sw-decoders=true ! videoconvert ! videoscale ! videorate"
+    " ! video/x-raw,format=I420,width=1280,height=720,framerate={fps}/1 ! identity sync=true"
+    " ! x264enc tune=zerolatency speed-preset=superfast bitrate=4000 key-int-max={fps} ! rtph264pay name=pay0 pt=96"
+)
 
 
 def main() -> None:
@@ -40,12 +44,12 @@ def main() -> None:
     options = parser.parse_args()
     found: dict[str, list[tuple[float, CameraStatistics]]] = {way: [] for way in WAYS}
     with tempfile.TemporaryDirectory() as directory:
-        clip = Clip(pictures_of(options.clip, WIDTH, HEIGHT, PICTURES), options.fps, Path(directory))
+        media = CAMERA.format(clip=options.clip.resolve(), fps=options.fps)
         for number in range(options.pairs):
             for way, word in WAYS.items():
-                with ip_camera(clip) as (_, address, _):
+                with ip_camera(free_port(), media=media) as (address, _):
                     out = Path(directory) / f"{number}-{word.partition('=')[2]}"
-                    found[way].append(drive(address.partition("=")[2], word, options, out))
+                    found[way].append(drive(address, word, options, out))
                 print(f"pair {number + 1}: {way}", file=sys.stderr)
     show([row for way, drives in found.items() for row in rows(way, drives)])
 
