@@ -83,6 +83,7 @@ export function showDriveDraft(places) {
 
 /** The cameras by their role in the Drive view. */
 export const driveRoles = () => rolesOf(store.hello?.cameras ?? [], drivePlaces());
+let isTold = false; // how a picture is enlarged
 const drivePlaces = () => driveDraft ?? store.hello?.layout.drive ?? null;
 
 /** Put the tiles into bands. */
@@ -142,7 +143,7 @@ function buildTile({ name }) {
   const element = make(
     "article",
     { class: "tile", "data-camera": name, "data-status": "synchronising", tabindex: "0", "aria-label": `camera ${displayName(name)}`,
-      onclick: () => select(name), onfocus: () => select(name) },
+      onclick: () => choose(name), onfocus: () => select(name) },
     head, parts.box, foot,
   );
   parts.box.addEventListener("dblclick", () => enlarge(store.enlarged === name ? null : name));
@@ -152,6 +153,15 @@ function buildTile({ name }) {
   dragRegion(name, parts.box, () => tiles.get(name).view);
   zoomRegion(name, parts.box, () => tiles.get(name).view);
   sizes.observe(parts.box);
+}
+
+/** A click on a picture. In the Drive view it seems to do little: say once what would enlarge the picture. */
+function choose(name) {
+  if (store.view === "drive" && !isTold) {
+    publish("toast", { text: withKey("double click: the large picture", "enlarge"), level: "hint" });
+    isTold = true;
+  }
+  select(name);
 }
 
 /** Show the lines on the ground of these cameras only; a hidden canvas costs nothing. @param {string[]} names */
