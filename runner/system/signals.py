@@ -25,6 +25,7 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 
 LIFELINE = "TOD_RUNNER_LIFELINE"  # environment variable: descriptor of a pipe whose other end is open in the parent
+TWICE_S = 0.2  # the same signal again within this time is one: `timeout` sends its own to the process and to its group
 AGAIN_S = 0.01  # after a discarded exception: by then Python has reported it
 END_S = 2.0  # how long an orderly shutdown may take
 URGENT_S = 0.5  # how long cleanup may take without an orderly shutdown
@@ -72,6 +73,7 @@ class _Watch:
         self.delivered = False  # whether the main thread has been notified
         self.interrupted = False  # whether the main thread was interrupted by an exception
         self._discarded = False  # whether Python has discarded that exception
+        self._taken = (0, 0.0)  # the last signal that was read, and when
         self._repeated = 0  # signals that this process sends itself and that have not been read yet
         self._deadline: float | None = None
 
@@ -148,6 +150,9 @@ class _Watch:
     def _take(self, number: int) -> None:
         if self._repeated:
             self._repeated -= 1
+            return
+        (last, at), self._taken = self._taken, (number, time.monotonic())
+        if number == last and self._taken[1] - at < TWICE_S:
             return
         if self._deadline is not None or (self.stop and self.stop.is_set()):
             self._end("second signal: ending now")

@@ -144,6 +144,15 @@ def test_a_second_signal_ends_immediately_and_leaves_no_partial_file(tmp_path: P
     assert list(tmp_path.iterdir()) == []
 
 
+def test_the_same_signal_twice_at_once_is_one() -> None:
+    """As `timeout` sends it: to the process, and to its group."""
+    child = started("with signals.stopping() as stop:\n    ready(); stop.wait(60); time.sleep(0.3)")
+    child.send_signal(signal.SIGTERM)
+    time.sleep(0.02)  # two at once would be delivered as one
+    child.send_signal(signal.SIGTERM)
+    assert ended(child)[1] == ""
+
+
 def test_hanging_cleanup_does_not_delay_the_end_for_long() -> None:
     child = started("with signals.urgent(lambda: time.sleep(60)):\n    ready(); time.sleep(0.1); time.sleep(60)")
     child.send_signal(signal.SIGSTOP)  # both signals are pending when it resumes
