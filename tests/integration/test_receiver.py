@@ -8,7 +8,7 @@ import struct
 import threading
 import time
 from collections import Counter
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
@@ -155,7 +155,10 @@ def test_a_client_is_not_stopped_while_it_frees_its_connection():
 
 def open_ports():
     """UDP ports of this process on all addresses, which anybody reaches: those of RTSP clients."""
-    own = {descriptor.stat().st_ino for descriptor in Path("/proc/self/fd").iterdir() if descriptor.exists()}
+    own = set()
+    for descriptor in Path("/proc/self/fd").iterdir():
+        with suppress(FileNotFoundError):  # closed meanwhile
+            own.add(descriptor.stat().st_ino)
     bound = [line.split() for line in Path("/proc/self/net/udp").read_text().splitlines()[1:]]
     places = [words[1].split(":") for words in bound if int(words[9]) in own]
     return [int(port, 16) for address, port in places if int(address, 16) == 0]
