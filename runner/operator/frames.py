@@ -10,7 +10,6 @@ than the cameras gets the newest picture of each and misses others; nothing is q
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -22,13 +21,12 @@ from numpy.typing import NDArray
 
 from runner.configuration.config import configuration
 from runner.errors import UserError, suggest
+from runner.operator.awaited import Awaited, watched
 from runner.plans import compile_plans
 from runner.security.exposure import viewer_keyring
 
-CHECK_S = 0.25  # how often cameras are checked for silence
 # A camera that delivers at most FEW frames may be off: it is expected, and rebuilt, only for RETRY_S of each PERIOD_S.
 FEW, RETRY_S, PERIOD_S = 5, 5.0, 30.0
-STOP_S = 1.0  # how long the last check may take
 
 
 class Frame(NamedTuple):
@@ -43,36 +41,20 @@ class Frame(NamedTuple):
     image: NDArray[np.uint8]
 
 
-class Frames:
+class Frames(Awaited[Frame]):
     """The newest picture of each camera, each returned once, in order of arrival."""
 
     def __init__(self) -> None:
         self._newest: dict[str, Frame] = {}
-        self._changed = threading.Condition()
-        self._closed = False
-
-    def __iter__(self) -> Iterator[Frame]:
-        while (frame := self.next()) is not None:
-            yield frame
-
-    def next(self, timeout_s: float | None = None) -> Frame | None:
-        """The next picture; None after the timeout, or once this is closed."""
-        with self._changed:
-            if not self._changed.wait_for(lambda: self._newest or self._closed, timeout_s) or self._closed:
-                return None
-            return self._newest.pop(next(iter(self._newest)))
+        super().__init__(self._newest, lambda: self._newest.pop(next(iter(self._newest))))
 
     def put(self, camera: str, captured: float | None, width: int, height: int, data: bytes) -> None:
         """Add a picture from the decoder, whose rows may be padded."""
         rows = np.frombuffer(data, np.uint8).reshape(height, -1)[:, : width * 3]
+        frame = Frame(camera, captured, rows.reshape(height, width, 3))
         with self._changed:
-            self._newest[camera] = Frame(camera, captured, rows.reshape(height, width, 3))
+            self._newest[camera] = frame
             self._changed.notify()
-
-    def close(self) -> None:
-        with self._changed:
-            self._closed = True
-            self._changed.notify_all()
 
 
 @contextmanager
@@ -101,29 +83,17 @@ def live_frames(
         if name not in vehicle.cameras:
             raise UserError("cameras", "", name, f"unknown camera{suggest(name, vehicle.cameras)}")
     plans = [plan for plan in compile_plans(setup) if cameras is None or plan.camera.name in cameras]
-    frames, stopped = Frames(), threading.Event()
-    keyring = viewer_keyring(setup)
+    frames, keyring = Frames(), viewer_keyring(setup)
     side = apply.OperatorSide(plans, report, on_picture=frames.put, keyring=keyring, vehicle=vehicle.name)
     expected = {plan.camera.name: True for plan in plans}
     delivered, since = dict.fromkeys(expected, 0), dict.fromkeys(expected, time.monotonic())
 
-    def watch() -> None:
-        try:
-            while not stopped.wait(CHECK_S):
-                now = time.monotonic()
-                for name, received in side.sample(expected).items():
-                    if received.frames - delivered[name] > FEW:
-                        delivered[name], since[name] = received.frames, now
-                    expected[name] = (now - since[name]) % PERIOD_S < RETRY_S
-        finally:
-            frames.close()  # release a caller that waits for pictures of a failed side
+    def look() -> None:
+        now = time.monotonic()
+        for name, received in side.sample(expected).items():
+            if received.frames - delivered[name] > FEW:
+                delivered[name], since[name] = received.frames, now
+            expected[name] = (now - since[name]) % PERIOD_S < RETRY_S
 
-    watcher = threading.Thread(target=watch, name="watch", daemon=True)
-    watcher.start()
-    try:
+    with watched(side, frames, look):
         yield frames
-    finally:
-        stopped.set()
-        frames.close()
-        watcher.join(STOP_S)
-        side.stop()

@@ -9,7 +9,6 @@ Runs alone, or in addition to an operator as a listener like any other (`media.m
 
 from __future__ import annotations
 
-import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -22,12 +21,11 @@ from numpy.typing import NDArray
 from runner.configuration.config import configuration
 from runner.core.budget import SOUND
 from runner.errors import UserError
+from runner.operator.awaited import Awaited, watched
 from runner.plans import sound_plan
 from runner.security.exposure import viewer_keyring
 
-CHECK_S = 0.25  # how often silence is checked
 KEPT = 100  # sounds that a slow program may be behind: 2 s; then it misses the oldest
-STOP_S = 1.0  # how long the last check may take
 
 
 class Sound(NamedTuple):
@@ -41,35 +39,18 @@ class Sound(NamedTuple):
     samples: NDArray[np.int16]
 
 
-class Sounds:
+class Sounds(Awaited[Sound]):
     """Each sound once, in order."""
 
     def __init__(self) -> None:
-        self._waiting: deque[Sound] = deque(maxlen=KEPT)
-        self._changed = threading.Condition()
-        self._closed = False
-
-    def __iter__(self) -> Iterator[Sound]:
-        while (sound := self.next()) is not None:
-            yield sound
-
-    def next(self, timeout_s: float | None = None) -> Sound | None:
-        """The next sound; None after the timeout, or once this is closed."""
-        with self._changed:
-            if not self._changed.wait_for(lambda: self._waiting or self._closed, timeout_s) or self._closed:
-                return None
-            return self._waiting.popleft()
+        self._kept: deque[Sound] = deque(maxlen=KEPT)
+        super().__init__(self._kept, self._kept.popleft)
 
     def put(self, captured: float | None, data: bytes) -> None:
         """Add samples from the decoder."""
         with self._changed:
-            self._waiting.append(Sound(captured, np.frombuffer(data, np.int16)))
+            self._kept.append(Sound(captured, np.frombuffer(data, np.int16)))
             self._changed.notify()
-
-    def close(self) -> None:
-        with self._changed:
-            self._closed = True
-            self._changed.notify_all()
 
 
 @contextmanager
@@ -92,7 +73,7 @@ def live_sound(
     plan = sound_plan(setup)
     if plan is None:
         raise UserError("", SOUND, "null", "must be chosen, as on the vehicle: sound=alsa")
-    sounds, stopped = Sounds(), threading.Event()
+    sounds = Sounds()
     side = apply.OperatorSide(
         [],
         lambda _, what: report(what),
@@ -102,19 +83,5 @@ def live_sound(
         on_samples=sounds.put,
     )
 
-    def watch() -> None:
-        try:
-            while not stopped.wait(CHECK_S):
-                side.sample({SOUND: True})
-        finally:
-            sounds.close()  # release a caller that waits for a failed side
-
-    watcher = threading.Thread(target=watch, name="watch", daemon=True)
-    watcher.start()
-    try:
+    with watched(side, sounds, lambda: side.sample({SOUND: True})):
         yield sounds
-    finally:
-        stopped.set()
-        sounds.close()
-        watcher.join(STOP_S)
-        side.stop()
