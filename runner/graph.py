@@ -363,19 +363,19 @@ def _per_frame_rate(settings: GraphSettings, fps: Fraction) -> Mapping[str, int]
 
 def _check_names(graph: Graph, source: Source, recorder: Iterable[Element]) -> None:
     """Source and graph become one pipeline, source and recording another; elements are found by name."""
-    sent = _names("graph.wire.vehicle", graph.wire_vehicle) | _names("graph.vehicle", graph.vehicle)
-    played = _names("source.stand_in", source.stand_in) | _names("source.elements", source.elements)
-    _check_free("source.elements", source.elements, sent)
-    _check_free("source.stand_in", source.stand_in, sent)
-    _check_free("recording.elements", recorder, played | _names("recording.elements", (*_RECORDED, _WRITER)))
+    sent = names_of("graph.wire.vehicle", graph.wire_vehicle) | names_of("graph.vehicle", graph.vehicle)
+    played = names_of("source.stand_in", source.stand_in) | names_of("source.elements", source.elements)
+    check_free("source.elements", source.elements, sent)
+    check_free("source.stand_in", source.stand_in, sent)
+    check_free("recording.elements", recorder, played | names_of("recording.elements", (*_RECORDED, _WRITER)))
 
 
-def _names(where: str, elements: Iterable[Element]) -> dict[str, str]:
+def names_of(where: str, elements: Iterable[Element]) -> dict[str, str]:
     """By name of an element, its key."""
     return {element.name: f"{where}[{index}].name" for index, element in enumerate(elements)}
 
 
-def _check_free(where: str, elements: Iterable[Element], taken: Mapping[str, str]) -> None:
+def check_free(where: str, elements: Iterable[Element], taken: Mapping[str, str]) -> None:
     """Check that elements have names of their own.
 
     taken  names of others, with the key of each

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from runner.core.budget import SOUND
 from runner.core.model import Element, GraphSettings, Kbps, ModelError, Value
-from runner.graph import filled, launch, rtsp_url, shell
+from runner.graph import check_free, filled, launch, names_of, rtsp_url, shell
 from runner.settings import Endpoint, Media, Sound
 
 
@@ -102,13 +102,8 @@ def compile_sound(sound: Sound, media: Media) -> SoundPlan:
 
 def _check_names(sound: Sound) -> None:
     """Source and vehicle become one pipeline, in which elements are found by name."""
-    taken: dict[str, str] = {}
-    for where, elements in (("source", sound.source), ("vehicle", sound.vehicle)):
-        for index, element in enumerate(elements):
-            key = f"{where}[{index}].name"
-            if element.name in taken:
-                raise ModelError(key, repr(element.name), "is already the name of another element", taken[element.name])
-            taken[element.name] = key
+    check_free("source", sound.source, {})
+    check_free("vehicle", sound.vehicle, names_of("source", sound.source))
     if sound.vehicle[-1].name != "pay0":
         key = f"vehicle[{len(sound.vehicle) - 1}].name"
         raise ModelError(key, repr(sound.vehicle[-1].name), "must be pay0, as the RTSP server requires")

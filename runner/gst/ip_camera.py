@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Callable, Sequence
 
@@ -10,6 +9,7 @@ from gi.repository import GLib, Gst, GstRtsp, GstSdp
 
 from runner.core.model import Source
 from runner.graph import Plan
+from runner.gst.caps import structure
 from runner.gst.rtspsrc import is_rtsp_client
 
 OPENING = frozenset({"OPTIONS", "DESCRIBE", "SETUP", "PLAY"})
@@ -122,10 +122,8 @@ class CameraClient:
 
 def _other_format(medium: GstSdp.SDPMedia, wanted: str) -> str | None:
     """What a medium is, if it has another format than the one that is passed on; None if it has that."""
-    offered = re.search(
-        r"encoding-name=\(string\)\"?([\w-]+)", str(medium.get_caps_from_media(int(medium.get_format(0))))
-    )
-    found = offered[1] if offered else "an unnamed format"
+    caps = medium.get_caps_from_media(int(medium.get_format(0)))
+    found = (structure(caps).get_string("encoding-name") if caps else None) or "an unnamed format"
     if found.lower() == wanted:
         return None
     return f"the camera sends {found}, and the graph passes on {wanted.upper()}: set the camera to that, or decode it"

@@ -89,8 +89,7 @@ def _give_up(
     given_up: tuple[str, ...] = ()
     if order := _shed_order(vehicle):
         assert draft.total is not None
-        lowest = {**_floors(vehicle), **_fixed(vehicle, wanted)}
-        floors = {name: floor * state.copies.get(name, 1) for name, floor in lowest.items()}
+        floors = {name: floor * state.copies.get(name, 1) for name, floor in _lowest(vehicle, wanted).items()}
         of_all = {name: own * state.copies.get(name, 1) for name, own in wanted.items()}
         given_up = allocation.shed(of_all, draft.total, floors, order, before)
     if given_up != before:
@@ -111,9 +110,10 @@ def _floors(vehicle: Vehicle) -> Mapping[str, Kbps]:
     return {name: camera.floor_kbps for name, camera in vehicle.cameras.items() if camera.floor_kbps}
 
 
-def _fixed(vehicle: Vehicle, wanted: Mapping[str, Kbps]) -> Mapping[str, Kbps]:
-    """kbit/s by camera, for those that get all that they encode by themselves, or nothing."""
-    return {name: wanted[name] for name in vehicle.fixed if name in wanted}
+def _lowest(vehicle: Vehicle, wanted: Mapping[str, Kbps]) -> Mapping[str, Kbps]:
+    """The floors, with those of cameras that get all that they encode by themselves, or nothing."""
+    floors = _floors(vehicle)
+    return {**floors, **{name: wanted[name] for name in vehicle.fixed if name in wanted}} if vehicle.fixed else floors
 
 
 @cache
@@ -328,13 +328,13 @@ def _wire_floors(vehicle: Vehicle, state: State, draft: Draft, cameras: tuple[Ca
 
     cameras  that are on, with repetitions for copies
     """
-    wanted = _wanted(vehicle, state, draft)
-    if not (lowest := {**_floors(vehicle), **_fixed(vehicle, wanted)}):
+    if not (vehicle.fixed or _floors(vehicle)):
         return allocation.ZERO
+    wanted = _wanted(vehicle, state, draft)
     floors = sum(
         (
             min(floor, wanted.get(name, allocation.ZERO)) * state.copies.get(name, 1)
-            for name, floor in lowest.items()
+            for name, floor in _lowest(vehicle, wanted).items()
             if vehicle.cameras[name].shed is None
         ),
         allocation.ZERO,
