@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Iterable
-from contextlib import suppress
+from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from runner.system.reports import LimitedReports
 MAX_STRANGERS = 100  # connections without access; a new one replaces the oldest
 MAX_BODY = 4096  # bytes of a request
 REQUEST_S = 10.0  # a connection without a complete request for this long is closed
-FAREWELL_S = 0.3  # how long browsers may take to answer that it ends
+FAREWELL_S = 0.4  # how long browsers may take to answer that it ends
 ENDED = b"the station has ended"  # reason of closing, to pages: a crash or a cut link states none
 
 
@@ -41,7 +40,7 @@ class Connections:
         logger = logging.Logger("page")
         logger.addHandler(_FaultHandler(lambda text: self._report(text, "")))
         self._runner = web.AppRunner(
-            app, access_log=None, logger=logger, shutdown_timeout=0.5, keepalive_timeout=REQUEST_S
+            app, access_log=None, logger=logger, shutdown_timeout=FAREWELL_S, keepalive_timeout=REQUEST_S
         )
         await self._runner.setup()
         self._loop = asyncio.get_running_loop()
@@ -120,11 +119,33 @@ class Connections:
         abort(oldest.transport)
 
 
-async def say_ended(sockets: Iterable[web.WebSocketResponse]) -> None:
-    """Close WebSockets because this program ends in order, after all that was sent by them."""
-    closing = [ws.close(code=WSCloseCode.GOING_AWAY, message=ENDED) for ws in sockets]
-    with suppress(TimeoutError):
-        await asyncio.wait_for(asyncio.gather(*closing, return_exceptions=True), FAREWELL_S)
+class Farewells:
+    """WebSockets whose browsers are told if this program ends in order."""
+
+    def __init__(self) -> None:
+        self._served = set[asyncio.Task[None]]()
+
+    async def serve(self, ws: web.WebSocketResponse, work: Coroutine[Any, Any, None]) -> web.WebSocketResponse:
+        """Serve a browser until the work is done, or until `say`."""
+        task = asyncio.create_task(work)
+        self._served.add(task)
+        try:
+            await asyncio.wait([task])
+        finally:
+            task.cancel()
+            self._served.discard(task)
+        if task.cancelled():
+            # Nothing else reads or writes now: this takes what the browser still sends until it answers. Closing with
+            # something unread would reset the connection, and the reason might never be seen.
+            await ws.close(code=WSCloseCode.GOING_AWAY, message=ENDED)
+        else:
+            task.result()
+        return ws
+
+    def say(self) -> None:
+        """The server then waits for the answers as it closes."""
+        for task in self._served:
+            task.cancel()
 
 
 def abort(transport: asyncio.BaseTransport | None) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 
 from aiohttp import ClientError, ClientWebSocketResponse, WSMessage, WSMsgType, web
 
-from runner.page.connections import say_ended
+from runner.page.connections import Farewells
 from runner.page.documents import Documents, document
 from runner.page.front import Front
 from runner.page.loop import PageLoop
@@ -66,7 +66,7 @@ class FleetServer:
         check_port_free(endpoint, "page.port")
         self._documents, self._page = Documents(), document("index.html")
         self._vehicles: dict[str, Listed] = {}
-        self._lists, self._relayed = set[web.WebSocketResponse](), set[asyncio.Transport]()  # that are open
+        self._farewells, self._relayed = Farewells(), set[asyncio.Transport]()  # that are open
         self._loop = PageLoop()
 
     @property
@@ -108,7 +108,7 @@ class FleetServer:
                 vehicle.task.cancel()
         for transport in list(self._relayed):
             transport.abort()
-        await say_ended(self._lists)
+        self._farewells.say()
         await self._front.connections.close()
 
     def _add(self, vehicle: Listed) -> None:
@@ -148,18 +148,16 @@ class FleetServer:
         """Send the list whenever it has changed, until the browser leaves or may no longer see it."""
         ws = web.WebSocketResponse(compress=False, heartbeat=HEARTBEAT_S, timeout=CLOSE_S)
         await ws.prepare(request)
-        self._lists.add(ws)
-        try:
-            while not ws.closed and (visitor := self._front.access.visitor(request)) is not None:
-                await ws.send_json({"vehicles": self.rows(), "may_drive": visitor.may_drive})
-                with suppress(TimeoutError):
-                    message = await ws.receive(LIST_S)
-                    if visitor.may_drive:
-                        await self._on_message(message)
-            await ws.close()
-        finally:
-            self._lists.discard(ws)
-        return ws
+        return await self._farewells.serve(ws, self._list(ws, request))
+
+    async def _list(self, ws: web.WebSocketResponse, request: web.Request) -> None:
+        while not ws.closed and (visitor := self._front.access.visitor(request)) is not None:
+            await ws.send_json({"vehicles": self.rows(), "may_drive": visitor.may_drive})
+            with suppress(TimeoutError):
+                message = await ws.receive(LIST_S)
+                if visitor.may_drive:
+                    await self._on_message(message)
+        await ws.close()
 
     async def _on_message(self, message: WSMessage) -> None:
         """Release control of a vehicle: its name is the browser's only message."""

@@ -23,7 +23,7 @@ from runner.h264.access_unit import AccessUnit, RecentUnits
 from runner.mqtt.messages import read_message
 from runner.operator.station import LinkState, Listener, Station
 from runner.page.access import Access
-from runner.page.connections import abort, say_ended
+from runner.page.connections import Farewells, abort
 from runner.page.counter import CounterReading, counter_reading
 from runner.page.documents import Documents, document
 from runner.page.front import Front
@@ -93,8 +93,13 @@ class PageServer(Listener):
         self._call_soon = self._loop.call_soon
         self._front = Front(setup.page.endpoint, keyring, setup.page.people, station.note)
         names = list(vehicle.cameras)
+
+        def state_attention(attention: Attention | None) -> None:
+            station.attention = attention
+
         self._windows = Windows(
-            self._on_attention, lambda shown, is_open: on_shown([names[index] for index in shown], is_open)
+            state_attention,
+            lambda shown, is_open: on_shown([names[index] for index in shown], is_open),
         )
         self._layouts = layouts or Layouts()
         self._page_layouts = PageLayouts(
@@ -108,7 +113,7 @@ class PageServer(Listener):
         self._history = History()
         self._notes: deque[Mapping[str, Any]] = deque(maxlen=NOTES)
         self._turn = asyncio.Lock()
-        self._open = set[web.WebSocketResponse]()
+        self._farewells = Farewells()
 
     @property
     def url(self) -> str:
@@ -166,11 +171,8 @@ class PageServer(Listener):
         return await self._front.connections.serve(app, self._setup.page.endpoint)
 
     async def _end(self) -> None:
-        await say_ended(self._open)
+        self._farewells.say()
         await self._front.connections.close()
-
-    def _on_attention(self, attention: Attention | None) -> None:
-        self._station.attention = attention
 
     def _add_sample(self, sample: Sample) -> None:
         self._history.add(sample)
@@ -215,11 +217,13 @@ class PageServer(Listener):
         except ValueError:  # headers that are not ASCII: the client's fault
             raise web.HTTPBadRequest(text="not a handshake of a WebSocket\n") from None
         viewer = PageViewer(token, cameras, lambda camera: self._recent[camera].burst(), browser, monitor, visitor)
-        self._open.add(ws)
+        return await self._farewells.serve(ws, self._serve(ws, viewer, request))
+
+    async def _serve(self, ws: web.WebSocketResponse, viewer: PageViewer, request: web.Request) -> None:
         self._windows.add(viewer)
         self._send_current_state(viewer)
         self._windows.opened(viewer, request.query.get("before"))
-        turn = None if visitor.may_drive else self._turn
+        turn = None if viewer.visitor.may_drive else self._turn
         tasks = [
             asyncio.create_task(_send(ws, viewer, turn)),
             asyncio.create_task(_ping(ws, request, self._front.access)),
@@ -231,9 +235,7 @@ class PageServer(Listener):
         finally:
             for task in tasks:
                 task.cancel()
-            self._open.discard(ws)
             self._windows.closed(viewer)
-        return ws
 
     async def _listen(self, ws: web.WebSocketResponse, viewer: PageViewer, request: web.Request) -> None:
         """Handle a viewer's messages, as long as it has access, until it disconnects.

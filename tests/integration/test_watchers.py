@@ -36,22 +36,22 @@ class Notes(Listener):
         self._texts.append(note.text)
 
 
-def bytes_for_each_unit(watcher):
+def bytes_for_each_unit(watcher, words):
     """What the uplink carries for each unit that reaches the driver, whose number depends on the machine's load."""
 
     def units():
         return sum(seen.units for seen in watcher.seen().values())
 
-    first, before = units(), uplink_bytes()
+    first, before = units(), uplink_bytes(words)
     until(lambda: units() > first + UNITS * len(CAMERAS), every_s=0.1)
-    return (uplink_bytes() - before) / (units() - first)
+    return (uplink_bytes(words) - before) / (units() - first)
 
 
 def test_ten_watchers_load_the_uplink_no_more_than_none_and_nobodys_pictures_stop(keys, tmp_path):
     people = change_people(tmp_path / "people", dict.fromkeys(TEN, Role.WATCHER))
     with vehicle(keys, *WORDS) as (words, _), page(keys, tmp_path / "people", words) as at, driver(at) as watcher:
         until(lambda: len(watcher.seen()) == len(CAMERAS), seconds=60)
-        without = bytes_for_each_unit(watcher)
+        without = bytes_for_each_unit(watcher, words)
         with watching(at, people) as ten:
 
             def counted():
@@ -60,7 +60,7 @@ def test_ten_watchers_load_the_uplink_no_more_than_none_and_nobodys_pictures_sto
 
             until(lambda: len(counted()) == len(TEN) * len(CAMERAS), seconds=60)
             before = counted()
-            while_they_watch = bytes_for_each_unit(watcher)
+            while_they_watch = bytes_for_each_unit(watcher, words)
             until(lambda: all(counted()[one] > units + UNITS / 2 for one, units in before.items()))
         assert while_they_watch < 1.1 * without
 

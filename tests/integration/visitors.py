@@ -18,7 +18,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any, NamedTuple
@@ -237,11 +237,14 @@ def driver(at: Page, take: Take = lambda captured, arrived: None) -> Iterator[Wa
         loop.close()
 
 
-def uplink_bytes() -> int:
-    """What a vehicle behind `link=netns` has sent, with IP headers: what this machine's device of the link received."""
-    devices = [line.split() for line in Path("/proc/net/dev").read_text().splitlines() if "tod-" in line]
-    (device,) = devices
-    return int(device[1])
+def uplink_bytes(words: Iterable[str]) -> int:
+    """What a vehicle behind `link=netns` has sent, with IP headers: what this machine's device of the link received.
+
+    words  of its operator
+    """
+    host = next(word.removeprefix("media.host=") for word in words if word.startswith("media.host="))
+    (route,) = json.loads(subprocess.check_output(["ip", "-json", "route", "get", host]))
+    return int(Path("/sys/class/net", route["dev"], "statistics/rx_bytes").read_text())
 
 
 if __name__ == "__main__":
