@@ -49,6 +49,13 @@ EXAMPLES: list[dict[str, Any]] = [
     {"t": 0.8, "event": "control_restored", "operator": "", "stop": "you"},
     {"t": 0.8, "event": "attention_changed", "attention": "hidden"},
     {"t": 0.8, "event": "attention_changed"},
+    {
+        "t": 0.8,
+        "event": "view_reported",
+        "view": {
+            "front_left": {"x": 8, "y": 0, "width": 640, "height": 360, "screen_width": 320, "screen_height": 180}
+        },
+    },
     {"t": 0.9, "event": "operator_connected"},
     {"t": 0.9, "event": "operator_connected", "attention": "watching"},
     {"t": 0.9, "event": "operator_connected", "operator": "me", "role": "controller"},

@@ -463,7 +463,7 @@ def test_a_name_has_one_role(tmp_path, capsys):
 
 OWN = (
     *("link_measured", "copies_counted", "stream_measured", "source_reported"),
-    *("control_passed", "control_restored", "attention_changed"),
+    *("control_passed", "control_restored", "attention_changed", "view_reported"),
 )
 PRESENCE = ("operator_connected", "operator_disconnected")
 DRIVEN = {*EVENTS} - {*OWN, "clock_advanced", "bitrate_predicted", "position_reported", "steering_reported"}

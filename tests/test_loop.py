@@ -259,6 +259,7 @@ EXAMPLES: tuple[dict[str, Any], ...] = (
     {"event": "stop_lifted"},
     {"event": "control_restored", "operator": "a-watcher"},
     {"event": "attention_changed", "attention": "hidden"},
+    {"event": "view_reported", "view": {}},
     {"event": "operator_connected"},
     {"event": "operator_disconnected"},
     {"event": "clock_advanced"},

@@ -58,7 +58,7 @@ def test_a_report_is_read_back_as_it_was_sent() -> None:
         (
             {"extra": 1},
             "extra: unknown key; expected one of at, as_of, units, packets, lost, latency_ms, damaged, sent, run, "
-            "uplink, offset_s",
+            "uplink, view, offset_s",
         ),
     ],
 )

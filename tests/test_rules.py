@@ -338,6 +338,10 @@ def test_memory_is_empty_under_the_paper_and_frozen_elsewhere() -> None:
 
 FRONT_LEFT = {"camera": st.just("front_left")}
 KBPS = {"kbps": st.sampled_from([0, 0.5, 300, 1320, 2970, 5225.5, 12_000])}
+SEEN = [
+    dict(zip(("x", "y", "width", "height", "screen_width", "screen_height"), numbers, strict=True))
+    for numbers in ((0, 0, 640, 360, 900, 506), (100, 50, 200, 300, 160, 100), (639, 359, 1, 1, 1, 1), (0,) * 6)
+]
 EVENTS: dict[str, dict[str, st.SearchStrategy[Any]]] = {
     "mode_selected": {"mode": st.sampled_from(list(map(str, Mode)))},
     "bitrate_predicted": {**KBPS, "lower_kbps": st.sampled_from([0, 900, 4000]), "valid_s": st.sampled_from([0.5, 4])},
@@ -371,6 +375,7 @@ EVENTS: dict[str, dict[str, st.SearchStrategy[Any]]] = {
     "control_denied": {"operator": st.just("a"), "to": st.just("b")},
     "control_accepted": {"operator": st.just("b"), "live": st.just([])},
     "attention_changed": {"attention": st.sampled_from(list(map(str, Attention)))},
+    "view_reported": {"view": st.dictionaries(st.sampled_from(list(TUM.cameras)), st.sampled_from(SEEN))},
     "operator_connected": {},
     "operator_disconnected": {},
     "clock_advanced": {},

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from enum import StrEnum
 from fractions import Fraction
 from typing import Annotated, Any, NamedTuple, get_args
@@ -16,6 +16,7 @@ from typing import Annotated, Any, NamedTuple, get_args
 from runner.core.limits import Count, Limits, NonNegative, Share
 from runner.core.model import Kbps, Mode, Roi, exact, plain
 from runner.core.roles import Role
+from runner.core.view import Seen
 
 LEAST_ERROR = 0.01  # of a prediction's deviation
 Rate = Annotated[Kbps, Limits(0)]
@@ -323,6 +324,16 @@ class AttentionChanged(_Event):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ViewReported(_Event):
+    """The operator in control sees other parts of the images.
+
+    view  by camera; those not named are seen in full: nothing is stated of them, or nobody is in control
+    """
+
+    view: Mapping[str, Seen]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class OperatorConnected(_Event):
     """An operator's side is connected.
 
@@ -389,6 +400,7 @@ Event = (
     | StopLifted
     | ControlRestored
     | AttentionChanged
+    | ViewReported
     | OperatorConnected
     | OperatorDisconnected
     | ClockAdvanced
@@ -404,6 +416,7 @@ OWN = (
     ControlPassed,
     ControlRestored,
     AttentionChanged,
+    ViewReported,
 )  # made by the vehicle itself; no operator may request them
 NAMES = {kind: name for name, kind in EVENTS.items()}
 
@@ -434,6 +447,8 @@ def parse(document: Mapping[str, Any]) -> Event:
         values["evidence"] = Evidence(**values["evidence"])
     elif kind is RoiSet:
         values["roi"] = Roi(*(int(values.pop(key)) for key in _ROI))
+    elif kind is ViewReported:
+        values["view"] = {name: Seen(**seen) for name, seen in values["view"].items()}
     elif kind is WeightsSet:
         values["weights"] = {name: exact(weight) for name, weight in values["weights"].items()}
     return kind(**values)
@@ -452,6 +467,8 @@ def to_json(event: Event) -> dict[str, Any]:
             document[name] = value._asdict()
         elif isinstance(value, tuple):
             document[name] = list(value)
+        elif isinstance(event, ViewReported):
+            document[name] = {camera: asdict(seen) for camera, seen in event.view.items()}
         elif isinstance(value, Mapping):
             document[name] = {camera: plain(Fraction(of)) for camera, of in value.items()}
         else:

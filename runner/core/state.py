@@ -14,6 +14,7 @@ from runner.core.budget import SOUND, with_sound
 from runner.core.decision import NOTHING, Decision
 from runner.core.events import Refused
 from runner.core.model import SMALLEST_SIDE_PX, Camera, Kbps, Mode, Roi, Vehicle, plain
+from runner.core.view import View
 from runner.errors import suggest
 
 
@@ -43,6 +44,7 @@ class State:
     operator_lost: float | None = None  # t at which the operator's side disconnected
     attention: ev.Attention | None = None  # of the driver, as the operator in control states it
     attention_since: float | None = None  # t of its last change
+    view: View = field(default_factory=lambda: NOTHING)  # what the operator in control sees; others: in full
     link: ev.LinkMeasured | None = None  # None: no operator measures it, or uplinks have names
     links: Mapping[str, ev.LinkMeasured] = field(default_factory=lambda: NOTHING)  # by uplink with a name
     position: ev.PositionReported | None = None
@@ -140,12 +142,16 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
             return {"links": _of_uplink(vehicle, state.links, event)} if vehicle.uplinks else {"link": event}
         case ev.ControlPassed(operator=operator):
             # Another place, network path and person. If the link is not measured, it is as if they had just connected.
-            unstated = {"attention": None, "attention_since": event.t}
+            unstated = {"attention": None, "attention_since": event.t, "view": NOTHING}
             is_new = bool(operator) and state.link is None and state.operator_since is not None
             since = event.t if is_new else state.operator_since
             return {"link": None, "links": NOTHING, "operator_since": since, **unstated}
         case ev.AttentionChanged(attention=attention):
             return {"attention": attention, "attention_since": event.t}
+        case ev.ViewReported(view=view):
+            for name, seen in view.items():
+                _check_inside(_known(vehicle, name), seen.roi, "view")
+            return {"view": view}
         case ev.CopiesCounted(copies=copies):
             for name in copies:
                 if not (vehicle.sound and name == SOUND):
@@ -159,7 +165,7 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
             if changes["driving"].present or state.operator_lost is not None:
                 return changes
             gone = {"operator_since": None, "operator_lost": event.t, "attention": None, "attention_since": event.t}
-            return {**changes, **gone, "link": None, "links": NOTHING}
+            return {**changes, **gone, "view": NOTHING, "link": None, "links": NOTHING}
         case ev.PositionReported():
             motion = state.motion.after(event)
             return {"position": event, "motion": motion, **_driving(replace(state, motion=motion), event)}
@@ -247,11 +253,16 @@ def _only_in(mode: Mode, state: State, event: ev.Event) -> None:
 
 
 def _check_roi(camera: Camera, roi: Roi) -> None:
-    found = f"{roi.width}x{roi.height} at {roi.x},{roi.y}"
     if min(roi.width, roi.height) < SMALLEST_SIDE_PX:
+        found = f"{roi.width}x{roi.height} at {roi.x},{roi.y}"
         raise Refused(f"ROI {found} is smaller than {SMALLEST_SIDE_PX}x{SMALLEST_SIDE_PX}")
+    _check_inside(camera, roi, "ROI")
+
+
+def _check_inside(camera: Camera, roi: Roi, what: str) -> None:
     if roi.x + roi.width > camera.width or roi.y + roi.height > camera.height:
-        raise Refused(f"ROI {found} leaves the {camera.width}x{camera.height} image of {camera.name}")
+        found = f"{what} {roi.width}x{roi.height} at {roi.x},{roi.y}"
+        raise Refused(f"{found} leaves the {camera.width}x{camera.height} image of {camera.name}")
 
 
 def _configured(camera: Camera, now: Manual, event: ev.CameraConfigured) -> Manual:

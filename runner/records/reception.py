@@ -9,6 +9,7 @@ from typing import Annotated, NamedTuple
 from msgspec import UNSET, UnsetType
 
 from runner.core.limits import Count, Limits, NonNegative
+from runner.core.view import Seen
 from runner.records import Clock, Time
 
 Size = Annotated[int, Limits(0, 10**8)]  # bytes or packets of a report
@@ -165,6 +166,8 @@ class ReceptionReport:
     sent           s since 1970 by the operator's clock; present if the vehicle should answer with a `ClockAnswer`
     uplink         whose packets these are, and which the vehicle estimates; absent: it has one, without a name
     run            random number of this run of the operator's side, to which delays and times are relative
+    view           what this process shows, by camera; those not named: in full. Absent: as it last stated, if it has
+                   done so within 2 s, otherwise all in full
     """
 
     at: Annotated[Clock, "s, by the operator's monotonic clock"]
@@ -177,6 +180,7 @@ class ReceptionReport:
     sent: Clock | UnsetType = UNSET
     run: Annotated[int, Limits(0, 2**32 - 1)] | UnsetType = UNSET
     uplink: str | UnsetType = UNSET
+    view: Annotated[Mapping[str, Seen], Limits(most=1000)] | UnsetType = UNSET
     offset_s: Annotated[Clock | UnsetType, "the constant that delays are less by, s; absent: no unit"] = UNSET
 
 

@@ -53,6 +53,7 @@ from runner.vehicle.replies import Replies
 from runner.vehicle.seen import SeenPictures
 from runner.vehicle.sending import SendingTimes
 from runner.vehicle.uplink import MeasuredUplinks
+from runner.vehicle.views import StatedViews
 
 if TYPE_CHECKING:
     from runner.pqos.track import Track
@@ -121,12 +122,11 @@ class ControlLoop:
         self._inbox = Inbox()
         self.refusals = Refusals(self._now, self._inbox.is_full, self.on_report)
         self._operators, self._attention = Operators(self.setup.expires_s), StatedAttention()
-        self._pictures, self._streams = SeenPictures(self.vehicle), Streams(self.vehicle.fixed)
+        self._pictures, self._views = SeenPictures(self.vehicle), StatedViews(self.vehicle)
         self._uplinks, self._sending, self._key_frames = MeasuredUplinks(self.vehicle), SendingTimes(), KeyFrames()
-        self._publisher, self._replies = Publisher(self.setup.latency, self.publish), Replies()
-        self._report_once = RepeatedReports(self.on_report)
-        self._operators_checked = 0.0  # when operators were last checked for silence
-        self._began = time.monotonic()
+        self._publisher, self._streams = Publisher(self.setup.latency, self.publish), Streams(self.vehicle.fixed)
+        self._replies, self._report_once = Replies(), RepeatedReports(self.on_report)
+        self._began, self._operators_checked = time.monotonic(), 0.0  # when operators were last checked for silence
         self._steered: SteeringReported | None = None  # the last one of the synthetic drive
 
     def post(self, document: Mapping[str, Any], answer: Answer | None = None) -> None:
@@ -221,6 +221,7 @@ class ControlLoop:
         if self._ticks % TELEMETRY_TICKS == 0:
             self._guarded("telemetry", lambda: self._publish_measured(t))
         self._guarded("operators", lambda: self._watch_operators(t))
+        self._guarded("views", lambda: self._notice(self._views.events(self._run.state, t)))
         self._guarded("advice", lambda: self._publisher.advise(self._run, t))
 
     def _steer(self, t: float) -> None:
@@ -300,6 +301,8 @@ class ControlLoop:
         if item.report.run is not UNSET:
             self._operators.reported(item.sender, t, item.report.run)
         self._pictures.add(item.sender, t, item.report)
+        if item.sender == self._run.state.driving.in_control:
+            self._notice(self._views.take(self._run.state, t, item.report))
         reported = ReceptionReported(t, item.sender, item.sender == self._run.state.driving.in_control, item.report)
         uplink = self._uplinks.of(item.report)
         if uplink is None:

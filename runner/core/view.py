@@ -1,0 +1,68 @@
+"""What an operator sees of a camera's image. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from math import ceil
+from typing import Annotated
+
+from runner.core.limits import Limits
+from runner.core.model import Roi
+
+Px = Annotated[int, Limits(0, 65535)]
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """Part of a camera's full image, and how large screens show it.
+
+    x, y                         its left and upper edge, px of the full image
+    width, height                its size, px of the full image; 0: nothing is shown
+    screen_width, screen_height  px of the screen that it covers
+    """
+
+    x: Px
+    y: Px
+    width: Px
+    height: Px
+    screen_width: Px
+    screen_height: Px
+
+    @property
+    def is_empty(self) -> bool:
+        return not (self.width and self.height)
+
+    @property
+    def roi(self) -> Roi:
+        return Roi(self.x, self.y, self.width, self.height)
+
+    @property
+    def scale(self) -> Fraction:
+        """px of the screen for each px of the full image, in the direction that shows more; 0 if nothing is shown."""
+        if self.is_empty:
+            return Fraction(0)
+        return max(Fraction(self.screen_width, self.width), Fraction(self.screen_height, self.height))
+
+
+View = Mapping[str, Seen]  # by camera; those not named are seen in full, as large as they are
+NOWHERE = Seen(0, 0, 0, 0, 0, 0)
+
+
+def united(one: Seen, other: Seen) -> Seen:
+    """What two windows show together: the smallest region with both, as large as either shows its own."""
+    if one.is_empty or other.is_empty:
+        return other if one.is_empty else one
+    both, scale = enclosing(one.roi, other.roi), max(one.scale, other.scale)
+    return Seen(both.x, both.y, both.width, both.height, ceil(both.width * scale), ceil(both.height * scale))
+
+
+def enclosing(one: Roi, other: Roi) -> Roi:
+    """The smallest region with both."""
+    x, y = min(one.x, other.x), min(one.y, other.y)
+    right, bottom = (
+        max(one.x + one.width, other.x + other.width),
+        max(one.y + one.height, other.y + other.height),
+    )
+    return Roi(x, y, right - x, bottom - y)
