@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 
-from runner.core.model import Camera, ModelError, Pose
+from runner.core.model import Camera, ModelError
+from runner.core.mounting import Pose
 
 RENDERER_VERSION = 3  # increment with every change to pictures or files
 _DIGEST_BYTES = 32

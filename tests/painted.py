@@ -20,7 +20,7 @@ from unittest.mock import patch
 import numpy as np
 
 from runner.clips import View
-from runner.core.model import Pose
+from runner.core.mounting import Pose
 from runner.settings import Dimensions
 
 SECONDS = 4.0

@@ -10,7 +10,8 @@ import pytest
 from helpers import Command, UserConf, vehicle
 
 from runner.configuration.layout import HEADER, NOWHERE, Layouts, drive_places_problem, own_places, places_problem
-from runner.core.model import Place, Vehicle
+from runner.core.model import Vehicle
+from runner.core.mounting import Place
 from runner.errors import ConfigError, RunError, UserError
 
 SAVED = {

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from runner.clips import View
-from runner.core.model import Pose
+from runner.core.mounting import Pose
 from runner.resources import directory
 
 pytestmark = [

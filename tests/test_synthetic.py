@@ -19,7 +19,7 @@ import pytest
 
 from runner import clips, synthetic
 from runner.clips import View, clip_path, is_whole, seal
-from runner.core.model import Pose
+from runner.core.mounting import Pose
 from runner.synthetic import render
 
 pytestmark = pytest.mark.slow  # renders pictures
@@ -185,7 +185,7 @@ from fractions import Fraction
 from pathlib import Path
 import sys
 from runner.clips import View
-from runner.core.model import Pose
+from runner.core.mounting import Pose
 from runner.synthetic import render
 view = View(160, 96, Fraction(5), Pose(2, 0, 1.5, 0), 90, "pinhole")
 render([view], 4, Path(sys.argv[1]), lambda *_: None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -18,6 +19,7 @@ from runner.configuration.rule_lists import call_entry, check_order
 from runner.configuration.uplinks import Ways, built_uplinks, reserves_kbps, uplink_problems
 from runner.core.budget import SOUND
 from runner.core.commands import KnobValue
+from runner.core.hull import Curve, concave
 from runner.core.model import (
     Camera,
     Capture,
@@ -25,15 +27,13 @@ from runner.core.model import (
     Kbps,
     Mode,
     ModelError,
-    Place,
-    Pose,
     RateQualityModel,
     Roi,
     Source,
     Vehicle,
     exact,
-    overlapping,
 )
+from runner.core.mounting import Place, Pose, overlapping
 from runner.core.rules import RuleCall
 from runner.errors import ConfigError, Problem, suggest
 from runner.graph import Plan, assignments, check_video, compile_graph
@@ -228,7 +228,8 @@ class Builder:
         native = data.get("native")
         pose, place = data.get("pose"), data.get("place")
         options = given(data, ("fov_deg", "lens", "shed", "framing", "calibrated", "redundant"))
-        options |= {key: exact(value) for key, value in given(data, ("weight", "floor_kbps")).items()}
+        options |= {key: exact(value) for key, value in given(data, ("weight", "floor_kbps", "least_scaling")).items()}
+        options |= {key: Roi(**value) for key, value in given(data, ("always",)).items()}
         return self.attempt(
             path,
             lambda: Camera(
@@ -430,8 +431,13 @@ def _capture(source: Source, data: Mapping[str, Any]) -> Capture:
 
 def _rate_quality(data: Mapping[str, Any], graph: Graph | None) -> RateQualityModel:
     scaling, b_min = (tuple(map(exact, data[key])) for key in ("scaling", "b_min_kbps"))
-    whole = RateQualityModel((Fraction(1),), (Fraction(0),), exact(data["b_full_kbps"]))
-    return whole if graph and graph.passes else RateQualityModel(scaling, b_min, whole.b_full)
+    points = data.get("quality")
+    if points and tuple(map(tuple, points)) != concave(points):
+        rule = "must be increasing and concave, each step with less quality for its bits; `tod-runner model` writes it"
+        raise ModelError("quality", json.dumps(points), rule)
+    curve = Curve(*(tuple(map(float, values)) for values in zip(*points, strict=True))) if points else None
+    whole = RateQualityModel((Fraction(1),), (Fraction(0),), exact(data["b_full_kbps"]), curve)
+    return whole if graph and graph.passes else RateQualityModel(scaling, b_min, whole.b_full, curve)
 
 
 def _rate(fps: float) -> Fraction:

@@ -12,7 +12,8 @@ from typing import Any, NamedTuple
 from runner import schema
 from runner.configuration.files import LAYOUT
 from runner.configuration.yaml_file import label, load_file
-from runner.core.model import Place, Vehicle, overlapping
+from runner.core.model import Vehicle
+from runner.core.mounting import Place, overlapping
 from runner.errors import ConfigError, Problem, UserError, os_errors_as, suggest
 
 WITHOUT_KEYS = "operator"  # name of an operator without keys

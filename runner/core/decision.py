@@ -102,9 +102,23 @@ class Decision:
         return is_same and all(s.reason == other.settings[name].reason for name, s in self.settings.items())
 
 
+class Shown(NamedTuple):
+    """What to send of a camera, by what its operator sees.
+
+    roi      region of the full image
+    largest  scaling factor above which screens show no more
+    area     px of screens that show it
+    """
+
+    roi: Roi
+    largest: Fraction
+    area: int
+
+
 class Draft(NamedTuple):
     """A decision in progress. A rule reads what earlier ones gave and returns a draft with its own part replaced.
 
+    shown      by camera that is on, what its operator sees; empty: everything
     total      kbit/s of all cameras
     demand     kbit/s by camera, 0 when off
     bitrate    exact kbit/s by camera
@@ -135,6 +149,7 @@ class Draft(NamedTuple):
     placed_words: Mapping[str, str] = NOTHING
     notes: tuple[str, ...] = ()
     reasons: Mapping[str, str] = NOTHING
+    shown: Mapping[str, Shown] = NOTHING
 
     def replaced(self, **changes: Any) -> Draft:
         """The draft with these parts replaced."""

@@ -6,17 +6,19 @@ Bitrates are kbit/s and exact (`Fraction` of the decimal text a user wrote), siz
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from decimal import Decimal
 from enum import StrEnum
 from fractions import Fraction
 from functools import lru_cache
-from itertools import chain, islice, pairwise
+from itertools import chain, pairwise
 from math import inf, nextafter
 from typing import Any, Protocol
 
+from runner.core.hull import Curve
 from runner.core.limits import Count
+from runner.core.mounting import Place, Pose
 from runner.errors import suggest
 
 Kbps = Fraction
@@ -118,6 +120,7 @@ class RateQualityModel:
     scaling  R factors in ]0, 1], increasing
     b_min    R lower bounds in kbit/s, increasing from 0
     b_full   kbit/s for the full image: the end of the last range and the camera's share in the allocation
+    quality  of the full image over its bitrate with the best of these factors; None: not measured
     raises   ModelError
 
     Derived: `whole_b_min`, the bounds as integers if all are whole, otherwise empty; `ranges`, each range B_r and its
@@ -127,6 +130,7 @@ class RateQualityModel:
     scaling: tuple[Fraction, ...]
     b_min: tuple[Kbps, ...]
     b_full: Kbps
+    quality: Curve | None = None
     whole_b_min: tuple[int, ...] = field(init=False, repr=False)
     ranges: tuple[str, ...] = field(init=False, repr=False)
 
@@ -349,46 +353,6 @@ class Capture:
     controls: Mapping[str, int] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, slots=True)
-class Pose:
-    """Where a camera is mounted on the vehicle, in the axes of ROS REP 103: x forward, y left, z up.
-
-    The origin is on the ground below the rear axle. Metres and degrees; yaw turns left,
-    pitch tilts the view down, roll tilts it clockwise.
-    """
-
-    x_m: float
-    y_m: float
-    z_m: float
-    yaw_deg: float
-    pitch_deg: float = 0.0
-    roll_deg: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class Place:
-    """Tile on the operator's page, counted from the top left, and how many rows and columns it covers."""
-
-    row: int
-    column: int
-    row_span: int = 1
-    column_span: int = 1
-
-    def overlaps(self, other: Place) -> bool:
-        """Whether both cover the same row of the same column."""
-        rows = self.row < other.row + other.row_span and other.row < self.row + self.row_span
-        columns = self.column < other.column + other.column_span and other.column < self.column + self.column_span
-        return rows and columns
-
-
-def overlapping(places: Mapping[str, Place]) -> Iterator[tuple[str, str, str]]:
-    """Cameras whose tile overlaps an earlier camera's, each with the rule that it breaks, and that camera."""
-    for count, (name, place) in enumerate(places.items()):
-        overlapped = next((other for other, its in islice(places.items(), count) if place.overlaps(its)), None)
-        if overlapped is not None:
-            yield name, f"overlaps the place of camera {overlapped}", overlapped
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
     """A camera mounted in a vehicle.
@@ -406,6 +370,8 @@ class Camera:
     framing         in the page's Drive view. fit: the whole picture is shown; fill: it fills its box; None: by place
     calibrated      whether pose, fov_deg and lens were measured, not estimated
     redundant       whether every uplink carries it
+    always          region that is sent even if nobody looks; None: the central half in each direction
+    least_scaling   factor below which no screen that shows little lowers the picture; None: the smallest of its factors
     """
 
     name: str
@@ -430,6 +396,8 @@ class Camera:
     framing: str | None = None
     calibrated: bool = False
     redundant: bool = False
+    always: Roi | None = None
+    least_scaling: Fraction | None = None
     full_roi: Roi = field(init=False)
 
     def __post_init__(self) -> None:
@@ -441,6 +409,9 @@ class Camera:
                 rule = f"must lie inside the native {width}x{height}"
                 side = "width_px" if self.crop.x + self.crop.width > width else "height_px"
                 raise ModelError("native", found, rule, side)
+        if (kept := self.always) and (kept.x + kept.width > self.width or kept.y + kept.height > self.height):
+            found = f"{kept.width}x{kept.height} at {kept.x},{kept.y}"
+            raise ModelError("always", found, f"must lie inside the image of {self.width}x{self.height}", "width_px")
         frames = self.graph.settings.vbv_frames or 0.0
         if 1000 * frames > MOST_BUFFER_MS * self.fps:
             rule = f"with vbv_frames {frames:g} of its graph it must be at least {1000 * frames / MOST_BUFFER_MS:g}"
@@ -454,6 +425,11 @@ class Camera:
     def in_source(self) -> Roi:
         """The full image within the source's image."""
         return self.crop or self.full_roi
+
+    @property
+    def kept_roi(self) -> Roi:
+        """The region that is sent even if nobody looks."""
+        return self.always or Roi(self.width // 4, self.height // 4, -(-self.width // 2), -(-self.height // 2))
 
     @property
     def address(self) -> str | None:

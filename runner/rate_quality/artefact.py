@@ -285,6 +285,7 @@ def to_yaml(measured: Measured) -> str:
         f"  scaling:    {[plain(factor) for factor in choice.scaling]}",
         f"  b_min_kbps: {list(choice.b_min)}",
         f"  b_full_kbps: {choice.b_full}",
+        *([f"  quality: {[list(point) for point in choice.quality]}"] if choice.quality else []),
         f"  model: {measured.name}.model.json   # the curves, beside this file",
     ]
     return "\n".join(lines) + "\n"

@@ -8,6 +8,7 @@ from fractions import Fraction
 from math import ceil
 from statistics import fmean
 
+from runner.core.hull import concave
 from runner.core.model import plain
 from runner.rate_quality.curves import (
     Crossing,
@@ -23,6 +24,7 @@ from runner.rate_quality.curves import (
     quality_drops,
 )
 
+WHOLE = {"mssim": 1.0, "vmaf": 100.0}  # metrics that are a share of this
 FEW_FRAMES = 40  # with fewer scored frames a mean is uncertain
 
 
@@ -50,6 +52,7 @@ class Choice:
     """A rate-quality model and the evidence for it.
 
     b_min      whole kbit/s, increasing from 0
+    quality    concave hull of bitrate (kbit/s) and quality (of 1) with these factors; empty: the metric is no share
     dropped    by factor, why it was dropped
     table      for each number of factors, the best choice and what it loses
     cores      by factor, share of a core that its encoder needs, the maximum over all bitrates
@@ -59,6 +62,7 @@ class Choice:
     scaling: tuple[Fraction, ...]
     b_min: tuple[int, ...]
     b_full: int
+    quality: tuple[tuple[float, float], ...]
     ladder: Ladder
     crossings: tuple[Crossing, ...]
     dropped: Mapping[Fraction, str]
@@ -96,6 +100,7 @@ def choose(points: Sequence[Point], criteria: ChoiceCriteria) -> Choice:
         scaling=ladder.scaling,
         b_min=(0, *(round(bound) for bound in ladder.bounds)),
         b_full=b_full,
+        quality=_hull(kept, criteria),
         ladder=ladder,
         crossings=tuple(crossings(kept, ladder, criteria.metric, criteria.sign)),
         dropped=dict(sorted(dropped.items())),
@@ -103,6 +108,16 @@ def choose(points: Sequence[Point], criteria: ChoiceCriteria) -> Choice:
         cores=cores,
         warnings=tuple(warnings),
     )
+
+
+def _hull(points: Iterable[Point], criteria: ChoiceCriteria) -> tuple[tuple[float, float], ...]:
+    """The best quality at each bitrate, as far as more of them gains."""
+    if criteria.metric not in WHOLE:
+        return ()
+    score, best = mean_score(criteria.metric), dict[float, float]()
+    for point in (point for point in points if point.meets_target):
+        best[point.target_kbps] = max(best.get(point.target_kbps, 0.0), score(point) / WHOLE[criteria.metric])
+    return concave([(kbps, round(quality, 4)) for kbps, quality in best.items()])
 
 
 def pooled(groups: Sequence[Sequence[Point]]) -> list[Point]:

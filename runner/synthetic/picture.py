@@ -17,7 +17,7 @@ import numpy as np
 
 from runner.clips import View
 from runner.core.intrinsics import focal_px
-from runner.core.model import Pose
+from runner.core.mounting import Pose
 from runner.synthetic.course import Array, plan_course
 from runner.synthetic.faces import VISIBLE_M, stand_faces
 from runner.synthetic.world import GROUND, LEVELS, RAILING, SKY, TREE, WALL, compiled, open_atlas

@@ -12,7 +12,7 @@ from stills import MARKS, Station, image, on_screen, serving, steering
 
 from browser import all_live, opened, shot, until
 from rig import BROWSER, CHROMIUM_FLAGS
-from runner.core.model import Pose
+from runner.core.mounting import Pose
 
 pytestmark = MARKS
 

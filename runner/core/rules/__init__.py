@@ -10,9 +10,9 @@ from typing import Any
 
 from runner.core import allocation, scaling
 from runner.core.budget import beside_sound
-from runner.core.decision import NOTHING, Decision, Draft, Setting, short
-from runner.core.model import Mode, Roi, Vehicle
-from runner.core.rules import spread, steady  # noqa: F401  (register their rules, as the imports below do theirs)
+from runner.core.decision import NOTHING, Decision, Draft, Setting, Shown, short
+from runner.core.model import SMALLEST_SIDE_PX, Mode, Roi, Vehicle
+from runner.core.rules import seen, spread, steady  # noqa: F401  (register their rules, as the imports below do theirs)
 from runner.core.rules.paper import whole
 from runner.core.rules.registry import GIVEN, Last, Memories, Memory, Rule, RuleCall, Step, rule
 from runner.core.rules.safe import follow_link
@@ -36,6 +36,9 @@ __all__ = [
 
 BITRATE_RULE = "must be kbit/s from 0 as an exact number (int or Fraction)"
 FACTOR_RULE = "must be a Fraction in ]0, 1]"
+SHOWN_RULE = (
+    f"must be Shown, its region at least {SMALLEST_SIDE_PX}x{SMALLEST_SIDE_PX}, its factor a Fraction in ]0, 1]"
+)
 
 
 class RuleFailed(RunError):
@@ -50,16 +53,18 @@ def decide(vehicle: Vehicle, state: State, memory: Memories) -> tuple[Decision, 
     raises  RuleFailed, since rules may be the user's own
     """
     draft, asked = Draft(), None
-    seen = replace(state, on={**state.on, **dict.fromkeys(state.lost, False)}) if state.lost else state
+    inputs = replace(state, on={**state.on, **dict.fromkeys(state.lost, False)}) if state.lost else state
     for call in vehicle.modes[state.mode]:
         before, own = draft, memory.get(call.key, NOTHING)
         try:
-            draft, kept = call(vehicle, seen, draft, own)
+            draft, kept = call(vehicle, inputs, draft, own)
         except (Exception, SystemExit) as error:
             raise RuleFailed(f"rule {call.name} failed: {type(error).__name__}: {error}") from error
-        if problem := _draft_problem(seen, before, draft):
+        if problem := _draft_problem(inputs, before, draft):
             raise RuleFailed(f"rule {call.name} failed: {problem}")
         memory = memory if kept is own else {**memory, call.key: kept}
+        if draft.shown is not before.shown:  # the rules that follow share the bits among these regions
+            inputs = replace(inputs, rois={**inputs.rois, **{name: shown.roi for name, shown in draft.shown.items()}})
         if asked is None and draft.total is not None:
             asked = draft.total
             if vehicle.sound and not draft.bitrate:  # in mode S the total is what the operator has set for cameras
@@ -70,7 +75,7 @@ def decide(vehicle: Vehicle, state: State, memory: Memories) -> tuple[Decision, 
         vehicle,
         state.on,
         state.lost,
-        state.rois,
+        inputs.rois,
         draft._replace(total=None, uncapped=None, measured=False, believed=None, uplinks=NOTHING),
     )
     # Without a prediction there is only the measurement, so the total without it is unknown.
@@ -118,11 +123,20 @@ def _is_factor(value: Any) -> bool:
     return type(value) is Fraction and 0 < value.numerator <= value.denominator
 
 
+def _is_shown(value: Any) -> bool:
+    return (
+        isinstance(value, Shown)
+        and _is_factor(value.largest)
+        and min(value.roi.width, value.roi.height) >= SMALLEST_SIDE_PX
+    )
+
+
 # Parts of a draft by camera, the check of their values, and its description.
 PARTS = (
     ("demand", _is_bitrate, BITRATE_RULE),
     ("bitrate", _is_bitrate, BITRATE_RULE),
     ("scaling", _is_factor, FACTOR_RULE),
+    ("shown", _is_shown, SHOWN_RULE),
 )
 
 

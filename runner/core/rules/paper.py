@@ -7,7 +7,7 @@ from fractions import Fraction
 from functools import partial
 
 from runner.core import allocation, scaling
-from runner.core.decision import Draft, short
+from runner.core.decision import Draft, Shown, short
 from runner.core.model import Kbps, Roi, Vehicle, plain
 from runner.core.rules.registry import Last, Memory, Step, rule
 from runner.core.state import State
@@ -95,10 +95,14 @@ def share_equally(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) 
     return with_excess_noted(vehicle, draft.replaced(bitrate=given)), memory
 
 
-@rule(needs=["bitrate"], gives=["scaling"], reads=["rois"], uses=["sized_for"])
+@rule(needs=["bitrate"], gives=["scaling"], reads=["rois"], uses=["shown", "sized_for"])
 def scaling_from_rate_quality(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
-    """Eq. (4): the factor whose bitrate range contains the allocation, converted to the full image."""
-    factors, reasons = _scaled(vehicle, state.on, state.rois, draft.demand, draft.bitrate, lasting_share(draft))
+    """Eq. (4): the factor whose bitrate range contains the allocation, converted to the full image.
+
+    No factor is larger than what screens show, if an earlier rule has given that.
+    """
+    lasting = lasting_share(draft)
+    factors, reasons = _scaled(vehicle, state.on, state.rois, draft.demand, draft.bitrate, lasting, draft.shown)
     return draft.replaced(scaling=factors, reasons=reasons), memory
 
 
@@ -115,6 +119,7 @@ def _scaled(
     demand: Mapping[str, Kbps],
     bitrate: Mapping[str, Kbps],
     lasting: Fraction | None,
+    shown: Mapping[str, Shown],
 ) -> tuple[Mapping[str, Fraction], Mapping[str, str]]:
     """Factor and reason by camera. lasting: see `lasting_share`."""
     factors, reasons = {}, {}
@@ -126,10 +131,15 @@ def _scaled(
         of_full = scaling.as_full_image(sized_for, roi, full)
         # A camera that cannot be sent gets the smallest factor, however few its pixels.
         factors[name], why = scaling.select_scaling(camera.rate_quality, of_full if kbps else allocation.ZERO)
-        seen = ""
+        as_full = ""
         if kbps and (lasting is not None or (roi is not full and roi != full)):
-            seen = f", as {whole(of_full)} for the full image" + ("" if lasting is None else " at the total that lasts")
-        reasons[name] = f"{kbps} of {short(demand[name])} kbit/s{seen}, {AS_ENCODED if camera.graph.passes else why}"
+            as_full = f", as {whole(of_full)} for the full image" + (
+                "" if lasting is None else " at the total that lasts"
+            )
+        reasons[name] = f"{kbps} of {short(demand[name])} kbit/s{as_full}, {AS_ENCODED if camera.graph.passes else why}"
+        if name in shown and shown[name].largest < factors[name]:
+            factors[name] = shown[name].largest
+            reasons[name] += f", the screen shows {plain(factors[name])}"
     return factors, reasons
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from fractions import Fraction
 from functools import cache, partial
@@ -32,6 +32,8 @@ from runner.core.state import State
 FORGOTTEN_S = 10.0  # without anything that arrives over one of several uplinks, until what it carried counts no more
 _allocated = Last(allocation.allocate_above_floors)
 
+Share = Callable[[Mapping[str, Kbps], Kbps], Mapping[str, Kbps]]
+
 
 @rule(needs=["total", "demand"], gives=["bitrate"], reads=["copies", "weights"], uses=["placed", "uplinks"])
 def share_above_floors(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
@@ -39,16 +41,39 @@ def share_above_floors(vehicle: Vehicle, state: State, draft: Draft, memory: Mem
 
     Memory: the cameras given up.
     """
+    return shared_above_floors(vehicle, state, draft, memory, _by_demand(vehicle, state))
+
+
+def shared_above_floors(vehicle: Vehicle, state: State, draft: Draft, memory: Memory, share: Share) -> Step:
+    """The total shared, with cameras given up for the floors of others; memory: these cameras.
+
+    share  returns kbit/s by camera, of all copies, from what is wanted for them, and their total
+    """
     draft, given_up, memory = _give_up(vehicle, state, draft, draft.demand, memory)
     wanted = _without(given_up, draft.demand)
-    return with_excess_noted(vehicle, draft.replaced(bitrate=_shared(vehicle, state, draft, wanted))), memory
+    return with_excess_noted(vehicle, draft.replaced(bitrate=_shared(vehicle, state, draft, wanted, share))), memory
 
 
-def _shared(vehicle: Vehicle, state: State, draft: Draft, wanted: Mapping[str, Kbps]) -> Mapping[str, Kbps]:
+def _by_demand(vehicle: Vehicle, state: State) -> Share:
+    """Floors first, then Eq. (2)."""
+    floors = lowest_of_all_copies(vehicle, state)
+    return lambda wanted, total: _allocated(wanted, total, state.weights, floors)
+
+
+def lowest_of_all_copies(vehicle: Vehicle, state: State) -> Mapping[str, Kbps]:
+    """kbit/s by camera that has a floor, for every copy that leaves the vehicle."""
+    floors = _floors(vehicle)
+    return {name: own * state.copies.get(name, 1) for name, own in floors.items()} if state.copies else floors
+
+
+def _shared(
+    vehicle: Vehicle, state: State, draft: Draft, wanted: Mapping[str, Kbps], share_of_all: Share
+) -> Mapping[str, Kbps]:
     """kbit/s by camera, of the total, or of what the uplinks carry that it is placed on."""
     assert draft.total is not None
+    share = partial(_shared_among, vehicle, state, share_of_all)
     if not draft.placed:
-        return _shared_among(vehicle, state, wanted, draft.total)
+        return share(wanted, draft.total)
     living = {
         name: [at for at in uplinks if not draft.uplinks[at].stalled]
         for name, uplinks in draft.placed.items()
@@ -58,7 +83,6 @@ def _shared(vehicle: Vehicle, state: State, draft: Draft, wanted: Mapping[str, K
         name: (living[name] or uplinks) if name in living else uplinks[:1] for name, uplinks in draft.placed.items()
     }
     totals = {name: share.total for name, share in draft.uplinks.items()}
-    share = partial(_shared_among, vehicle, state)
     given = shared(limits, totals, wanted, share)
     copies = {name: others for name, on in draft.placed.items() if (others := set(on).difference(limits[name]))}
     if not copies:
@@ -69,15 +93,14 @@ def _shared(vehicle: Vehicle, state: State, draft: Draft, wanted: Mapping[str, K
     return again | {name: min(given[name], again[name]) for name in copies}
 
 
-def _shared_among(vehicle: Vehicle, state: State, wanted: Mapping[str, Kbps], total: Kbps) -> Mapping[str, Kbps]:
-    """kbit/s by camera: floors first, then Eq. (2); the total counts every copy of a camera that leaves the vehicle."""
-    floors = _floors(vehicle)
+def _shared_among(
+    vehicle: Vehicle, state: State, share: Share, wanted: Mapping[str, Kbps], total: Kbps
+) -> Mapping[str, Kbps]:
+    """kbit/s by camera; the total counts every copy of a camera that leaves the vehicle."""
     if not state.copies:
-        return above_fixed(vehicle, wanted, total, lambda others, rest: _allocated(others, rest, state.weights, floors))
+        return above_fixed(vehicle, wanted, total, share)
     copies = {name: state.copies.get(name, 1) for name in wanted}
     of_all = {name: own * copies[name] for name, own in wanted.items()}
-    lowest = {name: floor * copies[name] for name, floor in floors.items() if name in copies}
-    share = partial(allocation.allocate_above_floors, weights=state.weights, floors=lowest)
     return {name: Fraction(own) / copies[name] for name, own in above_fixed(vehicle, of_all, total, share).items()}
 
 
@@ -141,7 +164,8 @@ def fit_to_total(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -
     if total >= of_all_copies(state, draft.bitrate) and not draft.placed:
         return draft, {} if memory else memory
     draft, given_up, memory = _give_up(vehicle, state, draft, draft.bitrate, memory)
-    bitrates = _shared(vehicle, state, draft, _without(given_up, draft.bitrate))
+    wanted = _without(given_up, draft.bitrate)
+    bitrates = _shared(vehicle, state, draft, wanted, _by_demand(vehicle, state))
     if bitrates == draft.bitrate:
         return draft, memory
     factors, reasons = dict(draft.scaling), dict(draft.reasons)

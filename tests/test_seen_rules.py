@@ -1,0 +1,159 @@
+"""Rules that send what is seen: regions, sizes and shares by what the operator in control looks at."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import pytest
+from helpers import Drive
+
+from runner.core.model import Roi
+
+SEEN = ("modes=seen", "vehicle=delivery_robot", "mode=collective")
+QUALITY = (
+    "{scaling: [0.25, 0.5, 1], b_min_kbps: [0, 300, 900], b_full_kbps: 3000,"
+    " quality: [[100, 0.8], [400, 0.88], [2000, 0.94]]}"
+)
+MEASURED = tuple(f"cameras.{name}.rate_quality={QUALITY}" for name in ("front", "rear", "mast"))
+FULL, NOTHING = Roi(0, 0, 1280, 720), {"x": 0, "y": 0, "width": 0, "height": 0, "screen_width": 0, "screen_height": 0}
+
+
+def view(x, y, width, height, screen_width, screen_height):
+    return dict(zip(NOTHING, (x, y, width, height, screen_width, screen_height), strict=True))
+
+
+@pytest.fixture
+def drive():
+    drive = Drive(*SEEN, *MEASURED)
+    drive.accept("total_set", kbps=2000)
+    drive.accept("attention_changed", attention="watching")
+    return drive
+
+
+def test_everything_is_sent_while_no_view_is_stated(drive):
+    assert drive["front"].roi == drive.vehicle.cameras["front"].full_roi
+    drive.accept("view_reported", t=1, view={"rear": NOTHING})
+    drive.accept("clock_advanced", t=3)
+    assert drive["front"].roi == drive.vehicle.cameras["front"].full_roi
+
+
+def look(drive, t, **views):
+    drive.accept("view_reported", t=t, view=views)
+
+
+def test_a_region_is_what_is_seen_with_a_margin_and_what_is_always_sent(drive):
+    camera = drive.vehicle.cameras["front"]
+    strip = view(camera.width // 2 - 100, 0, 200, camera.height, 100, camera.height // 2)
+    look(drive, 0.1, front=strip)
+    drive.accept("clock_advanced", t=2)
+    sent = drive["front"].roi
+    kept = camera.kept_roi
+    assert sent.x <= kept.x and sent.x + sent.width >= kept.x + kept.width < camera.width
+    assert (sent.y, sent.height) == (0, camera.height)
+    assert sent.x % 16 == sent.width % 16 == 0
+
+
+def test_a_region_widens_at_once_and_narrows_after_a_second(drive):
+    camera = drive.vehicle.cameras["front"]
+    everything = view(0, 0, camera.width, camera.height, camera.width, camera.height)
+    drive.accept("clock_advanced", t=1)
+    look(drive, 1.0, front=NOTHING)
+    assert drive["front"].roi == camera.full_roi
+    drive.accept("clock_advanced", t=1.9)
+    assert drive["front"].roi == camera.full_roi
+    drive.accept("clock_advanced", t=2.0)
+    assert drive["front"].roi.pixels < camera.full_roi.pixels / 3
+    look(drive, 2.1, front=everything)
+    assert drive["front"].roi == camera.full_roi
+
+
+def test_a_view_that_alternates_narrows_nothing(drive):
+    camera = drive.vehicle.cameras["front"]
+    left = view(0, 0, camera.width // 2, camera.height, 100, 100)
+    right = view(camera.width // 2, 0, camera.width // 2, camera.height, 100, 100)
+    for tenth in range(1, 60):
+        look(drive, tenth / 10, front=left if tenth % 2 else right)
+        if tenth > 1:
+            assert drive["front"].roi == camera.full_roi
+
+
+@pytest.mark.parametrize(
+    ("attention", "speed_mps", "narrows"),
+    [("watching", 9, True), (None, 9, False), (None, None, False), (None, 0.5, True), ("hidden", 0.5, False)],
+)
+def test_while_driving_nothing_is_taken_from_a_driver_who_is_not_known_to_watch(attention, speed_mps, narrows):
+    drive = Drive(*SEEN, *MEASURED)
+    if attention:
+        drive.accept("attention_changed", attention=attention)
+    if speed_mps is not None:
+        drive.accept("position_reported", lat=48, lon=11, speed_mps=speed_mps)
+    look(drive, 0.5, front=NOTHING)
+    drive.accept("clock_advanced", t=5)
+    assert (drive["front"].roi != drive.vehicle.cameras["front"].full_roi) is narrows
+
+
+def test_no_region_leaves_the_operators_own():
+    drive = Drive(*SEEN, *MEASURED, "mode=single")
+    own = {"x": 32, "y": 16, "width": 200, "height": 100}
+    drive.accept("roi_set", camera="front", **own)
+    drive.accept("mode_selected", mode="collective")
+    drive.accept("attention_changed", attention="watching")
+    look(drive, 0.1, front=view(100, 50, 64, 64, 64, 64))
+    drive.accept("clock_advanced", t=2)
+    assert drive["front"].roi != Roi(**own)
+    sent = drive["front"].roi
+    assert sent.x >= 32 and sent.y >= 16 and sent.x + sent.width <= 232 and sent.y + sent.height <= 116
+    look(drive, 2.1, front=view(400, 300, 64, 64, 64, 64))
+    assert drive["front"].roi == Roi(**own), "what is seen lies outside"
+
+
+def test_no_picture_is_larger_than_the_screen_shows_it():
+    drive = Drive(*SEEN, *MEASURED, "cameras.front.least_scaling=0.1")
+    camera = drive.vehicle.cameras["front"]
+    drive.accept("attention_changed", attention="watching")
+    look(drive, 0.1, front=view(0, 0, camera.width, camera.height, camera.width // 5, camera.height // 5))
+    drive.accept("clock_advanced", t=2)
+    assert drive["front"].scaling == Fraction(7, 32), "the next one above a fifth"
+    assert "the screen shows 0.21875" in drive["front"].reason
+    look(drive, 2.1, front=NOTHING)
+    drive.accept("clock_advanced", t=4)
+    assert drive["front"].scaling == Fraction(1, 10)
+
+
+def test_bits_go_to_what_fills_the_screen(drive):
+    cameras = drive.vehicle.cameras
+    before = drive["front"].kbps
+    sizes = {name: (own.width, own.height) for name, own in cameras.items()}
+    large = view(0, 0, *sizes["front"], *sizes["front"])
+    small = {name: view(0, 0, *sizes[name], sizes[name][0] // 8, sizes[name][1] // 8) for name in ("rear", "mast")}
+    look(drive, 0.1, front=large, **small)
+    drive.accept("clock_advanced", t=2)
+    assert drive["front"].kbps > 1.5 * before
+    assert all(drive[name].sending and drive[name].kbps >= 30 for name in small)
+    assert sum(drive[name].kbps for name in cameras) <= 2000
+    assert "shared by quality" in drive["front"].reason
+
+
+def test_without_measured_quality_demand_shares_the_total():
+    drive = Drive(*SEEN)
+    assert "front, rear, mast without measured quality: shared by demand" in drive["front"].reason
+
+
+def test_floors_and_weights_hold(drive):
+    other = Drive(*SEEN, *MEASURED, "cameras.rear.floor_kbps=700", "cameras.mast.weight=0")
+    other.accept("total_set", kbps=1000)
+    assert other["rear"].kbps >= 700
+    assert other["mast"].kbps == 30, "its floor, and nothing beyond it"
+    assert drive["mast"].kbps > 30
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        ("cameras.front.rate_quality.quality=[[400, 0.8], [100, 0.9]]", "must be increasing and concave"),
+        ("cameras.front.always={x: 1200, y: 0, width: 100, height: 100}", "must lie inside the image"),
+    ],
+)
+def test_mistakes_in_the_configuration_are_named(change, problem):
+    with pytest.raises(Exception, match=problem):
+        Drive(*SEEN, *MEASURED, change)
