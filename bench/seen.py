@@ -106,6 +106,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=8)
     parser.add_argument("--fps", type=int, default=20)
     parser.add_argument("--set", nargs="*", default=[], help="further overrides of the policies that know the screen")
+    parser.add_argument("--each", action="store_true", help="a line for each camera, too")
     options = parser.parse_args()
     options.output.mkdir(parents=True, exist_ok=True)
     words = ["vehicle=tum_q7", "source=synthetic", f"fps_max={options.fps}"]
@@ -177,13 +178,17 @@ class Scores:
         """MSSIM, and kbit/s; nothing is seen of a camera that is not sent."""
         return self._known[encoding(camera, setting, seen).key] if setting.sending else (0.0, 0.0)
 
+    def views(self, layout: str) -> Mapping[str, Seen]:
+        """By camera, what a layout shows."""
+        return {name: tile.seen(self._setup.vehicle.cameras[name]) for name, tile in LAYOUTS[layout].items()}
+
     def add(self, decided: Decided) -> None:
         """Encode and score what is not known yet."""
         wanted: dict[tuple[str, Roi], dict[str, Encoding]] = {}
         for (_, layout, _), settings in decided.items():
             for name, setting in settings.items():
                 if setting.sending:
-                    each = encoding(name, setting, LAYOUTS[layout][name].seen(self._setup.vehicle.cameras[name]))
+                    each = encoding(name, setting, self.views(layout)[name])
                     if each.key not in self._known:
                         wanted.setdefault((name, each.roi), {})[each.key] = each
         for number, ((name, roi), encodings) in enumerate(wanted.items(), 1):
@@ -241,31 +246,41 @@ def encoding(camera: str, setting: Setting, seen: Seen) -> Encoding:
 
 
 class OnScreen(NamedTuple):
-    """MSSIM of a layout: mean by px of the screen, that of the worst and of the front camera; kbit/s of all."""
+    """MSSIM of a layout: mean by px of the screen, and of each camera; kbit/s of all."""
 
     mean: float
-    worst: float
-    front: float
+    cameras: Mapping[str, float]
     kbps: float
+
+    @property
+    def worst(self) -> float:
+        return min(self.cameras.values())
+
+    @property
+    def front(self) -> float:
+        return self.cameras["front_center"]
 
 
 def on_the_screen(layout: str, settings: Mapping[str, Setting], scores: Scores) -> OnScreen:
-    cameras = scores._setup.vehicle.cameras
-    seen = {name: tile.seen(cameras[name]) for name, tile in LAYOUTS[layout].items()}
-    areas = {name: one.screen_width * one.screen_height for name, one in seen.items()}
-    found = {name: scores.of(name, settings[name], seen[name]) for name in seen}
+    found = {name: scores.of(name, settings[name], seen) for name, seen in scores.views(layout).items()}
+    areas = {name: seen.screen_width * seen.screen_height for name, seen in scores.views(layout).items()}
     mean = sum(areas[name] * quality for name, (quality, _) in found.items()) / sum(areas.values())
-    worst = min(quality for quality, _ in found.values())
-    return OnScreen(mean, worst, found["front_center"][0], sum(kbps for _, kbps in found.values()))
+    return OnScreen(mean, {name: quality for name, (quality, _) in found.items()}, sum(k for _, k in found.values()))
 
 
 def table(decided: Decided, scores: Scores, options: Any) -> Iterable[str]:
     for layout in options.layouts:
-        yield f"{layout:25} {'kbit/s':>7} {'mean':>6} {'worst':>6} {'front':>6} {'sent':>7}"
+        yield f"{layout:20} {'kbit/s':>7} {'mean':>6} {'worst':>6} {'front':>6} {'sent':>7}"
         for policy in options.policies:
             for total in options.totals:
-                found = on_the_screen(layout, decided[policy, layout, total], scores)
-                yield f"{policy:25} {total:7} {found.mean:6.4f} {found.worst:6.4f} {found.front:6.4f} {found.kbps:7.0f}"
+                settings = decided[policy, layout, total]
+                found = on_the_screen(layout, settings, scores)
+                yield f"{policy:20} {total:7} {found.mean:6.4f} {found.worst:6.4f} {found.front:6.4f} {found.kbps:7.0f}"
+                if options.each:
+                    for name, quality in found.cameras.items():
+                        own = settings[name]
+                        sent = f"{own.width}x{own.height} of {own.roi.width}x{own.roi.height}"
+                        yield f"    {name:16} {own.kbps:7} {quality:6.4f} {sent}"
 
 
 if __name__ == "__main__":
