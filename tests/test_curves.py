@@ -247,7 +247,7 @@ def test_pooled_cameras_have_the_mean_of_their_curves():
 def run_adaptive(**how):
     points = []
     for _ in range(50):
-        lanes = plans.adaptive(EIGHTHS, RATES, points, SCORE, 5e-4, 1.25)
+        lanes = plans.adaptive(EIGHTHS, RATES, points, [SCORE], 5e-4, 1.25)
         if not lanes:
             return points
         points += [point(lane.scaling, lane.kbps, **how) for lane in lanes]

@@ -113,14 +113,17 @@ def test_no_picture_is_larger_than_the_screen_shows_it():
     drive.accept("attention_changed", attention="watching")
     look(drive, 0.1, front=view(0, 0, camera.width, camera.height, camera.width // 5, camera.height // 5))
     drive.accept("clock_advanced", t=2)
-    assert drive["front"].scaling == Fraction(7, 32), "the next one above a fifth"
-    assert "the screen shows 0.21875" in drive["front"].reason
+    assert drive["front"].scaling == Fraction(7, 16), "twice the next one above a fifth, in steps of 1/32"
+    assert "the screen shows no more than" in drive["front"].reason
     look(drive, 2.1, front=NOTHING)
     drive.accept("clock_advanced", t=4)
     assert drive["front"].scaling == Fraction(1, 10)
 
 
-def test_bits_go_to_what_fills_the_screen(drive):
+def test_bits_go_to_what_fills_the_screen():
+    drive = Drive(*SEEN, *MEASURED, "modes.collective.share_by_quality.kept=0")
+    drive.accept("total_set", kbps=2000)
+    drive.accept("attention_changed", attention="watching")
     cameras = drive.vehicle.cameras
     before = drive["front"].kbps
     sizes = {name: (own.width, own.height) for name, own in cameras.items()}

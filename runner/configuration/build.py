@@ -430,14 +430,32 @@ def _capture(source: Source, data: Mapping[str, Any]) -> Capture:
 
 
 def _rate_quality(data: Mapping[str, Any], graph: Graph | None) -> RateQualityModel:
-    scaling, b_min = (tuple(map(exact, data[key])) for key in ("scaling", "b_min_kbps"))
-    points = data.get("quality")
-    if points and tuple(map(tuple, points)) != concave(points):
+    b_full = exact(data["b_full_kbps"])
+    shown = {
+        exact(its["scale"]): _model(its, b_full, ("shown", index)) for index, its in enumerate(data.get("shown", ()))
+    }
+    whole = RateQualityModel((Fraction(1),), (Fraction(0),), b_full)
+    return whole if graph and graph.passes else replace(_model(data, b_full), shown=dict(sorted(shown.items())))
+
+
+def _model(data: Mapping[str, Any], b_full: Kbps, path: schema.Path = ()) -> RateQualityModel:
+    """raises ModelError, with keys below `path`"""
+    try:
+        scaling, b_min = (tuple(map(exact, data[key])) for key in ("scaling", "b_min_kbps"))
+        return RateQualityModel(scaling, b_min, b_full, _curve(data.get("quality")))
+    except ModelError as error:
+        raise ModelError(schema.dotted((*path, error.key)), error.found, error.rule, *error.others) from None
+
+
+def _curve(points: Sequence[Sequence[float]] | None) -> Curve | None:
+    if not points:
+        return None
+    hull = concave([(float(kbps), float(quality)) for kbps, quality in points])
+    if len(hull) < len(points):
         rule = "must be increasing and concave, each step with less quality for its bits; `tod-runner model` writes it"
         raise ModelError("quality", json.dumps(points), rule)
-    curve = Curve(*(tuple(map(float, values)) for values in zip(*points, strict=True))) if points else None
-    whole = RateQualityModel((Fraction(1),), (Fraction(0),), exact(data["b_full_kbps"]), curve)
-    return whole if graph and graph.passes else RateQualityModel(scaling, b_min, whole.b_full, curve)
+    kbps, quality = zip(*hull, strict=True)
+    return Curve(kbps, quality)
 
 
 def _rate(fps: float) -> Fraction:

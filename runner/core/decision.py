@@ -106,11 +106,13 @@ class Shown(NamedTuple):
     """What to send of a camera, by what its operator sees.
 
     roi      region of the full image
-    largest  scaling factor above which screens show no more
+    scale    px of the screen for each px of the full image, at most 1
+    largest  scaling factor above which no more is seen
     area     px of screens that show it
     """
 
     roi: Roi
+    scale: Fraction
     largest: Fraction
     area: int
 

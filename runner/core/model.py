@@ -121,6 +121,7 @@ class RateQualityModel:
     b_min    R lower bounds in kbit/s, increasing from 0
     b_full   kbit/s for the full image: the end of the last range and the camera's share in the allocation
     quality  of the full image over its bitrate with the best of these factors; None: not measured
+    shown    by factor of the image's size at which a screen shows it, the model of what is seen there; ascending
     raises   ModelError
 
     Derived: `whole_b_min`, the bounds as integers if all are whole, otherwise empty; `ranges`, each range B_r and its
@@ -131,6 +132,7 @@ class RateQualityModel:
     b_min: tuple[Kbps, ...]
     b_full: Kbps
     quality: Curve | None = None
+    shown: Mapping[Fraction, RateQualityModel] = field(default_factory=dict)
     whole_b_min: tuple[int, ...] = field(init=False, repr=False)
     ranges: tuple[str, ...] = field(init=False, repr=False)
 
@@ -156,6 +158,11 @@ class RateQualityModel:
         ends = [*bounds[1:], "..."]
         texts = (f"range [{a}, {b}) -> {s}" for a, b, s in zip(bounds, ends, factors, strict=True))
         object.__setattr__(self, "ranges", tuple(texts))
+
+    def at(self, scale: Fraction) -> tuple[Fraction, RateQualityModel]:
+        """The measured factor of the image's size that is nearest to that of a screen, and its model; 1: this one."""
+        nearest = min((Fraction(1), *self.shown), key=lambda factor: max(factor / scale, scale / factor))
+        return nearest, self.shown.get(nearest, self)
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ from runner.core.limits import Limits, NonNegative
 from runner.core.model import Camera, plain
 from runner.errors import UserError, reason
 from runner.rate_quality.cache import digest
-from runner.rate_quality.choice import Choice
+from runner.rate_quality.choice import Choice, ShownChoice
 from runner.rate_quality.curves import Crossing, Ladder, Point
 from runner.rate_quality.metrics import NAMES
 from runner.rate_quality.sequence import Sequence as Clip
@@ -121,6 +121,7 @@ class PointDocument(TypedDict):
     mssim        of luma (Wang 2004)
     vmaf         higher is better
     brisque      lower is better
+    shown        the deciding metric of the picture as a screen shows it, by the factor of the image's size
     """
 
     scaling: Factor
@@ -132,6 +133,7 @@ class PointDocument(TypedDict):
     mssim: NotRequired[float]
     vmaf: NotRequired[float]
     brisque: NotRequired[float]
+    shown: NotRequired[Mapping[str, float]]
 
 
 class CrossingDocument(TypedDict):
@@ -286,9 +288,20 @@ def to_yaml(measured: Measured) -> str:
         f"  b_min_kbps: {list(choice.b_min)}",
         f"  b_full_kbps: {choice.b_full}",
         *([f"  quality: {[list(point) for point in choice.quality]}"] if choice.quality else []),
+        *(["  shown:   # the same for screens that show fewer pixels"] if choice.shown else []),
+        *(line for scale, its in choice.shown.items() for line in _shown_to_yaml(scale, its)),
         f"  model: {measured.name}.model.json   # the curves, beside this file",
     ]
     return "\n".join(lines) + "\n"
+
+
+def _shown_to_yaml(scale: Fraction, its: ShownChoice) -> list[str]:
+    return [
+        f"    - scale: {plain(scale)}",
+        f"      scaling: {[plain(each) for each in its.scaling]}",
+        f"      b_min_kbps: {list(its.b_min)}",
+        *([f"      quality: {[list(point) for point in its.quality]}"] if its.quality else []),
+    ]
 
 
 def read_model(path: Path) -> dict[str, Any]:
@@ -333,7 +346,9 @@ def _clip_to_json(clip: Clip) -> ClipDocument:
 
 
 def _point_to_json(point: Point) -> PointDocument:
-    scores = {name: round(fmean(values), 6) for name, values in point.scores.items()}
+    means = {name: round(fmean(values), 6) for name, values in point.scores.items()}
+    shown = {name.partition("@")[2]: mean for name, mean in means.items() if "@" in name}
+    scores = {name: mean for name, mean in means.items() if "@" not in name} | ({"shown": shown} if shown else {})
     return {
         "scaling": plain(point.scaling),
         "target_kbps": point.target_kbps,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from math import ceil
 from statistics import fmean
@@ -48,6 +48,15 @@ class ChoiceCriteria:
 
 
 @dataclass(frozen=True, slots=True)
+class ShownChoice:
+    """The same for a screen that shows fewer px than the full image: factors, bounds and quality as in `Choice`."""
+
+    scaling: tuple[Fraction, ...]
+    b_min: tuple[int, ...]
+    quality: tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True, slots=True)
 class Choice:
     """A rate-quality model and the evidence for it.
 
@@ -57,6 +66,7 @@ class Choice:
     table      for each number of factors, the best choice and what it loses
     cores      by factor, share of a core that its encoder needs, the maximum over all bitrates
     warnings   caveats for the user
+    shown      by factor of the image's size at which a screen shows it
     """
 
     scaling: tuple[Fraction, ...]
@@ -69,6 +79,7 @@ class Choice:
     table: tuple[Ladder, ...]
     cores: Mapping[Fraction, float]
     warnings: tuple[str, ...]
+    shown: Mapping[Fraction, ShownChoice] = field(default_factory=dict)
 
 
 def choose(points: Sequence[Point], criteria: ChoiceCriteria) -> Choice:
@@ -110,13 +121,27 @@ def choose(points: Sequence[Point], criteria: ChoiceCriteria) -> Choice:
     )
 
 
+def choose_shown(points: Sequence[Point], criteria: ChoiceCriteria, b_full: int) -> ShownChoice:
+    """Choose factors and bounds for a screen; its metric is that of the pictures that the screen shows.
+
+    raises  ValueError as `choose`
+    """
+    cores = cores_needed(points, criteria.fps)
+    left = [point for point in points if criteria.cores is None or cores[point.scaling] <= criteria.cores]
+    curves = draw_curves(left, mean_score(criteria.metric, criteria.sign))
+    ladder = _below(curves, best_ladder(curves, criteria.tolerance, criteria.narrowest)[0], b_full)
+    kept = [point for point in left if point.scaling in ladder.scaling]
+    return ShownChoice(ladder.scaling, (0, *(round(bound) for bound in ladder.bounds)), _hull(kept, criteria))
+
+
 def _hull(points: Iterable[Point], criteria: ChoiceCriteria) -> tuple[tuple[float, float], ...]:
     """The best quality at each bitrate, as far as more of them gains."""
-    if criteria.metric not in WHOLE:
+    whole = WHOLE.get(criteria.metric.partition("@")[0])
+    if whole is None:
         return ()
     score, best = mean_score(criteria.metric), dict[float, float]()
     for point in (point for point in points if point.meets_target):
-        best[point.target_kbps] = max(best.get(point.target_kbps, 0.0), score(point) / WHOLE[criteria.metric])
+        best[point.target_kbps] = max(best.get(point.target_kbps, 0.0), score(point) / whole)
     return concave([(kbps, round(quality, 4)) for kbps, quality in best.items()])
 
 

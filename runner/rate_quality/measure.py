@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from fractions import Fraction
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -16,9 +18,10 @@ from runner.lanes import Lane, cut, fragment
 from runner.rate_quality import plans
 from runner.rate_quality.artefact import MARK, Measured, dumps, to_json, to_yaml
 from runner.rate_quality.cache import Cache, file_digest
-from runner.rate_quality.choice import ChoiceCriteria, choose, pooled
+from runner.rate_quality.choice import ChoiceCriteria, choose, choose_shown, pooled
 from runner.rate_quality.curves import Point, mean_score
 from runner.rate_quality.metrics import Metric, find_metric
+from runner.rate_quality.metrics.reduced import fits, name_at, reduced
 from runner.rate_quality.sequence import Footage, as_recorded, survey
 from runner.rate_quality.sequence import Sequence as Clip
 from runner.rate_quality.study import Study, check_size, stride
@@ -59,9 +62,19 @@ def measure(
     parallel = parallel_tasks(study.parallel)
     with open_executor(study.workers, study.scheduler, parallel) as executor:
         for model, members in models.items():
-            sweeps = [_sweep(setup, study, name, clips[name], metrics, cache, executor, parallel) for name in members]
-            measured = _measure(model, setup.vehicle, study, sweeps, metrics, progress)
+            screens = _screens(study, [setup.vehicle.cameras[name] for name in members], metrics[0])
+            every = (*metrics, *(reduced(metrics[0], factor) for factor in screens))
+            sweeps = [_sweep(setup, study, name, clips[name], every, cache, executor, parallel) for name in members]
+            measured = _measure(model, setup.vehicle, study, sweeps, metrics, screens, progress)
             yield _write(measured, output, sweeps)
+
+
+def _screens(study: Study, cameras: Sequence[Camera], deciding: Metric) -> tuple[Fraction, ...]:
+    """Factors of the image's size at which the deciding metric also scores what a screen shows."""
+    if deciding.every_frame or not deciding.higher_is_better:
+        return ()
+    sizes = [(camera.width, camera.height) for camera in cameras]
+    return tuple(each for each in study.screens if all(fits(size, each, deciding) for size in sizes))
 
 
 def _check_output(output: Path, models: Iterable[str], inputs: Iterable[Path]) -> None:
@@ -154,7 +167,13 @@ def _read_mask(path: Path, name: str, camera: Camera) -> Mask:
 
 
 def _measure(
-    name: str, vehicle: Vehicle, study: Study, sweeps: Sequence[Sweep], metrics: tuple[Metric, ...], progress: Progress
+    name: str,
+    vehicle: Vehicle,
+    study: Study,
+    sweeps: Sequence[Sweep],
+    metrics: tuple[Metric, ...],
+    screens: tuple[Fraction, ...],
+    progress: Progress,
 ) -> Measured:
     deciding = metrics[0]
     sign = 1 if deciding.higher_is_better else -1
@@ -168,8 +187,10 @@ def _measure(
         fps=sweeps[0].plan.camera.fps,
     )
     try:
-        points = _points(study, criteria, sweeps, lambda share: progress(name, share))
+        shown = {factor: replace(criteria, metric=name_at(deciding.name, factor)) for factor in screens}
+        points = _points(study, [criteria, *shown.values()], sweeps, lambda share: progress(name, share))
         choice = choose(points, criteria)
+        choice = replace(choice, shown={at: choose_shown(points, its, choice.b_full) for at, its in shown.items()})
     except ValueError as error:
         raise RunError(f"{name}: {error}") from None
     first = sweeps[0]
@@ -195,7 +216,7 @@ def _measure(
 
 
 def _points(
-    study: Study, criteria: ChoiceCriteria, sweeps: Sequence[Sweep], on_progress: Callable[[float], None]
+    study: Study, criteria: Sequence[ChoiceCriteria], sweeps: Sequence[Sweep], on_progress: Callable[[float], None]
 ) -> list[Point]:
     """Points of one model, round by round, until its plan requests no more."""
     groups: list[list[Point]] = [[] for _ in sweeps]
@@ -217,11 +238,12 @@ def _rising(on_progress: Callable[[float], None], begun: float, part: float) -> 
     return lambda share: on_progress(min(0.99, begun + part * share))
 
 
-def _next(study: Study, criteria: ChoiceCriteria, points: Sequence[Point]) -> list[Lane]:
+def _next(study: Study, criteria: Sequence[ChoiceCriteria], points: Sequence[Point]) -> list[Lane]:
     if study.plan == "full":
         return plans.full(study.scalings, study.rates, points)
-    score = mean_score(criteria.metric, criteria.sign)
-    return plans.adaptive(study.scalings, study.rates, points, score, criteria.tolerance, criteria.narrowest)
+    scores = [mean_score(each.metric, each.sign) for each in criteria]
+    every = (criteria[0].tolerance, criteria[0].narrowest)
+    return plans.adaptive(study.scalings, study.rates, points, scores, *every)
 
 
 def _notes(camera: Camera, clip: Clip) -> Iterator[str]:

@@ -26,22 +26,28 @@ def adaptive(
     scalings: Sequence[Fraction],
     rates: Sequence[int],
     points: Sequence[Point],
-    score: Score,
+    scores: Sequence[Score],
     tolerance: float,
     narrowest: float,
 ) -> list[Lane]:
     """A few bitrates for each factor, then both factors at each crossing until it stays where it was predicted.
 
-    rates      of the full plan, increasing; their ends are kept, and no more than a third of its encodings are made
-    score, tolerance, narrowest  as `curves.best_ladder` takes them
+    rates      of the full plan, increasing; their ends are kept, and no more than a third of its encodings are made,
+               and a sixth for each further score
+    scores     of the models that these encodings are for
+    tolerance, narrowest  as `curves.best_ladder` takes them
     """
     first = _missing([Lane(factor, kbps) for factor in scalings for kbps in spread(rates, FIRST_RATES)], points)
     if first or len(rates) <= FIRST_RATES:
         return first
-    curves = draw_curves(points, score)
-    ladder, _ = best_ladder(curves, tolerance, narrowest)
-    left = max(0, len(scalings) * len(rates) // SHARE - len(points))
-    return (_unknown(_crossings(ladder), points) or _unknown(_near_best(curves, ladder, tolerance), points))[:left]
+    most = len(scalings) * len(rates) * (1 + len(scores)) // (2 * SHARE)
+    left = max(0, min(most, len(scalings) * len(rates)) - len(points))
+    wanted: list[Lane] = []
+    for score in scores:
+        curves = draw_curves(points, score)
+        ladder, _ = best_ladder(curves, tolerance, narrowest)
+        wanted += _unknown(_crossings(ladder), points) or _unknown(_near_best(curves, ladder, tolerance), points)
+    return list(dict.fromkeys(wanted))[:left]
 
 
 def _crossings(ladder: Ladder) -> list[Lane]:

@@ -29,6 +29,7 @@ class Study:
     narrowest: float
     b_full_quality: float | None
     cpu_cores: float | None
+    screens: tuple[Fraction, ...]
     pool: Mapping[str, tuple[str, ...]]
     masks: Mapping[str, Path]
     vmaf_model: str
@@ -64,6 +65,7 @@ def read_study(data: Mapping[str, Any]) -> Study:
         narrowest=data["narrowest"],
         b_full_quality=data["b_full_quality"],
         cpu_cores=data["cpu_cores"],
+        screens=tuple(map(exact, data["screens"])),
         pool={name: tuple(members) for name, members in data["pool"].items()},
         masks={name: Path(path) for name, path in data["masks"].items()},
         vmaf_model=data["vmaf_model"],

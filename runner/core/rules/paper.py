@@ -99,7 +99,7 @@ def share_equally(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) 
 def scaling_from_rate_quality(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
     """Eq. (4): the factor whose bitrate range contains the allocation, converted to the full image.
 
-    No factor is larger than what screens show, if an earlier rule has given that.
+    If an earlier rule has given what the operator sees, the ranges are those of pictures of that size on the screen.
     """
     lasting = lasting_share(draft)
     factors, reasons = _scaled(vehicle, state.on, state.rois, draft.demand, draft.bitrate, lasting, draft.shown)
@@ -130,7 +130,10 @@ def _scaled(
         kbps, sized_for = whole(allocated), allocated if lasting is None else allocated * lasting
         of_full = scaling.as_full_image(sized_for, roi, full)
         # A camera that cannot be sent gets the smallest factor, however few its pixels.
-        factors[name], why = scaling.select_scaling(camera.rate_quality, of_full if kbps else allocation.ZERO)
+        model = camera.rate_quality
+        if name in shown:
+            model = model.at(shown[name].scale)[1]
+        factors[name], why = scaling.select_scaling(model, of_full if kbps else allocation.ZERO)
         as_full = ""
         if kbps and (lasting is not None or (roi is not full and roi != full)):
             as_full = f", as {whole(of_full)} for the full image" + (
@@ -139,7 +142,7 @@ def _scaled(
         reasons[name] = f"{kbps} of {short(demand[name])} kbit/s{as_full}, {AS_ENCODED if camera.graph.passes else why}"
         if name in shown and shown[name].largest < factors[name]:
             factors[name] = shown[name].largest
-            reasons[name] += f", the screen shows {plain(factors[name])}"
+            reasons[name] += f", the screen shows no more than {plain(factors[name])}"
     return factors, reasons
 
 

@@ -12,7 +12,7 @@ from runner.core import allocation
 from runner.core.decision import NOTHING, Draft, Shown
 from runner.core.events import Attention
 from runner.core.hull import Contender, best_shares
-from runner.core.model import SMALLEST_SIDE_PX, Camera, Kbps, Roi, Vehicle, least_float
+from runner.core.model import SMALLEST_SIDE_PX, Camera, Kbps, Roi, Vehicle, exact, least_float
 from runner.core.rules.paper import demands
 from runner.core.rules.registry import Last, Memory, Step, rule
 from runner.core.rules.safe import lowest_of_all_copies, share_above_floors, shared_above_floors
@@ -20,16 +20,17 @@ from runner.core.state import State
 from runner.core.view import Seen, enclosing
 
 STEP_PX = 16  # of the edges of regions, so that small changes of a view are none
-STEPS = 32  # of the factors that screens show
+STEPS = 32  # of the scale at which screens show an image
+OVERSAMPLED = 2  # px of a picture for each of the screen; with more, nothing more is seen
 SLOW_MPS = 1.0
 GLANCE = Fraction(1, 100)  # least weight of a camera, as a share of what all screens show
 
 
 class _Region(NamedTuple):
-    """A region and how large screens show it, and since when less of it is wanted; None: it is all wanted."""
+    """A region and how large screens show it, and since when less is wanted; None: it is all wanted."""
 
     roi: Roi
-    largest: Fraction
+    scale: Fraction
     wanted: tuple[Roi, Fraction] | None = None
     since: float = 0.0
 
@@ -72,7 +73,7 @@ def roi_from_view(
         wanted = (own, Fraction(1)) if seen is None else _wanted(camera, own, seen, margin)
         region = _followed(past.regions.get(name), wanted, own, state.t, least_float(narrow_s), may_narrow)
         area = own.pixels if seen is None else seen.screen_width * seen.screen_height
-        regions[name], given[name] = region, Shown(region.roi, region.largest, area)
+        regions[name], given[name] = region, Shown(region.roi, region.scale, _largest(camera, region.scale), area)
     shown = past.shown if given == past.shown else given  # the same object: later rules have nothing new to compute
     if shown is past.shown and regions == past.regions:
         return draft.replaced(shown=shown), memory
@@ -90,16 +91,20 @@ def _may_narrow(state: State) -> bool:
 
 
 def _wanted(camera: Camera, own: Roi, seen: Seen, margin: Fraction) -> tuple[Roi, Fraction]:
-    """Region and factor that a view needs, within the operator's own region."""
+    """Region that a view needs, within the operator's own, and the px of the screen for each of its own."""
     region = camera.kept_roi
     if not seen.is_empty:
         across, down = ceil(seen.width * margin), ceil(seen.height * margin)
         left, top = max(0, seen.x - across), max(0, seen.y - down)
         width, height = seen.x + seen.width + across - left, seen.y + seen.height + down - top
         region = enclosing(region, Roi(left, top, width, height))
-    scale = Fraction(ceil(seen.scale * STEPS), STEPS)
+    return _within(own, region), min(Fraction(1), Fraction(max(1, ceil(seen.scale * STEPS)), STEPS))
+
+
+def _largest(camera: Camera, scale: Fraction) -> Fraction:
+    """The factor above which no more is seen."""
     least = camera.rate_quality.scaling[0] if camera.least_scaling is None else camera.least_scaling
-    return _within(own, region), min(Fraction(1), max(least, scale))
+    return min(Fraction(1), max(least, OVERSAMPLED * scale))
 
 
 def _within(own: Roi, region: Roi) -> Roi:
@@ -120,15 +125,15 @@ def _side(begin: int, length: int, wanted: int, wide: int) -> tuple[int, int]:
 def _followed(
     past: _Region | None, wanted: tuple[Roi, Fraction], own: Roi, t: float, narrow_s: float, may_narrow: bool
 ) -> _Region:
-    roi, largest = wanted
+    roi, scale = wanted
     if past is None or not _contains(own, past.roi):
-        return _Region(roi, largest)
-    needed = _Region(roi if past.roi == roi else enclosing(past.roi, roi), max(past.largest, largest))
-    if (needed.roi, needed.largest) == wanted:
+        return _Region(roi, scale)
+    needed = _Region(roi if past.roi == roi else enclosing(past.roi, roi), max(past.scale, scale))
+    if (needed.roi, needed.scale) == wanted:
         return needed
     if past.wanted != wanted or not may_narrow:
         return needed._replace(wanted=wanted, since=t)
-    return _Region(roi, largest) if t - past.since >= narrow_s else needed._replace(wanted=wanted, since=past.since)
+    return _Region(roi, scale) if t - past.since >= narrow_s else needed._replace(wanted=wanted, since=past.since)
 
 
 def _contains(outer: Roi, inner: Roi) -> bool:
@@ -158,7 +163,8 @@ def share_by_quality(
     draft: Draft,
     memory: Memory,
     *,
-    worst: Fraction = Fraction(1, 5),
+    kept: Fraction = Fraction(1),
+    worst: Fraction = Fraction(0),
     least_kbps: Kbps = Fraction(30),
     detail: Fraction = Fraction(3, 2),
 ) -> Step:
@@ -167,16 +173,18 @@ def share_by_quality(
     Weights are the px of the screens times the operator's weight. Floors come first, and cameras with `shed` are given
     up as by `share_above_floors`. Without `rate_quality.quality` of every camera, Eq. (2) shares.
 
+    kept        share of what Eq. (2) would give, of the part of the image that is sent, that each camera gets at least;
+                with 1 no camera looks worse than by the paper's rules
     worst       share of the worst camera in what is maximised
     least_kbps  that a camera gets first that has no floor
-    detail      a picture that screens show at the factor s needs the bits of the full one times s to this power
+    detail      between measured scales: the bits that a picture needs grow with its scale to this power
     Memory: the cameras given up.
     """
     lacking = [name for name, own in draft.demand.items() if own and vehicle.cameras[name].rate_quality.quality is None]
     if lacking:
         draft = draft.noted(f"{', '.join(lacking)} without measured quality: shared by demand")
         return share_above_floors(vehicle, state, draft, memory)
-    how = _How(float(worst), float(least_kbps), float(detail))
+    how = _How(float(kept), float(worst), float(least_kbps), float(detail))
     floors, slopes = lowest_of_all_copies(vehicle, state), list[float]()
 
     def share(wanted: Mapping[str, Kbps], total: Kbps) -> Mapping[str, Kbps]:
@@ -193,6 +201,7 @@ def share_by_quality(
 class _How(NamedTuple):
     """The parameters of `share_by_quality`."""
 
+    kept: float
     worst: float
     least_kbps: float
     detail: float
@@ -212,17 +221,20 @@ def _best(
     """kbit/s by camera, of all copies, in tenths; and the gain of quality for another kbit/s."""
     names = [name for name, own in wanted.items() if own]
     glance = GLANCE * sum((shown[name].area for name in names), 1)
+    hard = {name: floors.get(name) or exact(how.least_kbps) * copies.get(name, 1) for name in names}
+    full = {name: vehicle.cameras[name].rate_quality.b_full * copies.get(name, 1) for name in names}
+    equal = allocation.allocate_above_floors(full, total, weights, hard)
     contenders: dict[str, Contender] = {}
     for name in names:
-        camera, own = vehicle.cameras[name], shown[name]
-        curve = camera.rate_quality.quality
-        assert curve
-        times = copies.get(name, 1)
-        stretch = own.roi.pixels / camera.full_roi.pixels * float(own.largest) ** how.detail * times
+        camera, own, times = vehicle.cameras[name], shown[name], copies.get(name, 1)
+        part = own.roi.pixels / camera.full_roi.pixels
+        measured, model = camera.rate_quality.at(own.scale)
+        assert model.quality
+        curve = model.quality.stretched(part * float(own.scale / measured) ** how.detail * times)
         weight = float(weights[name] * max(glance, Fraction(own.area)))
-        floor = float(floors.get(name, 0)) or how.least_kbps * times
-        most = float(wanted[name]) if weight else floor
-        contenders[name] = Contender(curve.stretched(stretch), weight, floor, most)
+        floor = max(float(hard[name]), how.kept * part * float(equal[name]))
+        most = max(floor, float(wanted[name])) if weight else floor
+        contenders[name] = Contender(curve, weight, floor, most)
     shares, slope = best_shares(list(contenders.values()), float(total), how.worst)
     given = {name: Fraction(int(10 * kbps), 10) for name, kbps in zip(contenders, shares, strict=True)}
     weight = sum(one.weight for one in contenders.values())
