@@ -1,7 +1,10 @@
 """What a driver sees for the same bits: rules that know the screen, and others.
 
   tod-runner model vehicle=tum_q7 source=synthetic fps_max=20 output=MODELS
-  python bench/seen.py MODELS OUT [--totals 1000 2000 3000 5000 8000] [--layouts drive half configure] [--seconds 8]
+  python bench/seen.py MODELS OUT [--totals 1000 2000 3000 5000 8000] [--layouts drive half configure]
+
+Columns: total, MSSIM mean, of the worst and of the front camera; kbit/s sent; bits for the mean that the paper's rules
+reach with that total, as a share of theirs; and by how much a camera looks worse than by them at most.
 
 The rules decide once for each total, layout and policy. Each camera's clip is then encoded with that region, size and
 bitrate by the live graph's own encoder, decoded, and drawn at the size that it has on the screen. Its score is that of
@@ -21,6 +24,7 @@ from dataclasses import astuple
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import yaml
 from helpers import Drive, setup
 
@@ -29,31 +33,38 @@ from runner.core.model import Camera, Roi
 from runner.core.view import Seen
 from runner.graph import compile_graph
 from runner.lanes import Lane, compile_lanes
+from runner.settings import Setup
 from runner.system.files import write_whole
 
 STRIDE = 8  # one frame in so many is scored
-MODEL = ("scaling", "b_min_kbps", "b_full_kbps", "quality")
 
 
 class Policy(NamedTuple):
-    """Overrides, and whether the cameras' own models are used."""
+    """Overrides of the rules and of the graph, and what of the cameras' own models is used; None: Table I."""
 
     words: tuple[str, ...]
-    own: bool = True
+    graph: tuple[str, ...] = ()
+    own: tuple[str, ...] | None = ("scaling", "b_min_kbps", "b_full_kbps", "quality", "shown")
 
 
+TABLE = ("scaling", "b_min_kbps", "b_full_kbps")
+REFERENCE = "paper, own models"
+SEEN = ("modes=seen",)
+ENCODER = ("graph.effort=exact", "graph.key_interval_s=6")
+SIDES = {"front_left": 1040, "front_center": 1040, "front_right": 1040, "rear_center": 1200}
+WHOLE = tuple(f"cameras.{name}.always={{x: 0, y: 0, width: 1920, height: {height}}}" for name, height in SIDES.items())
 POLICIES = {
-    "equal": Policy(("modes=equal",)),
-    "paper, Table I": Policy(("modes=paper",), own=False),
-    "paper, own models": Policy(("modes=paper",)),
-    "seen": Policy(("modes=seen",)),
+    "equal parts": Policy(("modes=equal",), own=TABLE),
+    "paper, Table I": Policy(("modes=paper",), own=None),
+    REFERENCE: Policy(("modes=paper",), own=TABLE),
+    "seen": Policy(SEEN, ENCODER),
+    "seen, whole images": Policy((*SEEN, *WHOLE), ENCODER),
+    "seen, ranges of full images": Policy(SEEN, ENCODER, own=(*TABLE, "quality")),
+    "seen, shared by demand": Policy(SEEN, ENCODER, own=TABLE),
+    "seen, refresh every 1.5 s": Policy(SEEN, ENCODER[:1]),
+    "seen, paper's encoder": Policy(SEEN),
 }
-WITHOUT = {  # levers of `seen`, each switched off
-    "regions": lambda camera: (
-        f"cameras.{camera.name}.always={{x: 0, y: 0, width: {camera.width}, height: {camera.height}}}"
-    ),
-    "sizes": lambda camera: f"cameras.{camera.name}.least_scaling=1",
-}
+DRAWN = ("paper, Table I", REFERENCE, "seen, paper's encoder", "seen")
 
 
 class Tile(NamedTuple):
@@ -103,38 +114,43 @@ def main() -> None:
     parser.add_argument("--totals", type=int, nargs="+", default=[1000, 2000, 3000, 5000, 8000])
     parser.add_argument("--layouts", nargs="+", choices=LAYOUTS, default=list(LAYOUTS))
     parser.add_argument("--policies", nargs="+", choices=POLICIES, default=list(POLICIES))
-    parser.add_argument("--seconds", type=float, default=8)
     parser.add_argument("--fps", type=int, default=20)
     parser.add_argument("--set", nargs="*", default=[], help="further overrides of the policies that know the screen")
     parser.add_argument("--each", action="store_true", help="a line for each camera, too")
     options = parser.parse_args()
     options.output.mkdir(parents=True, exist_ok=True)
     words = ["vehicle=tum_q7", "source=synthetic", f"fps_max={options.fps}"]
+    options.policies = list(dict.fromkeys((REFERENCE, *options.policies)))
     decided = {
         (policy, layout, total): decisions(words, policy, layout, total, options)
         for policy in options.policies
         for layout in options.layouts
         for total in options.totals
     }
-    scores = Scores(options.output / "scores.json", words, options.seconds)
+    scores = Scores(options.output / "scores.json", words)
     scores.add(decided)
-    for line in table(decided, scores, options):
+    found = {key: on_the_screen(*key[:2], settings, scores) for key, settings in decided.items()}
+    for line in table(found, decided, options):
         print(line)
+    draw(found, options, options.output / "seen.png")
 
 
-def own_models(directory: Path) -> list[str]:
-    """Overrides with the models that `tod-runner model` has written."""
-    return [
-        f"cameras.{path.stem}.rate_quality={json.dumps({k: v for k, v in own.items() if k in MODEL})}".replace('"', "")
-        for path in sorted(directory.glob("*.yaml"))
-        if (own := yaml.safe_load(path.read_text())["rate_quality"])
-    ]
+def own_models(models: Path, output: Path, keys: Sequence[str]) -> list[str]:
+    """Overrides with parts of the models that `tod-runner model` has written."""
+    conf, names = output / "own" / "-".join(keys), []
+    (conf / "cameras").mkdir(parents=True, exist_ok=True)
+    for path in models.glob("*.yaml"):
+        kind = yaml.safe_load(path.read_text())
+        kind["rate_quality"] = {key: value for key, value in kind["rate_quality"].items() if key in keys}
+        (conf / "cameras" / path.name).write_text(yaml.safe_dump(kind))
+        names.append(path.stem)
+    return [f"conf={conf}", *(f"cameras@cameras.{name}={name}" for name in names)]
 
 
 def decisions(words: Sequence[str], policy: str, layout: str, total: int, options: Any) -> Mapping[str, Setting]:
     """How each camera is sent, with the view of a layout."""
     own = POLICIES[policy]
-    models = own_models(options.models) if own.own else []
+    models = own_models(options.models, options.output, own.own) if own.own else []
     more = options.set if policy.startswith("seen") else []
     drive = Drive(*words, *own.words, *models, "mode=collective", *more)
     drive.accept("total_set", kbps=total)
@@ -152,6 +168,7 @@ def seen_json(seen: Seen) -> dict[str, int]:
 class Encoding(NamedTuple):
     """What is encoded, and as part of which view it is scored."""
 
+    graph: tuple[str, ...]
     camera: str
     roi: Roi
     lane: Lane
@@ -160,7 +177,7 @@ class Encoding(NamedTuple):
     @property
     def key(self) -> str:
         return json.dumps(
-            [self.camera, *astuple(self.roi), str(self.lane.scaling), self.lane.kbps, *astuple(self.seen)]
+            [*self.graph, self.camera, *astuple(self.roi), str(self.lane.scaling), self.lane.kbps, *astuple(self.seen)]
         )
 
 
@@ -170,43 +187,45 @@ Decided = Mapping[tuple[str, str, int], Mapping[str, Setting]]
 class Scores:
     """MSSIM on the screen and kbit/s of encodings, kept in a file."""
 
-    def __init__(self, path: Path, words: Sequence[str], seconds: float) -> None:
-        self._path, self._seconds, self._setup = path, seconds, setup(*words)
+    def __init__(self, path: Path, words: Sequence[str]) -> None:
+        self._path = path
+        self._setups = {graph: setup(*words, *graph) for graph in {policy.graph for policy in POLICIES.values()}}
         self._known: dict[str, tuple[float, float]] = json.loads(path.read_text()) if path.exists() else {}
 
-    def of(self, camera: str, setting: Setting, seen: Seen) -> tuple[float, float]:
+    def of(self, graph: tuple[str, ...], camera: str, setting: Setting, seen: Seen) -> tuple[float, float]:
         """MSSIM, and kbit/s; nothing is seen of a camera that is not sent."""
-        return self._known[encoding(camera, setting, seen).key] if setting.sending else (0.0, 0.0)
+        return self._known[encoding(graph, camera, setting, seen).key] if setting.sending else (0.0, 0.0)
 
     def views(self, layout: str) -> Mapping[str, Seen]:
         """By camera, what a layout shows."""
-        return {name: tile.seen(self._setup.vehicle.cameras[name]) for name, tile in LAYOUTS[layout].items()}
+        return {name: tile.seen(self._setups[()].vehicle.cameras[name]) for name, tile in LAYOUTS[layout].items()}
 
     def add(self, decided: Decided) -> None:
         """Encode and score what is not known yet."""
-        wanted: dict[tuple[str, Roi], dict[str, Encoding]] = {}
-        for (_, layout, _), settings in decided.items():
+        wanted: dict[tuple[tuple[str, ...], str, Roi], dict[str, Encoding]] = {}
+        for (policy, layout, _), settings in decided.items():
             for name, setting in settings.items():
                 if setting.sending:
-                    each = encoding(name, setting, self.views(layout)[name])
+                    each = encoding(POLICIES[policy].graph, name, setting, self.views(layout)[name])
                     if each.key not in self._known:
-                        wanted.setdefault((name, each.roi), {})[each.key] = each
-        for number, ((name, roi), encodings) in enumerate(wanted.items(), 1):
+                        wanted.setdefault(each[:3], {})[each.key] = each
+        for number, ((graph, name, roi), encodings) in enumerate(wanted.items(), 1):
             print(f"{number} of {len(wanted)}: {name}, {roi.width}x{roi.height}, {len(encodings)}", file=sys.stderr)
-            self._known |= self._measure(name, roi, list(encodings.values()))
+            self._known |= self._measure(self._setups[graph], name, roi, list(encodings.values()))
             write_whole(self._path, json.dumps(self._known).encode())
 
-    def _measure(self, name: str, roi: Roi, encodings: Sequence[Encoding]) -> dict[str, tuple[float, float]]:
+    def _measure(
+        self, setup: Setup, name: str, roi: Roi, encodings: Sequence[Encoding]
+    ) -> dict[str, tuple[float, float]]:
         from runner.apply import run_lanes
         from runner.rate_quality.metrics import find_metric
         from runner.rate_quality.screen import on_screen
         from runner.rate_quality.sequence import decoding
 
-        setup, metric = self._setup, find_metric("mssim")
+        metric = find_metric("mssim")
         camera = setup.vehicle.cameras[name]
         plan, lanes = compile_graph(camera, setup.media), list(dict.fromkeys(each.lane for each in encodings))
-        end = f"identity eos-after={round(self._seconds * float(camera.fps)) + 1}"
-        decode = f"{decoding(self._clip(name), camera.fps)} ! {end}"
+        decode = decoding(self._clip(setup, name), camera.fps)
         references: dict[int, Any] = {}
         meters = {
             each.key: metric.meter((each.seen.screen_width, each.seen.screen_height), camera.fps, STRIDE, None)
@@ -231,18 +250,18 @@ class Scores:
         means = {each.key: list(meters[each.key].close().values()) for each in encodings}
         return {each.key: (sum(of := means[each.key]) / len(of), kbps[each.lane]) for each in encodings}
 
-    def _clip(self, name: str) -> Path:
+    def _clip(self, setup: Setup, name: str) -> Path:
         from runner.plans import compile_plans, render_missing
 
-        only = self._setup.with_cameras({name: self._setup.vehicle.cameras[name]})
+        only = setup.with_cameras({name: setup.vehicle.cameras[name]})
         render_missing(only.vehicle, lambda what, share: None)
         (plan,) = compile_plans(only)
         return Path(next(str(each.properties["location"]) for each in plan.source if "location" in each.properties))
 
 
-def encoding(camera: str, setting: Setting, seen: Seen) -> Encoding:
+def encoding(graph: tuple[str, ...], camera: str, setting: Setting, seen: Seen) -> Encoding:
     assert setting.scaling is not None
-    return Encoding(camera, setting.roi, Lane(setting.scaling, setting.kbps), seen)
+    return Encoding(graph, camera, setting.roi, Lane(setting.scaling, setting.kbps), seen)
 
 
 class OnScreen(NamedTuple):
@@ -261,26 +280,65 @@ class OnScreen(NamedTuple):
         return self.cameras["front_center"]
 
 
-def on_the_screen(layout: str, settings: Mapping[str, Setting], scores: Scores) -> OnScreen:
-    found = {name: scores.of(name, settings[name], seen) for name, seen in scores.views(layout).items()}
+def on_the_screen(policy: str, layout: str, settings: Mapping[str, Setting], scores: Scores) -> OnScreen:
+    graph = POLICIES[policy].graph
+    found = {name: scores.of(graph, name, settings[name], seen) for name, seen in scores.views(layout).items()}
     areas = {name: seen.screen_width * seen.screen_height for name, seen in scores.views(layout).items()}
     mean = sum(areas[name] * quality for name, (quality, _) in found.items()) / sum(areas.values())
     return OnScreen(mean, {name: quality for name, (quality, _) in found.items()}, sum(k for _, k in found.values()))
 
 
-def table(decided: Decided, scores: Scores, options: Any) -> Iterable[str]:
+Found = Mapping[tuple[str, str, int], OnScreen]
+
+
+def table(found: Found, decided: Decided, options: Any) -> Iterable[str]:
     for layout in options.layouts:
-        yield f"{layout:20} {'kbit/s':>7} {'mean':>6} {'worst':>6} {'front':>6} {'sent':>7}"
+        heads = ("kbit/s", "mean", "worst", "front", "sent", "bits", "lost")
+        yield " ".join((f"{layout:28}", *(f"{head:>7}" for head in heads)))
         for policy in options.policies:
             for total in options.totals:
-                settings = decided[policy, layout, total]
-                found = on_the_screen(layout, settings, scores)
-                yield f"{policy:20} {total:7} {found.mean:6.4f} {found.worst:6.4f} {found.front:6.4f} {found.kbps:7.0f}"
+                own, paper = found[policy, layout, total], found[REFERENCE, layout, total]
+                lost = max(paper.cameras[name] - quality for name, quality in own.cameras.items())
+                bits = bits_for_equal(found, policy, layout, total, options.totals)
+                figures = (f"{one:7.4f}" for one in (own.mean, own.worst, own.front))
+                yield " ".join((f"{policy:28} {total:7}", *figures, f"{own.kbps:7.0f} {bits:7.2f} {max(0, lost):7.4f}"))
                 if options.each:
-                    for name, quality in found.cameras.items():
-                        own = settings[name]
-                        sent = f"{own.width}x{own.height} of {own.roi.width}x{own.roi.height}"
-                        yield f"    {name:16} {own.kbps:7} {quality:6.4f} {sent}"
+                    yield from each_camera(own, decided[policy, layout, total])
+
+
+def each_camera(found: OnScreen, settings: Mapping[str, Setting]) -> Iterable[str]:
+    for name, quality in found.cameras.items():
+        own = settings[name]
+        yield f"    {name:24} {own.kbps:7} {quality:7.4f} {own.width}x{own.height} of {own.roi.width}x{own.roi.height}"
+
+
+def bits_for_equal(found: Found, policy: str, layout: str, total: int, totals: Sequence[int]) -> float:
+    """Bits that the policy needs for the mean that the paper's rules reach with this total, as a share of their bits.
+
+    Between totals, quality is interpolated over log bitrate; NaN: no total of the policy reaches as much, or as little.
+    """
+    paper, own = found[REFERENCE, layout, total], [found[policy, layout, each] for each in totals]
+    quality, bits = [each.mean for each in own], np.log([each.kbps for each in own])
+    return float(np.exp(np.interp(paper.mean, quality, bits, left=np.nan, right=np.nan)) / paper.kbps)
+
+
+def draw(found: Found, options: Any, path: Path) -> None:
+    """Quality on the screen over bits, a panel for each layout."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(4.2 * len(options.layouts), 4), layout="constrained")
+    every = np.atleast_1d(figure.subplots(1, len(options.layouts), sharey=True))
+    for axes, layout in zip(every, options.layouts, strict=True):
+        for policy in (policy for policy in options.policies if policy in DRAWN):
+            own = [found[policy, layout, total] for total in options.totals]
+            axes.plot([one.kbps / 1000 for one in own], [one.mean for one in own], ".-", label=policy)
+        axes.set(title=f"layout: {layout}", xlabel="sent, Mbit/s", xscale="log")
+        axes.set_xticks(ticks := [1, 2, 3, 5, 8], [str(tick) for tick in ticks])
+        axes.minorticks_off()
+        axes.grid(alpha=0.3)
+    every[0].set_ylabel("MSSIM on the screen, mean by px")
+    every[-1].legend(fontsize=9, loc="lower right")
+    figure.savefig(path, dpi=110)
 
 
 if __name__ == "__main__":

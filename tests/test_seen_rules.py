@@ -160,3 +160,22 @@ def test_floors_and_weights_hold(drive):
 def test_mistakes_in_the_configuration_are_named(change, problem):
     with pytest.raises(Exception, match=problem):
         Drive(*SEEN, *MEASURED, change)
+
+
+def bits(drive, t, kbps):
+    drive.accept("total_set", t=t, kbps=kbps)
+    return drive["front"].scaling
+
+
+def test_a_factor_stays_near_the_bounds_of_its_range_and_rises_after_a_while():
+    drive = Drive(*SEEN, *MEASURED)
+    assert bits(drive, 0, 3000) == 1  # 1000 kbit/s each: from 900 on
+    assert bits(drive, 1, 2000) == 1, "667 are within 40 % of the bound"
+    assert bits(drive, 2, 1500) == Fraction(1, 2)
+    assert bits(drive, 3, 3000) == Fraction(1, 2), "1000 are within 40 %, too"
+    assert bits(drive, 10, 6000) == Fraction(1, 2)
+    assert "kept at 0.5" in drive["front"].reason
+    drive.accept("clock_advanced", t=24.9)
+    assert drive["front"].scaling == Fraction(1, 2)
+    drive.accept("clock_advanced", t=25)
+    assert drive["front"].scaling == 1

@@ -23,6 +23,7 @@ STEP_PX = 16  # of the edges of regions, so that small changes of a view are non
 STEPS = 32  # of the scale at which screens show an image
 OVERSAMPLED = 2  # px of a picture for each of the screen; with more, nothing more is seen
 SLOW_MPS = 1.0
+DENSER = 0.75  # of a part of an image: what a camera is aimed at needs more than its share of the bits
 GLANCE = Fraction(1, 100)  # least weight of a camera, as a share of what all screens show
 
 
@@ -227,7 +228,7 @@ def _best(
     contenders: dict[str, Contender] = {}
     for name in names:
         camera, own, times = vehicle.cameras[name], shown[name], copies.get(name, 1)
-        part = own.roi.pixels / camera.full_roi.pixels
+        part = (own.roi.pixels / camera.full_roi.pixels) ** DENSER
         measured, model = camera.rate_quality.at(own.scale)
         assert model.quality
         curve = model.quality.stretched(part * float(own.scale / measured) ** how.detail * times)
