@@ -65,7 +65,7 @@ def read_study(data: Mapping[str, Any]) -> Study:
         narrowest=data["narrowest"],
         b_full_quality=data["b_full_quality"],
         cpu_cores=data["cpu_cores"],
-        screens=tuple(map(exact, data["screens"])),
+        screens=tuple(map(exact, data.get("screens", ()))),  # missing in older logs
         pool={name: tuple(members) for name, members in data["pool"].items()},
         masks={name: Path(path) for name, path in data["masks"].items()},
         vmaf_model=data["vmaf_model"],
