@@ -48,6 +48,7 @@ from runner.gst.watched import WatchedSource
 from runner.records.reception import Arrivals, SentFrame, UplinkReceived, UplinkSent
 from runner.records.vehicle import NOTHING_ENCODED, CameraReading, SenderStages, SoundReading
 from runner.settings import Media, Uplink
+from runner.system.camera_control import CameraControls
 
 if TYPE_CHECKING:
     from runner.gst.clip_writer import write_clip
@@ -154,6 +155,8 @@ class VehicleSide:
         self._left_out: dict[str, set[str]] = {plan.camera.name: set() for plan in plans}  # decoders
         self._wanted: dict[str, dict[str, KnobValue]] = {plan.camera.name: {} for plan in plans}
         self.on_turned: Callable[[], None] = lambda: None
+        commands = {plan.camera.name: plan.command for plan in plans if plan.command}
+        self._controls = CameraControls(commands, self._on_knobs_turned, on_report)
         self._glib = GlibThread()
         self._server: CameraServer | None = None
         streams = (*plans, *((sound,) if sound else ()))
@@ -185,6 +188,7 @@ class VehicleSide:
         changed: dict[str, dict[str, KnobValue]] = {}
         for command in commands:
             changed.setdefault(command.camera, {})[command.knob] = command.value
+        self._controls.turn(changed)
         for name, values in changed.items():
             if isinstance(uplinks := values.pop("uplinks", None), tuple):
                 self.carry({name: [str(each) for each in uplinks]})
@@ -265,6 +269,7 @@ class VehicleSide:
 
     def stop(self) -> None:
         self._lost.stop()
+        self._controls.stop()
 
         def stop() -> None:
             GLib.source_remove(self._looking)
@@ -281,7 +286,7 @@ class VehicleSide:
             return CameraReading(fault=refusal, lost=lost, copies=copies, refused=refused)
         fault, untimed, slow_fps = pipeline.source_fault or refusal, pipeline.untimed, pipeline.slow_fps
         rest = fault, lost, untimed, slow_fps, copies, refused
-        return CameraReading(dict(pipeline.knobs.applied), pipeline.counters(), *rest)
+        return CameraReading(self._controls.applied(name, dict(pipeline.knobs.applied)), pipeline.counters(), *rest)
 
     def _on_found(self, name: str) -> None:
         """From the thread that tries again. A viewer makes the server open its camera."""

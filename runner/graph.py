@@ -11,14 +11,13 @@ from fractions import Fraction
 from functools import lru_cache
 
 from runner.core.commands import KnobValue
+from runner.core.graph_settings import GraphSettings, KnobCommand
 from runner.core.model import (
     PLACEHOLDER,
     BagTopic,
     Camera,
-    Capture,
     Element,
     Graph,
-    GraphSettings,
     ModelError,
     Roi,
     Source,
@@ -31,8 +30,6 @@ _PLAIN_VALUE = re.compile(r"[\w./:,+=@%-]+")
 # Without colorimetry, decoders derive it from the picture size: colours would change when a picture is scaled.
 COLORIMETRY = "colorimetry=bt709"
 _PICTURE = f"pixel-aspect-ratio=1/1,{COLORIMETRY}"
-# Caps of encoded formats that a camera delivers; raw formats are named directly.
-_ENCODED = {"mjpeg": "image/jpeg", "h264": "video/x-h264", "h265": "video/x-h265"}
 SRT_MOST_BYTES = 1316  # of a packet; srtsink cuts longer ones unless its URI states a `payloadsize`
 # Encoders whose rate control goes by the frame rate of their caps, not by the time between pictures: see `assignments`.
 _COUNT_FRAMES = ("x264enc", "x265enc")
@@ -87,6 +84,7 @@ class Plan:
     operator   elements of the operator's side
     wire_*     what `print` adds in place of RTSP server and client
     recorder   elements that follow the source when it is recorded, without the file; empty if it is not
+    command    sets the bitrate in the camera, with {kbps} and {bps} in its words; None: none does
     bag        pictures that are pushed into the first element of the source; None: none
     needs      by element that only the vehicle may have, the package that provides it
     video      whether each side also writes what it sends or receives into a file
@@ -102,6 +100,7 @@ class Plan:
     wire_vehicle: tuple[Element, ...]
     wire_operator: tuple[Element, ...]
     recorder: tuple[Element, ...] = ()
+    command: KnobCommand | None = None
     bag: BagTopic | None = None
     needs: Mapping[str, str] = field(default_factory=dict)
     video: bool = False
@@ -214,6 +213,8 @@ def compile_graph(
     if passes and passes not in source.encoded:
         raise ModelError("graph.passes", passes, "needs a source with `encoded` pictures of this format, such as rtsp")
     elements, key = (source.encoded[passes], f"encoded.{passes}") if passes else (source.elements, "elements")
+    if passes:
+        _check_source_knobs(camera, elements)
     frames = stand_in if unrendered else fill(elements, f"source.{key}")
     stands_in = bool(stand_in) and clip is None
     return Plan(
@@ -227,6 +228,7 @@ def compile_graph(
         wire_vehicle=fill(graph.wire_vehicle, "graph.wire.vehicle"),
         wire_operator=fill(graph.wire_operator, "graph.wire.operator"),
         recorder=fill(recorder, "recording.elements"),
+        command=graph.command and _filled_command(graph.command, values),
         bag=bag_topic(camera),
         needs={**source.needs, **graph.needs, **(recording.needs if recording else {})},
     )
@@ -333,7 +335,12 @@ def _quantities(camera: Camera, value: KnobValue, pace: float = 1.0) -> dict[str
     if isinstance(value, int):
         bps = round(1000 * value * pace)
         of_frames = _per_frame_rate(camera.graph.settings, camera.fps)
-        return {"kbps": max(1, round(bps / 1000)), "bps": bps, **of_frames, **_buffer(of_frames, value)}
+        rate: dict[str, Value] = {
+            "kbps": max(1, round(bps / 1000)),
+            "bps": bps,
+            "controls": camera.capture.controls_text,
+        }
+        return {**rate, **of_frames, **_buffer(of_frames, value)}
     if isinstance(value, Roi):
         # The crop element sees the native picture; an ROI is relative to the full image inside it.
         native_width, native_height = camera.source_size
@@ -387,6 +394,26 @@ def check_free(where: str, elements: Iterable[Element], taken: Mapping[str, str]
         known[name] = key
 
 
+def _check_source_knobs(camera: Camera, elements: tuple[Element, ...]) -> None:
+    """Knobs of a graph that passes pictures on may turn elements of the source, where these stay."""
+    names = [element.name for element in camera.graph.vehicle]
+    for index, target in enumerate(camera.graph.knobs["bitrate"]):
+        known = [*names, *(element.name for element in elements)]
+        where = f"graph.knobs.bitrate[{index}].element"
+        if target.element not in known:
+            raise ModelError(where, repr(target.element), f"no such element{suggest(target.element, known)}")
+        if target.element not in names and camera.source.frozen_s is not None:
+            rule = "is of a source that is replaced when it freezes: it must be monitored by nobody (null)"
+            raise ModelError("source.frozen_s", camera.source.frozen_s, rule, where)
+
+
+def _filled_command(command: KnobCommand, values: Mapping[str, Value | None]) -> KnobCommand:
+    kept = {**values, **{name: f"{{{name}}}" for name in ("kbps", "bps")}}
+    words = enumerate(command.words)
+    filled = (str(_fill_value(word, kept, f"graph.knobs.bitrate[0].command[{at}]")) for at, word in words)
+    return replace(command, words=tuple(filled))
+
+
 def _check_packets(graph: Graph) -> None:
     size = graph.settings.mtu_bytes
     uris = {n: str(e.properties.get("uri")) for n, e in enumerate(graph.vehicle) if e.factory == "srtsink"}
@@ -411,8 +438,8 @@ def _values(camera: Camera, media: Media, index: int, clip: str | None) -> dict[
         "height": height,
         "framerate": rate,
         "raw_caps": f"video/x-raw,format=I420,width={width},height={height},framerate={rate},{_PICTURE}",
-        "capture_caps": _capture_caps(camera.capture),
-        "controls": _controls(camera.capture),
+        "capture_caps": camera.capture.caps,
+        "controls": camera.capture.controls_text if camera.capture.controls else None,
         "host": media.host,
         "url": rtsp_url(media, camera.name, feedback=bool(settings.retransmission_ms)),
         "port": port,
@@ -421,24 +448,6 @@ def _values(camera: Camera, media: Media, index: int, clip: str | None) -> dict[
         **_per_frame_rate(settings, camera.fps),
     }
     return values if clip is None else values | {"clip": clip}
-
-
-def _capture_caps(capture: Capture) -> str | None:
-    """Caps requested from a V4L2 camera; None: any."""
-    if capture.format is None:
-        return None
-    caps = [_ENCODED.get(capture.format, "video/x-raw")]
-    caps += [f"format={capture.format}"] if capture.format not in (*_ENCODED, "raw") else []
-    caps += [f"width={capture.width}"] if capture.width else []
-    caps += [f"height={capture.height}"] if capture.height else []
-    caps += [f"framerate={capture.fps.numerator}/{capture.fps.denominator}"] if capture.fps else []
-    return ",".join(caps)
-
-
-def _controls(capture: Capture) -> str | None:
-    """V4L2 controls as the serialized structure that v4l2src takes."""
-    given = [f"{name}={value}" for name, value in capture.controls.items()]
-    return ",".join(["controls", *given]) if given else None
 
 
 def filled(element: Element, values: Mapping[str, Value | None], where: str) -> Element:

@@ -6,7 +6,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from runner.core.budget import SOUND
-from runner.core.model import Element, GraphSettings, Kbps, ModelError, Value
+from runner.core.graph_settings import GraphSettings
+from runner.core.model import Element, Kbps, ModelError, Value
 from runner.graph import check_free, filled, launch, names_of, rtsp_url, shell
 from runner.settings import Endpoint, Media, Sound
 

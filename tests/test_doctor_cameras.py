@@ -16,7 +16,7 @@ import yaml
 from helpers import Command
 from test_v4l2 import METADATA, NULL, Kernel
 
-from runner.core.model import Capture
+from runner.core.capture import Capture
 from runner.ros.topics import Topic, picture_topics
 from runner.settings import RosSettings
 from runner.system import v4l2

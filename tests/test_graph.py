@@ -11,7 +11,8 @@ import pytest
 from helpers import CONF, setup, source_for, vehicle
 
 from runner.core.commands import KnobValue
-from runner.core.model import Camera, Element, Graph, GraphSettings, KnobTarget, ModelError, Roi, Source
+from runner.core.graph_settings import GraphSettings, KnobTarget
+from runner.core.model import Camera, Element, Graph, ModelError, Roi, Source
 from runner.graph import Plan, assignments, compile_graph, launch, rtsp_url, shell, text
 from runner.settings import Media
 

@@ -169,10 +169,11 @@ def bits(drive, t, kbps):
 
 def test_a_factor_stays_near_the_bounds_of_its_range_and_rises_after_a_while():
     drive = Drive(*SEEN, *MEASURED)
-    assert bits(drive, 0, 3000) == 1  # 1000 kbit/s each: from 900 on
-    assert bits(drive, 1, 2000) == 1, "667 are within 40 % of the bound"
-    assert bits(drive, 2, 1500) == Fraction(1, 2)
-    assert bits(drive, 3, 3000) == Fraction(1, 2), "1000 are within 40 %, too"
+    assert bits(drive, 0, 3000) == 1
+    assert drive["front"].kbps == 1500, "half of it; from 900 on"
+    assert bits(drive, 1, 1400) == 1, "700 are within 40 % of the bound"
+    assert bits(drive, 2, 1200) == Fraction(1, 2)
+    assert bits(drive, 3, 2000) == Fraction(1, 2), "1000 are within 40 %, too"
     assert bits(drive, 10, 6000) == Fraction(1, 2)
     assert "kept at 0.5" in drive["front"].reason
     drive.accept("clock_advanced", t=24.9)

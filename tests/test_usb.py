@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from runner.core.model import Capture
+from runner.core.capture import Capture
 from runner.system.usb import Bus, UsbCamera, buses
 
 RAW = Capture("YUY2", 640, 480, Fraction(30))  # 147.456 Mbit/s

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from runner.__main__ import main
-from runner.core.model import Capture
+from runner.core.capture import Capture
 from runner.system import v4l2
 from runner.system.v4l2 import Device, Span, device_problem, offered_rate, unoffered, users
 

@@ -26,7 +26,7 @@ class Vehicle:
 
     def report(self, t, run=1, **more):
         report = ReceptionReport(at=t, as_of=t, units=(), packets=0, lost=0, run=run, **more)
-        return self._after(self.stated.take(self.state, t, report))
+        return self._after(self.stated.take(self.state, self.state.driving.in_control, t, report))
 
     def wait(self, t):
         return self._after(self.stated.events(self.state, t))

@@ -18,11 +18,11 @@ from runner.configuration.origin import Composed
 from runner.configuration.rule_lists import call_entry, check_order
 from runner.configuration.uplinks import Ways, built_uplinks, reserves_kbps, uplink_problems
 from runner.core.budget import SOUND
+from runner.core.capture import Capture
 from runner.core.commands import KnobValue
 from runner.core.hull import Curve, concave
 from runner.core.model import (
     Camera,
-    Capture,
     Graph,
     Kbps,
     Mode,

@@ -7,7 +7,8 @@ from dataclasses import fields
 from typing import Any
 
 from runner.configuration.origin import GRAPH_PARTS
-from runner.core.model import Element, Graph, GraphSettings, KnobTarget, ModelError, Source
+from runner.core.graph_settings import GraphSettings, KnobCommand, KnobTarget
+from runner.core.model import Element, Graph, ModelError, Source
 from runner.settings import Recording
 
 MOUNT_KEYS = ("device", "address", "clip", "bag", "topic")
@@ -41,7 +42,7 @@ def read_graph(data: Mapping[str, Any]) -> Graph:
     for key, side in GRAPH_PARTS.items():
         if key in data:
             raise ModelError(key, None, f"is unused; include it in {side} as ${{..{key}}}")
-    wire = data.get("wire") or {}
+    wire, knobs = data.get("wire") or {}, data["knobs"]
     named = {key: value for key, value in data.items() if key not in GRAPH_STRUCTURE} | _effort(data)
     return Graph(
         transport=data["transport"],
@@ -49,12 +50,26 @@ def read_graph(data: Mapping[str, Any]) -> Graph:
         operator=elements(data["operator"]),
         wire_vehicle=elements(wire.get("vehicle")),
         wire_operator=elements(wire.get("operator")),
-        knobs={knob: tuple(KnobTarget(**target) for target in targets) for knob, targets in data["knobs"].items()},
+        knobs={
+            knob: tuple(KnobTarget(**its) for its in targets if "element" in its) for knob, targets in knobs.items()
+        },
         settings=GraphSettings(**given(named, GRAPH_SETTINGS)),
         placeholders=named,
+        command=_command(knobs["bitrate"]),
         mutable=tuple((entry["element"], entry["property"]) for entry in data.get("mutable") or ()),
         **given(data, ("verified", "passes", "key_frame", "needs")),
     )
+
+
+def _command(targets: Sequence[Mapping[str, Any]]) -> KnobCommand | None:
+    """The command among the targets of a knob."""
+    found = [dict(its) for its in targets if "command" in its]
+    if len(found) > 1:
+        raise ModelError("knobs.bitrate", f"{len(found)} commands", "one command sets the bitrate")
+    command = KnobCommand(tuple(found[0].pop("command")), **found[0]) if found else None
+    if command and command.with_bitrate(1) == list(command.words):
+        raise ModelError("knobs.bitrate", list(command.words), "one word of the command must have {kbps} or {bps}")
+    return command
 
 
 def read_source(data: Mapping[str, Any]) -> Source:

@@ -214,7 +214,10 @@ class CopiesCounted(_Event):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StreamMeasured(_Event):
-    """What a camera sends whose pictures are passed on as it encodes them; until this is reported, its b_full."""
+    """What a camera sends whose pictures are passed on as it encodes them; until this is reported, its b_full.
+
+    Of a camera whose bitrate can be set, what it sends although it was asked for less; 0: it does as asked.
+    """
 
     camera: CameraName
     kbps: Annotated[Rate, "mean of the last seconds, kbit/s"]

@@ -16,6 +16,8 @@ from itertools import chain, pairwise
 from math import inf, nextafter
 from typing import Any, Protocol
 
+from runner.core.capture import Capture
+from runner.core.graph_settings import GraphSettings, KnobCommand, KnobTarget
 from runner.core.hull import Curve
 from runner.core.limits import Count
 from runner.core.mounting import Place, Pose
@@ -180,41 +182,6 @@ class Element:
 
 
 @dataclass(frozen=True, slots=True)
-class KnobTarget:
-    """One property that a knob sets, and its value: a quantity of the knob (see `runner.graph`) or a text with some."""
-
-    element: str
-    property: str
-    value: str
-
-
-@dataclass(frozen=True, slots=True)
-class GraphSettings:
-    """Numbers of a graph that this program reads itself. None, and the defaults: a graph that does not state them.
-
-    first_port         UDP port of the first camera; camera n uses this + n
-    mtu_bytes          size of an RTP packet
-    header_bytes       headers of a packet on the wire, below the payload of the video
-    jitter_buffer_ms   how long the operator waits for a missing packet
-    retransmission_ms  how long the vehicle keeps packets for retransmission; 0: there is none
-    srt_latency_ms     how long SRT may take to repair a loss, its playout delay
-    dscp               DiffServ code point of the video packets; -1 leaves it to the system
-    key_interval_s     between key frames, or length of a refresh wave; fills {key_interval_frames}
-    vbv_frames         rate control buffer in frames at the bitrate in force; fills {vbv_ms}
-    """
-
-    first_port: int
-    mtu_bytes: int = 1200
-    header_bytes: int = 58
-    jitter_buffer_ms: int = 0
-    retransmission_ms: int = 0
-    srt_latency_ms: int = 0
-    dscp: int = -1
-    key_interval_s: float | None = None
-    vbv_frames: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
 class Graph:
     """A camera's pipeline on both sides as defined in YAML.
 
@@ -225,6 +192,7 @@ class Graph:
     mutable       (element, property) that knobs set although GStreamer does not declare it mutable while playing
     verified      False: only checked against its schema, never run by this project's tests
     passes        format of the pictures that it passes on as the source encodes them, h264 or h265; None: it encodes
+    command       sets the bitrate of a camera whose pictures it passes on; None: knobs do, if there are some
     key_frame     how to request a key frame after unrecovered packet loss: "event", GStreamer's own; "caps", a pixel
                   aspect ratio that differs imperceptibly, for an encoder that ignores the event; None: not at all
     needs         by element that only the vehicle may have, the Debian package that provides it
@@ -241,6 +209,7 @@ class Graph:
     mutable: tuple[tuple[str, str], ...] = ()
     verified: bool = True
     passes: str | None = None
+    command: KnobCommand | None = None
     key_frame: str | None = None
     needs: Mapping[str, str] = field(default_factory=dict)
 
@@ -254,7 +223,7 @@ class Graph:
             raise ModelError("vehicle", repr(self.vehicle[-1].name), rule, last, "transport")
         for knob, targets in self.knobs.items():
             for index, target in enumerate(targets):
-                if target.element not in names:
+                if target.element not in names and not self.passes:  # else it may be one of the source
                     rule = f"no such element{suggest(target.element, names)}"
                     known = (f"vehicle[{place}].name" for place in range(len(self.vehicle)))
                     raise ModelError(f"knobs.{knob}[{index}].element", repr(target.element), rule, *known)
@@ -266,6 +235,14 @@ class Graph:
         for index, pair in enumerate(self.mutable):
             if pair not in turned:
                 raise ModelError(f"mutable[{index}]", repr(".".join(pair)), "no knob sets this property", "knobs")
+        if self.command and not self.passes:
+            rule = "a command sets the bitrate of pictures that are passed on, others are encoded here"
+            raise ModelError("knobs.bitrate", None, rule, "passes")
+
+    @property
+    def sets_bitrate(self) -> bool:
+        """Whether the bitrate of its pictures can be set, here or in the camera."""
+        return bool(self.command or self.knobs.get("bitrate"))
 
 
 def check_unique(key: str, names: list[str]) -> None:
@@ -342,24 +319,6 @@ class BagTopic:
     depth_m: float = DEPTH_M
 
 
-@dataclass(frozen=True, slots=True)
-class Capture:
-    """Format requested from a V4L2 camera; None leaves the choice to the camera.
-
-    format    mjpeg, h264, h265, raw, or the name of a raw format in GStreamer such as YUY2
-    width     px, of the captured picture
-    height    px
-    fps       Hz
-    controls  V4L2 controls by name, set when the device is opened, as `v4l2-ctl --list-ctrls` shows them
-    """
-
-    format: str | None = None
-    width: int | None = None
-    height: int | None = None
-    fps: Fraction | None = None
-    controls: Mapping[str, int] = field(default_factory=dict)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
     """A camera mounted in a vehicle.
@@ -419,6 +378,10 @@ class Camera:
         if (kept := self.always) and (kept.x + kept.width > self.width or kept.y + kept.height > self.height):
             found = f"{kept.width}x{kept.height} at {kept.x},{kept.y}"
             raise ModelError("always", found, f"must lie inside the image of {self.width}x{self.height}", "width_px")
+        least, most = self.graph.settings.lowest_kbps, self.rate_quality.b_full
+        if self.graph.passes and least > most:
+            rule = f"must be at most the b_full_kbps of the camera, {plain(most)}"
+            raise ModelError("graph.lowest_kbps", least, rule, "b_full_kbps")
         frames = self.graph.settings.vbv_frames or 0.0
         if 1000 * frames > MOST_BUFFER_MS * self.fps:
             rule = f"with vbv_frames {frames:g} of its graph it must be at least {1000 * frames / MOST_BUFFER_MS:g}"
@@ -466,6 +429,7 @@ class Vehicle:
     uplinks  by name, kbit/s that are left to other traffic; empty: there is one, without a name
     sound    kbit/s on the wire of one copy of its sound; 0: none
     fixed    cameras whose pictures are sent as their sources encode them, whatever the rules would choose
+    lowest   those that also encode by themselves, but at a bitrate that can be set: kbit/s, the least of each
     """
 
     name: str
@@ -475,9 +439,13 @@ class Vehicle:
     uplinks: Mapping[str, Kbps] = field(default_factory=dict)
     sound: Kbps = Fraction(0)
     fixed: frozenset[str] = field(init=False)
+    lowest: Mapping[str, Kbps] = field(init=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "fixed", frozenset(name for name, each in self.cameras.items() if each.graph.passes))
+        passed = {name: each.graph for name, each in self.cameras.items() if each.graph.passes}
+        lowest = {name: Kbps(each.settings.lowest_kbps) for name, each in passed.items() if each.sets_bitrate}
+        object.__setattr__(self, "fixed", frozenset(passed.keys() - lowest.keys()))
+        object.__setattr__(self, "lowest", lowest)
 
 
 Progress = Callable[[str, float], None]  # current step, share done in [0, 1]

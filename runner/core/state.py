@@ -131,8 +131,7 @@ def _changes(vehicle: Vehicle, state: State, event: ev.Event, in_force: Decision
             return {"rois": {**state.rois, name: roi}}
         case ev.CameraConfigured(camera=name):
             _only_in(Mode.SINGLE, state, event)
-            camera = _encoded_here(_known(vehicle, name), "switch it off to send less")
-            configured = _configured(camera, state.manual[name], event)
+            configured = _configured(_settable(vehicle, _known(vehicle, name), event), state.manual[name], event)
             return {"manual": {**state.manual, name: configured}}
         case ev.WeightsSet(weights=weights):
             for name in weights:
@@ -238,6 +237,13 @@ def _encoded_here(camera: Camera, instead: str) -> Camera:
     raise Refused(f"the pictures of {camera.name} are sent as the camera encodes them; {instead}")
 
 
+def _settable(vehicle: Vehicle, camera: Camera, event: ev.CameraConfigured) -> Camera:
+    """Of a camera that encodes by itself, at most the bitrate can be set."""
+    if camera.name in vehicle.lowest and event.scaling is None:
+        return camera
+    return _encoded_here(camera, "set its bitrate" if camera.name in vehicle.lowest else "switch it off to send less")
+
+
 def _of_uplink(
     vehicle: Vehicle, known: Mapping[str, Any], event: ev.BitratePredicted | ev.LinkMeasured
 ) -> Mapping[str, Any]:
@@ -266,9 +272,10 @@ def _check_inside(camera: Camera, roi: Roi, what: str) -> None:
 
 
 def _configured(camera: Camera, now: Manual, event: ev.CameraConfigured) -> Manual:
+    least = camera.graph.settings.lowest_kbps if camera.graph.passes else 1
     b_full = camera.rate_quality.b_full
-    if event.kbps is not None and not 1 <= event.kbps <= b_full:
-        raise Refused(f"{plain(event.kbps)} kbit/s for {camera.name} is outside 1 to {plain(b_full)}, its b_full")
+    if event.kbps is not None and not least <= event.kbps <= b_full:
+        raise Refused(f"{plain(event.kbps)} kbit/s for {camera.name} is outside {least} to {plain(b_full)}, its b_full")
     if event.scaling is not None and not 0 < event.scaling <= 1:
         raise Refused(f"scaling {plain(event.scaling)} for {camera.name} is outside ]0, 1]")
     return Manual(

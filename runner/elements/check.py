@@ -99,7 +99,8 @@ def _check_knobs(registry: Registry, plan: Plan) -> Iterator[ModelError]:
     """Each knob's property must exist, be mutable while PLAYING and accept the knob's largest value."""
     camera = plan.camera
     factories = {element.name: element.factory for element in (*plan.source, *plan.vehicle)}
-    stated = {element.name: f"graph.vehicle[{place}].element" for place, element in enumerate(plan.vehicle)}
+    stated = {each.name: f"source.elements[{place}].element" for place, each in enumerate(plan.source)}
+    stated |= {element.name: f"graph.vehicle[{place}].element" for place, element in enumerate(plan.vehicle)}
     largest: dict[str, KnobValue] = {
         "sending": True,
         "roi": camera.full_roi,

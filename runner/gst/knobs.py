@@ -34,7 +34,9 @@ class KnobPanel:
     ) -> None:
         self._camera, self._on_turned, self._on_report = camera, on_turned, on_report
         self._elements = [pipeline.get_by_name(element.name) for element in camera.graph.vehicle]
+        of_source = {target.element for target in camera.graph.knobs.get("bitrate", ())}  # if it passes pictures on
         self._by_name = {element.get_name(): element for element in self._elements}
+        self._by_name |= {name: pipeline.get_by_name(name) for name in of_source}
         # Reentrant: setting caps sends an event upstream through the probed pad, which calls the probe again.
         self._lock = threading.RLock()
         self._pending: dict[str, KnobValue] = {}
@@ -60,10 +62,10 @@ class KnobPanel:
             self._apply_pending()
             return
         names = {name for name, _, _ in changed}
-        if not names:  # of a graph that passes pictures on
+        first = next((element for element in self._elements if element.get_name() in names), None)
+        if first is None:  # of a graph that passes pictures on
             self._apply_pending()
             return
-        first = next(element for element in self._elements if element.get_name() in names)
         # Only a source pad knows whether a frame it has pushed is still being processed downstream.
         above = first.get_static_pad("sink").get_peer()
         self._between_frames.add_to(above)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from gi.repository import GObject, Gst, GstRtsp, GstSdp
 
-from runner.core.model import GraphSettings
+from runner.core.graph_settings import GraphSettings
 from runner.gst.arriving import HEADER_BYTES, RTP_HZ, ArrivingFrames, Lateness, Packet, read_packet
 from runner.gst.packet_times import received_at, state_arrivals
 from runner.gst.probes import BufferProbe, PassingBuffer

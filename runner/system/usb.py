@@ -8,7 +8,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import NamedTuple
 
-from runner.core.model import Capture
+from runner.core.capture import Capture
 
 # Mbit/s of payload that a bus has for periodic transfers, by its speed in Mbit/s as sysfs states it. USB 2.0 gives them
 # at most 80 % of a microframe of 7500 bytes, enough for 5 transactions of 1024 bytes and 38 of overhead;

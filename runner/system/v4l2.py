@@ -18,7 +18,7 @@ from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
-from runner.core.model import Capture
+from runner.core.capture import Capture
 from runner.errors import reason
 from runner.system.usb import BITS
 

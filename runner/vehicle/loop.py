@@ -116,16 +116,17 @@ class ControlLoop:
     _ticks: int = 0
 
     def __post_init__(self) -> None:
-        self.vehicle = self.setup.vehicle
-        has_sound = self.vehicle.sound is not None
-        self._readings = Readings(self.applier, self.vehicle.cameras, self.on_report, has_sound=has_sound)
+        vehicle = self.vehicle = self.setup.vehicle
+        has_sound = vehicle.sound is not None
+        self._readings = Readings(self.applier, vehicle.cameras, self.on_report, has_sound=has_sound)
         self._inbox = Inbox()
         self.refusals = Refusals(self._now, self._inbox.is_full, self.on_report)
-        self._operators, self._attention = Operators(self.setup.expires_s), StatedAttention()
-        self._pictures, self._views = SeenPictures(self.vehicle), StatedViews(self.vehicle)
+        self._operators, self._attention, self._replies = Operators(self.setup.expires_s), StatedAttention(), Replies()
+        self._pictures, self._views = SeenPictures(vehicle), StatedViews(vehicle)
         self._uplinks, self._sending, self._key_frames = MeasuredUplinks(self.vehicle), SendingTimes(), KeyFrames()
-        self._publisher, self._streams = Publisher(self.setup.latency, self.publish), Streams(self.vehicle.fixed)
-        self._replies, self._report_once = Replies(), RepeatedReports(self.on_report)
+        self._streams = Streams(vehicle.fixed, vehicle.lowest)
+        self._publisher = Publisher(self.setup.latency, self.publish)
+        self._report_once = RepeatedReports(self.on_report)
         self._began, self._operators_checked = time.monotonic(), 0.0  # when operators were last checked for silence
         self._steered: SteeringReported | None = None  # the last one of the synthetic drive
 
@@ -217,7 +218,7 @@ class ControlLoop:
         self._guarded("cameras", self._readings.read)
         self._guarded("sources", lambda: self._notice(source_events(self._run.state, self._readings.cameras, t)))
         self._guarded("copies_counted", lambda: self._notice(copies_events(self._run.state, self._readings.streams, t)))
-        self._guarded("streams", lambda: self._notice(self._streams.events(self._run.state, self._readings.cameras, t)))
+        self._guarded("streams", lambda: self._notice(self._streams.events(self._run, self._readings.cameras, t)))
         if self._ticks % TELEMETRY_TICKS == 0:
             self._guarded("telemetry", lambda: self._publish_measured(t))
         self._guarded("operators", lambda: self._watch_operators(t))
@@ -301,8 +302,7 @@ class ControlLoop:
         if item.report.run is not UNSET:
             self._operators.reported(item.sender, t, item.report.run)
         self._pictures.add(item.sender, t, item.report)
-        if item.sender == self._run.state.driving.in_control:
-            self._notice(self._views.take(self._run.state, t, item.report))
+        self._notice(self._views.take(self._run.state, item.sender, t, item.report))
         reported = ReceptionReported(t, item.sender, item.sender == self._run.state.driving.in_control, item.report)
         uplink = self._uplinks.of(item.report)
         if uplink is None:

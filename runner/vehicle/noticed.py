@@ -10,6 +10,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from fractions import Fraction
 from math import ceil
 
+from runner.core.commands import KnobValues
 from runner.core.events import (
     CopiesCounted,
     Departure,
@@ -22,11 +23,14 @@ from runner.core.events import (
 from runner.core.model import Kbps
 from runner.core.roles import Role
 from runner.core.state import State
+from runner.core.step import Run
 from runner.records.vehicle import CameraReading, SoundReading
 
 STREAM_S = 4.0  # over which a stream is measured: many cameras send a key picture every two seconds
 LEAST_S = 2.0  # of these, before anything is said
 CHANGE = Fraction(11, 10)  # of its bitrate, that is told
+OVER = Fraction(5, 4)  # of what a camera was asked for: less may be its rate control's
+FOLLOW_S = 10.0  # within which it does as asked: a command may wait and take seconds, and what it sends is a mean
 
 
 def presence_events(
@@ -66,14 +70,17 @@ def source_events(known: State, cameras: Mapping[str, CameraReading], t: float) 
 class Streams:
     """Measures what cameras send that encode by themselves, from the counters of their pipelines.
 
-    cameras  their names
+    fixed     names of those that send what they send
+    settable  of those that are asked for a bitrate
     """
 
-    def __init__(self, cameras: Collection[str]) -> None:
-        self._seen: dict[str, deque[tuple[float, int]]] = {name: deque() for name in cameras}
+    def __init__(self, fixed: Collection[str], settable: Collection[str] = ()) -> None:
+        self._seen: dict[str, deque[tuple[float, int]]] = {name: deque() for name in (*fixed, *settable)}
+        self._asked: dict[str, deque[tuple[float, int]]] = {name: deque() for name in settable}
 
-    def events(self, known: State, cameras: Mapping[str, CameraReading], t: float) -> Iterator[Event]:
+    def events(self, run: Run, cameras: Mapping[str, CameraReading], t: float) -> Iterator[Event]:
         """Those that send more or less than is known by `CHANGE`; several times a second."""
+        self._note_asked(run.commanded, t)
         for name, seen in self._seen.items():
             counted = cameras[name].encoded.bytes
             if cameras[name].applied.get("sending") is not True or (seen and counted < seen[-1][1]):
@@ -85,9 +92,23 @@ class Streams:
             if span_s < LEAST_S or counted == seen[0][1]:
                 continue
             kbps = Kbps(ceil(8 * (counted - seen[0][1]) / span_s / 1000))
-            last = known.streams.get(name)
-            if last is None or not 1 / CHANGE < kbps / last < CHANGE:
+            last = run.state.streams.get(name)
+            if name in self._asked:
+                kbps, last = self._over_asked(name, kbps), last or Kbps(0)
+            if last is None or (kbps != last and not (kbps and last and 1 / CHANGE < kbps / last < CHANGE)):
                 yield StreamMeasured(t=t, camera=name, kbps=kbps)
+
+    def _note_asked(self, commanded: Mapping[str, KnobValues], t: float) -> None:
+        for name, asked in self._asked.items():
+            kbps = commanded.get(name, {}).get("bitrate")
+            if isinstance(kbps, int) and (not asked or asked[-1][1] != kbps):
+                asked.append((t, kbps))
+            while len(asked) > 1 and t - asked[1][0] >= FOLLOW_S:
+                asked.popleft()
+
+    def _over_asked(self, name: str, kbps: Kbps) -> Kbps:
+        """What a camera sends, if that is more than it was asked for at any time in which it could follow; else 0."""
+        return kbps if kbps > OVER * max((most for _, most in self._asked[name]), default=kbps) else Kbps(0)
 
 
 def copies_events(known: State, streams: Mapping[str, CameraReading | SoundReading], t: float) -> Iterator[Event]:

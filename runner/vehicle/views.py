@@ -36,10 +36,12 @@ class StatedViews:
     _operator: str = ""
     _runs: dict[int | UnsetType, _Stated] = field(default_factory=dict)
 
-    def take(self, known: State, t: float, report: ReceptionReport) -> Iterator[Event]:
-        """What a report changes that has arrived from the operator in control, t in s."""
-        if known.driving.in_control != self._operator:
-            self._operator, self._runs = known.driving.in_control, {}
+    def take(self, known: State, operator: str, t: float, report: ReceptionReport) -> Iterator[Event]:
+        """What a report of an operator changes, t in s; only one of the operator in control does."""
+        if operator != known.driving.in_control:
+            return iter(())
+        if operator != self._operator:
+            self._operator, self._runs = operator, {}
         stated = self._runs.get(report.run, _Stated(t))
         if report.view is not UNSET:
             stated = replace(stated, view=self._possible(report.view), at=t)

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
 
-from runner.core.model import Capture
+from runner.core.capture import Capture
 from runner.errors import RunError, UserError
 from runner.ros.topics import Topic, picture_topics
 from runner.settings import Setup

@@ -11,7 +11,8 @@ from typing import Any
 
 import yaml
 
-from runner.core.model import Camera, Capture
+from runner.core.capture import Capture
+from runner.core.model import Camera
 from runner.errors import ArgumentError
 from runner.system.v4l2 import CLOSE, Device, device_problem, preferred
 

@@ -22,6 +22,7 @@ fastest. Each run is one line of JSON, as with format=json, with the additional 
 from __future__ import annotations
 
 import json
+import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -143,6 +144,7 @@ def as_json(plans: Sequence[Plan], sound: SoundPlan | None, decision: Decision, 
             "operator": plan.operator_line(),
             "server": plan.server,
             "decision": to_json(CameraDecision.of(decision.settings[plan.camera.name])),
+            **({"command": words} if (words := _command(plan, decision)) else {}),
         }
         for plan in plans
     }
@@ -158,6 +160,12 @@ def as_json(plans: Sequence[Plan], sound: SoundPlan | None, decision: Decision, 
         return document
     shares = to_json(uplinks_decided(decision)) if decision.uplinks else {}
     return {**document, "uplinks": {name: {**way, **shares.get(name, {})} for name, way in uplinks.items()}}
+
+
+def _command(plan: Plan, decision: Decision) -> list[str] | None:
+    """What sets the bitrate in the camera; None: nothing does."""
+    kbps = decision.settings[plan.camera.name].kbps
+    return plan.command.with_bitrate(kbps) if plan.command and kbps else None
 
 
 def as_text(
@@ -178,6 +186,8 @@ def as_text(
         lines.append(f"gst-launch-1.0 {plan.operator_line()}")
         if plan.server:
             lines.append(f"# server: {plan.server}")
+        if command := _command(plan, decision):
+            lines.append(f"# sets the bitrate: {shlex.join(command)}")
     if sound:
         lines += ["", f"# sound: {plain(sound.wire_kbps)} kbit/s on the wire, taken from the total"]
         lines.append(f"gst-launch-1.0 {sound.vehicle_line()}")

@@ -20,6 +20,7 @@ from runner.core.model import Camera, Kbps, Mode, Vehicle, exact, plain
 from runner.core.placement import shared
 from runner.core.rules.paper import (
     above_fixed,
+    as_sent,
     demands,
     lasting_share,
     of_all_copies,
@@ -35,7 +36,7 @@ _allocated = Last(allocation.allocate_above_floors)
 Share = Callable[[Mapping[str, Kbps], Kbps], Mapping[str, Kbps]]
 
 
-@rule(needs=["total", "demand"], gives=["bitrate"], reads=["copies", "weights"], uses=["placed", "uplinks"])
+@rule(needs=["total", "demand"], gives=["bitrate"], reads=["copies", "streams", "weights"], uses=["placed", "uplinks"])
 def share_above_floors(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
     """As `share_by_demand`, but each camera first gets its `floor_kbps`; those with `shed` are given up first.
 
@@ -51,7 +52,8 @@ def shared_above_floors(vehicle: Vehicle, state: State, draft: Draft, memory: Me
     """
     draft, given_up, memory = _give_up(vehicle, state, draft, draft.demand, memory)
     wanted = _without(given_up, draft.demand)
-    return with_excess_noted(vehicle, draft.replaced(bitrate=_shared(vehicle, state, draft, wanted, share))), memory
+    given = _shared(vehicle, state, draft, wanted, share)
+    return with_excess_noted(vehicle, state, draft.replaced(bitrate=given)), memory
 
 
 def _by_demand(vehicle: Vehicle, state: State) -> Share:
@@ -98,10 +100,11 @@ def _shared_among(
 ) -> Mapping[str, Kbps]:
     """kbit/s by camera; the total counts every copy of a camera that leaves the vehicle."""
     if not state.copies:
-        return above_fixed(vehicle, wanted, total, share)
+        return above_fixed(vehicle, state, wanted, total, share)
     copies = {name: state.copies.get(name, 1) for name in wanted}
     of_all = {name: own * copies[name] for name, own in wanted.items()}
-    return {name: Fraction(own) / copies[name] for name, own in above_fixed(vehicle, of_all, total, share).items()}
+    given = above_fixed(vehicle, state, of_all, total, share, copies)
+    return {name: Fraction(own) / copies[name] for name, own in given.items()}
 
 
 def _give_up(
@@ -112,8 +115,9 @@ def _give_up(
     given_up: tuple[str, ...] = ()
     if order := _shed_order(vehicle):
         assert draft.total is not None
-        floors = {name: floor * state.copies.get(name, 1) for name, floor in _lowest(vehicle, wanted).items()}
-        of_all = {name: own * state.copies.get(name, 1) for name, own in wanted.items()}
+        sent = as_sent(vehicle, state, wanted)
+        floors = {name: floor * state.copies.get(name, 1) for name, floor in _lowest(vehicle, state, sent).items()}
+        of_all = {name: own * state.copies.get(name, 1) for name, own in sent.items()}
         given_up = allocation.shed(of_all, draft.total, floors, order, before)
     if given_up != before:
         memory = {"given_up": given_up}
@@ -133,10 +137,17 @@ def _floors(vehicle: Vehicle) -> Mapping[str, Kbps]:
     return {name: camera.floor_kbps for name, camera in vehicle.cameras.items() if camera.floor_kbps}
 
 
-def _lowest(vehicle: Vehicle, wanted: Mapping[str, Kbps]) -> Mapping[str, Kbps]:
-    """The floors, with those of cameras that get all that they encode by themselves, or nothing."""
+def _lowest(vehicle: Vehicle, state: State, wanted: Mapping[str, Kbps]) -> Mapping[str, Kbps]:
+    """The floors, with those of cameras that encode by themselves: they get that, or nothing."""
     floors = _floors(vehicle)
-    return {**floors, **{name: wanted[name] for name in vehicle.fixed if name in wanted}} if vehicle.fixed else floors
+    if not (vehicle.fixed or vehicle.lowest):
+        return floors
+    fixed = {name: wanted[name] for name in vehicle.fixed if name in wanted}
+    least = {
+        name: max(own, floors.get(name, allocation.ZERO), state.streams.get(name, allocation.ZERO))
+        for name, own in vehicle.lowest.items()
+    }
+    return {**floors, **fixed, **least}
 
 
 @cache
@@ -148,7 +159,7 @@ def _shed_order(vehicle: Vehicle) -> tuple[str, ...]:
 @rule(
     needs=["total", "bitrate", "scaling"],
     gives=["bitrate", "scaling"],
-    reads=["copies", "rois", "weights"],
+    reads=["copies", "rois", "streams", "weights"],
     uses=["placed", "sized_for", "uplinks"],
 )
 def fit_to_total(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
@@ -161,7 +172,7 @@ def fit_to_total(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -
     """
     total = draft.total
     assert total is not None
-    if total >= of_all_copies(state, draft.bitrate) and not draft.placed:
+    if total >= of_all_copies(state, as_sent(vehicle, state, draft.bitrate)) and not draft.placed:
         return draft, {} if memory else memory
     draft, given_up, memory = _give_up(vehicle, state, draft, draft.bitrate, memory)
     wanted = _without(given_up, draft.bitrate)
@@ -352,13 +363,13 @@ def _wire_floors(vehicle: Vehicle, state: State, draft: Draft, cameras: tuple[Ca
 
     cameras  that are on, with repetitions for copies
     """
-    if not (vehicle.fixed or _floors(vehicle)):
+    if not (vehicle.fixed or vehicle.lowest or _floors(vehicle)):
         return allocation.ZERO
-    wanted = _wanted(vehicle, state, draft)
+    wanted = as_sent(vehicle, state, _wanted(vehicle, state, draft))
     floors = sum(
         (
             min(floor, wanted.get(name, allocation.ZERO)) * state.copies.get(name, 1)
-            for name, floor in _lowest(vehicle, wanted).items()
+            for name, floor in _lowest(vehicle, state, wanted).items()
             if vehicle.cameras[name].shed is None
         ),
         allocation.ZERO,
