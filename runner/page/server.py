@@ -406,6 +406,7 @@ def _introduction(setup: Setup, shown: Sequence[int]) -> dict[str, Any]:
             "height": camera.height,
             "fps": float(camera.fps),
             "passed": camera.graph.passes is not None,
+            "settable": camera.name in setup.vehicle.lowest,
             "wave_s": camera.graph.settings.key_interval_s,
             "pose": camera.pose and asdict(camera.pose),
             "fov_deg": camera.fov_deg,

@@ -106,6 +106,12 @@ export function transferGround(...elements) {
 export const showGround = (shown, { clientWidth: width, clientHeight: height }) =>
   worker.postMessage({ order: "above", shown, width, height, ratio: devicePixelRatio });
 
+/**
+ * Show only a part of a camera's pictures.
+ * @param {string} name  @param {import("./framing.js").Rectangle|null} region px of the full image; null: all of it
+ */
+export const showCrop = (name, region) => worker.postMessage({ order: "crop", name, region });
+
 /** @param {string[]} names of the cameras whose pictures are straightened */
 export const showStraight = (names) => worker.postMessage({ order: "straight", names });
 

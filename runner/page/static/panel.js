@@ -2,7 +2,7 @@
 
 import { camera, decisionOf, inControl, listen, mode, store, whyUndecided } from "./store.js";
 import { pending, request, showProblem, whyNoControl } from "./requests.js";
-import { AS_ENCODED, fullRegion, isLocked, isPart, sendRegion, toggleLocked } from "./roi.js";
+import { AS_ENCODED, fullRegion, isCropped, isLocked, isPart, sendRegion, shownRegion, toggleLocked } from "./roi.js";
 import { RegionFrame } from "./region_frame.js";
 import { SMALLEST } from "./region.js";
 import { makeSlider } from "./slider.js";
@@ -11,7 +11,7 @@ import { canStraighten } from "./straight.js";
 import { isStraight, toggleStraight } from "./straighten.js";
 import { withKey } from "./hints.js";
 import { Kept } from "./kept.js";
-import { reasonWords, regionWords, setterWords } from "./reasons.js";
+import { cropWords, reasonWords, regionWords, setterWords } from "./reasons.js";
 import { colourOf } from "./colours.js";
 import { byId, capital, factor, KBPS, latency, make, rate, region, setAttribute, setText, size, tenth, whole } from "./format.js";
 
@@ -26,7 +26,8 @@ const whyNotByHand = () => whyNot() ?? setBy();
 
 /** What sets the bitrate; null: the operator does. */
 function setBy() {
-  if (camera(name())?.passed) return `${capital(AS_ENCODED)}.`;
+  const info = camera(name());
+  if (info?.passed && !info.settable) return `${capital(AS_ENCODED)}. This page alone shows a region of it.`;
   if (mode() === "automatic") return `${setterWords(store.state, isPredicted())}${BY_HAND}`;
   return mode() === "collective" ? `Shared from the total${BY_HAND}` : null;
 }
@@ -148,10 +149,10 @@ function sendSides() {
 
 /** Request the full image of the selected camera, or, if that sends it anyway, of every camera that sends a part. */
 export function sendFull() {
-  const why = whyNot();
-  if (why) return showProblem(why);
   const others = (store.hello?.cameras ?? []).map((each) => each.name).filter(isPart);
   const names = others.includes(name()) ? [name()] : others;
+  const why = names.every(isCropped) ? null : whyNot();
+  if (why) return showProblem(why);
   if (!names.length) return showProblem("every camera sends its full image");
   for (const each of names) sendRegion(each, fullRegion(each));
   edited = new Set();
@@ -192,22 +193,33 @@ function refreshHead(now) {
 
 function refreshSettings(info, now) {
   const why = whyNotByHand();
-  setText(byHand, why ?? (now ? origin.words(name(), now) : ""));
+  const whyNoRoi = info.passed ? null : why; // the page crops its picture
+  const ofRegion = info.passed ? "This page alone shows a region of it. " : "";
+  setText(byHand, why ?? ofRegion + (now ? origin.words(name(), now) : ""));
   bitrate.update({ value: now?.kbps, max: info.b_full_kbps, why });
-  refreshFactors(info, now, why);
-  fill(free, now?.scaling ?? "", why, pending(`scaling:${name()}`));
-  for (const side of SIDES) fill(sides[side], now?.roi[side] ?? "", why, pending(`roi:${name()}`));
+  const whyNoFactor = info.passed ? `${capital(AS_ENCODED)}.` : why;
+  refreshFactors(info, now, whyNoFactor);
+  fill(free, now?.scaling ?? "", whyNoFactor, pending(`scaling:${name()}`));
+  const seen = info.passed ? shownRegion(name()) : now?.roi;
+  for (const side of SIDES) fill(sides[side], seen?.[side] ?? "", whyNoRoi, pending(`roi:${name()}`));
   setAttribute(locked, "aria-pressed", isLocked());
-  apply.disabled = Boolean(why);
-  full.disabled = Boolean(whyNot()) || !isPart(name());
-  full.title = whyNot() ?? withKey("full image", "full_image");
+  apply.disabled = Boolean(whyNoRoi);
+  const whyNotFull = isCropped(name()) ? null : whyNot();
+  full.disabled = Boolean(whyNotFull) || !isPart(name());
+  full.title = whyNotFull ?? withKey("full image", "full_image");
   part.hidden = !(now && isPart(name()));
-  setText(part, now && isPart(name()) ? regionWords(now, mode() === "single", info, withKey("Full image", "full_image")) : "");
-  apply.title = why ?? "send these numbers; a rectangle dragged on the picture does the same";
+  setText(part, part.hidden ? "" : partWords(info, now));
+  apply.title = whyNoRoi ?? "send these numbers; a rectangle dragged on the picture does the same";
   fill(weight, now?.weight ?? info.weight, whyNot(), pending(`weight:${name()}`));
   const use = mode() === "single" ? "used in modes A and C only" : "scales this camera's share of the total";
   weight.title = whyNot() ?? use;
   setText(weightNote, whyNot() ?? use);
+}
+
+function partWords(info, now) {
+  const end = withKey("Full image", "full_image");
+  const seen = isCropped(name()) && shownRegion(name());
+  return seen ? cropWords(seen, info, end) : regionWords(now, mode() === "single", info, end);
 }
 
 /** A number field shows the value in force, except while it is being edited or a request is pending. */
@@ -292,6 +304,6 @@ export function startPanel() {
   byId("camera-panel").append(head, why, controls, comparison());
   byId("latency-panel").append(stageTable());
   listen("state", (state) => state.online && origin.update(state));
-  listen("hello state sample control requests socket status theme straight aspect", refresh);
+  listen("hello state sample control requests socket status theme straight aspect crop", refresh);
   listen("selected", onSelected);
 }

@@ -24,8 +24,10 @@ class FramePicture {
     this.painted = { width: this.width, height: this.height };
   }
 
-  paint(context, width, height) {
-    context.drawImage(this.frame, 0, 0, width, height);
+  /** Fill a canvas of this size. @param {import("./framing.js").Rectangle|null} crop the part to be shown, px; null: all */
+  paint(context, width, height, crop = null) {
+    const { x, y, width: wide, height: high } = crop ?? { x: 0, y: 0, ...this.painted };
+    context.drawImage(this.frame, x, y, wide, high, 0, 0, width, height);
   }
 
   /** Upload to the bound texture. @param {WebGL2RenderingContext} gl */
@@ -77,8 +79,13 @@ class PlanePicture {
     return image;
   }
 
-  paint(context, width, height) {
-    paintImage(context, this.pixels(), width, height);
+  /**
+   * As above.
+   * @param {import("./framing.js").Rectangle|null} crop px of the image, which may be smaller than the picture
+   */
+  paint(context, width, height, crop = null) {
+    const image = this.pixels();
+    paintImage(context, crop ? cut(image, crop) : image, width, height);
   }
 
   /** Upload to the bound texture. @param {WebGL2RenderingContext} gl */
@@ -116,6 +123,16 @@ function memoryFor(width, height, size) {
   const fits = ({ bytes, image }) => bytes.length === size && image.width === width && image.height === height;
   const found = spare.findIndex(fits);
   return found < 0 ? { bytes: new Uint8Array(size), image: new ImageData(width, height) } : spare.splice(found, 1)[0];
+}
+
+/** A part of an image. @param {ImageData} image  @param {import("./framing.js").Rectangle} part px */
+function cut({ data, width: wide }, { x, y, width, height }) {
+  const found = new ImageData(width, height);
+  for (let row = 0; row < height; row++) {
+    const from = 4 * ((y + row) * wide + x);
+    found.data.set(data.subarray(from, from + 4 * width), 4 * row * width);
+  }
+  return found;
 }
 
 /** Fill a canvas of this size with an image. @param {ImageData|ImageBitmap} image */

@@ -5,6 +5,8 @@ import { capital, KBPS, rate, sameRegion, whole } from "./format.js";
 const NAMED = { 1: "full size", 0.5: "half size", 0.25: "quarter size" };
 const PARTS = [2, 4, 8, 16]; // of a size that has a name: 3/8
 const AS_ENCODED = "as the camera encodes it";
+const EXCESS = /, more than its b_full of [\d.]+/; // that camera sends more than is stated
+const OVER = /, but it sends \d+/; // although it was asked for less
 const PAUSED = "not sending: ";
 const TOTAL = "total ";
 
@@ -54,6 +56,11 @@ export function regionWords({ roi }, isSingle, full, end) {
   return `Only ${share} of the image is sent, nobody sees the rest. ${bitrate}. ${end} ends this.`;
 }
 
+/** What a region costs that this page alone shows: nothing. Full image, region, and how to end it. */
+export function cropWords(roi, full, end) {
+  return `This page alone shows ${percent(shareOf(roi, full))} of the image, which is sent and recorded whole. ${end} ends this.`;
+}
+
 /**
  * Half size: 1181 of 6000 kbit/s, its share of the 6500 predicted.
  * @param {import("./records.js").CameraState|undefined} camera its decision
@@ -86,7 +93,12 @@ function pauseWords({ weight }, { mode }, common) {
 
 /** What limits its bitrate. */
 function causeWords({ kbps, demand_kbps, reason }, state, predicted) {
-  if (reason.includes(AS_ENCODED)) return `, ${AS_ENCODED}`;
+  if (reason.includes(AS_ENCODED)) return `, ${AS_ENCODED}${reason.match(EXCESS)?.[0] ?? ""}`;
+  const over = reason.match(OVER)?.[0] ?? "";
+  return `${sharedWords(kbps, demand_kbps, reason, state, predicted)}${over && `${over} kbit/s`}`;
+}
+
+function sharedWords(kbps, demand_kbps, reason, state, predicted) {
   const { mode, total_kbps, asked_kbps } = state;
   const limit = mode !== "automatic" && total_kbps >= asked_kbps ? null : limitOf(reason.split("; "), state);
   if (mode === "single") return !limit ? "" : `, less than was set: ${limit === "link" ? "the link carries no more" : limit}`;

@@ -1,6 +1,7 @@
 /** Choosing a region of interest by dragging a rectangle on the picture, in mode S. */
 
 import { camera, decisionOf, inControl, listen, mode, publish } from "./store.js";
+import { showCrop } from "./link.js";
 import { pending, request, whyNoControl } from "./requests.js";
 import { toBox, toPicture, visible } from "./framing.js";
 import { withKey } from "./hints.js";
@@ -11,12 +12,19 @@ import { boxSize, make, sameRegion } from "./format.js";
 const DRAG_START_PX = 6; // a click moves the pointer less than this
 const ASPECT = "tod-roi-aspect";
 const refreshers = new Map(); // by camera: shows the pending region
+/** @type {Map<string, import("./framing.js").Rectangle>} */
+const crops = new Map(); // by camera that is sent as it encodes: the part that this page shows, where that is not all
+let croppedOf = ""; // vehicle of these cameras
 
-/** The region that the picture shows: as read back, otherwise as decided. */
+/** The region that the picture shows: as read back, otherwise as decided; of one that only this page crops, as chosen. */
 export const shownRegion = (name) => {
   const now = decisionOf(name);
+  if (now && camera(name)?.passed) return crops.get(name) ?? fullRegion(name);
   return now?.applied.roi ?? now?.roi ?? null;
 };
+
+/** Whether a camera's region is this page's own: the camera sends its whole picture, whatever is chosen. */
+export const isCropped = (name) => crops.has(name);
 
 /** Whether dragged regions keep the full image's aspect ratio. */
 export const isLocked = () => localStorage.getItem(ASPECT) === "locked";
@@ -50,9 +58,27 @@ function snap(sides, low, high, end) {
   return [Math.max(0, Math.min(start, end - length)), length];
 }
 
+/** Show a region: the vehicle sends it, or, of a camera that encodes by itself, this page crops the picture to it. */
 export function sendRegion(name, roi) {
+  if (camera(name)?.passed) return crop(name, roi);
   const { x, y, width, height } = roi;
   request(`roi:${name}`, { event: "roi_set", camera: name, x, y, width, height }, `ROI of ${name}`);
+}
+
+function crop(name, roi) {
+  const { x, y, width, height } = roi;
+  const part = sameRegion(roi, fullRegion(name)) ? null : { x, y, width, height };
+  if (part) crops.set(name, part);
+  else crops.delete(name);
+  showCrop(name, part);
+  publish("crop");
+}
+
+/** The worker may have new streams. */
+function onHello({ vehicle, cameras }) {
+  if (vehicle !== croppedOf) crops.clear();
+  croppedOf = vehicle;
+  for (const { name } of cameras) showCrop(name, crops.get(name) ?? null);
 }
 
 /** The full image of a camera. */
@@ -62,21 +88,22 @@ export function fullRegion(name) {
   return { x: 0, y: 0, width: full.width, height: full.height };
 }
 
-/** Whether a camera is to send, or may still send, a part of its image only. */
+/** Whether a camera is to send, or may still send, a part of its image only; or this page shows a part only. */
 export function isPart(name) {
+  if (isCropped(name)) return true;
   const [full, decided] = [fullRegion(name), decisionOf(name)?.roi];
   return [decided, pendingRegion(name)].some((region) => region && !sameRegion(region, full));
 }
 
-export const AS_ENCODED = "it is sent as the camera encodes it; set region, size and bitrate in the camera";
+export const AS_ENCODED = "it is sent as the camera encodes it; set size and bitrate in the camera";
 
 /** Why a region cannot be chosen on a camera's picture; null: it can. */
 export function whyNoRegion(name) {
-  if (!inControl()) return whyNoControl();
-  if (camera(name)?.passed) return AS_ENCODED;
+  const isOwn = camera(name)?.passed; // the page crops it: nothing is requested
+  if (!isOwn && !inControl()) return whyNoControl();
   const how = `${withKey("turn straightening off", "straighten")}, or type the numbers`;
   if (isStraight(name)) return `no ROI can be chosen on a straightened picture; ${how}`;
-  return mode() === "single" ? null : "the ROI is set in mode S; choose S to set it by hand";
+  return isOwn || mode() === "single" ? null : "the ROI is set in mode S; choose S to set it by hand";
 }
 
 /**
@@ -142,7 +169,8 @@ export function dragRegion(name, box, view) {
   refreshers.set(name, refresh);
 }
 
-listen("requests state straight", () => refreshers.forEach((refresh) => refresh()));
+listen("hello", onHello);
+listen("requests state straight crop", () => refreshers.forEach((refresh) => refresh()));
 
 /**
  * The region that was requested or decided but that the picture does not show yet.

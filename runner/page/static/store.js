@@ -24,6 +24,7 @@ let sampledAt = -Infinity; // page time of the last sample
  * @property {number} height px
  * @property {number} fps
  * @property {boolean} passed whether its pictures come as the camera encodes them
+ * @property {boolean} settable of these, whether its bitrate can be set in the camera
  * @property {number|null} wave_s length of a refresh wave, or time between key frames; null: unknown
  * @property {import("./projection.js").Pose|null} pose
  * @property {number} fov_deg

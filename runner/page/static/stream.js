@@ -98,7 +98,7 @@ export class Stream {
   async queuePicture(frame, meta) {
     const { decoder } = this.decoding;
     const size = { width: frame.displayWidth, height: frame.displayHeight };
-    const wide = this.isInBirdseye || this.straight ? Infinity : this.canvas.widthOnScreen(size);
+    const wide = this.isInBirdseye || this.straight ? Infinity : this.canvas.wholeOnScreen(size);
     const picture = await pictureOf(frame, wide).catch(() => null);
     if (!picture) return void this.decoding.counts.errors++;
     const isOld = meta.timestamp < (this.waiting?.meta.timestamp ?? 0);
@@ -302,7 +302,7 @@ export class Stream {
 
   /** The region in the canvas, of the image that the guides are made for; null: unknown. */
   drawnRegion() {
-    if (!this.straight) return this.region.ofSized(this.shown);
+    if (!this.straight) return this.region.ofSized(this.shown) && (this.canvas.crop ?? this.region.ofSized(this.shown));
     return this.region.of(this.shown) && this.shown?.image ? this.full : null;
   }
 

@@ -26,6 +26,8 @@ export class StreamCanvas {
   isFresh = true; // whether nothing was painted into the canvas yet
   isPictureResizeDue = false; // whether the canvas keeps an old size for now
   display = { width: 0, height: 0, ratio: 1, view: WHOLE };
+  /** @type {import("./framing.js").Rectangle|null} */
+  crop = null; // the part of the full image that is shown, chosen on this page alone; null: all of it
   /** @type {string|null} */
   painted_text = ""; // text in the canvas, "" for the plain picture; null: to be painted again
 
@@ -54,6 +56,21 @@ export class StreamCanvas {
     return this.isPictureResizeDue || Boolean(this.guides?.isResizeDue);
   }
 
+  /** Show a part of the pictures only. @param {import("./framing.js").Rectangle|null} region px of the full image; null: all */
+  setCrop(region) {
+    this.crop = region;
+    this.painted_text = null; // painted again at the next tick
+  }
+
+  /** The crop in px of a picture as it is painted; null: all of it. @param {import("./picture.js").Picture} picture */
+  cropOf({ painted: { width, height } }) {
+    if (!this.crop) return null;
+    const [across, down] = [width / this.camera.width, height / this.camera.height];
+    const px = (value, least, most) => Math.max(least, Math.min(Math.round(value), most));
+    const [x, y] = [px(this.crop.x * across, 0, width - 1), px(this.crop.y * down, 0, height - 1)];
+    return { x, y, width: px(this.crop.width * across, 1, width - x), height: px(this.crop.height * down, 1, height - y) };
+  }
+
   setStraight(on) {
     this.guides?.setOptics(on ? straightOptics(this.camera) : this.camera);
   }
@@ -62,8 +79,9 @@ export class StreamCanvas {
   paint({ shown, isStraight, status, text, note, steered }) {
     const { canvas, context } = this;
     if (!canvas || !context) return false;
-    this.resize(canvas, shown, isStraight, STALLED.includes(status));
-    if (shown && !["off", "refused", "unsupported"].includes(status)) paintPicture(context, shown, isStraight);
+    const crop = shown && !isStraight ? this.cropOf(shown.picture) : null;
+    this.resize(canvas, shown, crop, isStraight, STALLED.includes(status));
+    if (shown && !["off", "refused", "unsupported"].includes(status)) paintPicture(context, shown, crop, isStraight);
     else blank(context);
     this.guides?.draw(steered && { ...steered, picture: canvas, display: this.display });
     if (isStraight && shown?.image && !this.camera.calibrated && !this.guides?.shown) this.labelEstimate(context, canvas);
@@ -102,10 +120,10 @@ export class StreamCanvas {
    * The canvas has the picture's size. For a lasting alarm it is an integer multiple of it, close to the size on the
    * screen, so that words are sharp while the aspect ratio, and with it the page's layout, stays the same.
    */
-  resize(canvas, shown, isStraight, sharp) {
+  resize(canvas, shown, crop, isStraight, sharp) {
     const { width: wide, height: high, ratio } = this.display;
     const box = { width: Math.round(wide * ratio) || 480, height: Math.round(high * ratio) || 270 };
-    const own = isStraight ? (shown?.image ?? this.straightSize()) : (shown?.picture.painted ?? box);
+    const own = isStraight ? (shown?.image ?? this.straightSize()) : (crop ?? shown?.picture.painted ?? box);
     const times = sharp ? Math.min(6, Math.max(1, Math.ceil(this.widthOnScreen(own) / own.width))) : 1;
     const size = { width: own.width * times, height: own.height * times };
     if (this.isFresh) Object.assign(canvas, size); // nothing is shown yet
@@ -120,10 +138,15 @@ export class StreamCanvas {
     return { width: wide, height: Math.round((wide * height) / width) };
   }
 
-  /** Width of a picture on the screen, including cropped parts, in px of the screen; 0: not known yet. */
+  /** Width of what is painted on the screen, including cropped parts, in px of the screen; 0: not known yet. */
   widthOnScreen(picture) {
     const { ratio, view } = this.display;
     return placement(this.display, picture, view).width * ratio;
+  }
+
+  /** The same of a whole picture, of which a part may be painted. */
+  wholeOnScreen(picture) {
+    return this.crop ? (this.widthOnScreen(this.crop) * this.camera.width) / this.crop.width : this.widthOnScreen(picture);
   }
 
   /** The part of the canvas that is on the screen. */
@@ -136,10 +159,13 @@ export class StreamCanvas {
 
 const textOf = (...texts) => texts.filter(Boolean).join("\n");
 
-/** @param {OffscreenCanvasRenderingContext2D} context  @param {import("./stream.js").Shown} shown  @param {boolean} isStraight */
-function paintPicture(context, { picture, image = null }, isStraight) {
+/**
+ * @param {OffscreenCanvasRenderingContext2D} context  @param {import("./stream.js").Shown} shown
+ * @param {import("./framing.js").Rectangle|null} crop of the picture, px  @param {boolean} isStraight
+ */
+function paintPicture(context, { picture, image = null }, crop, isStraight) {
   const { width, height } = context.canvas;
-  if (!isStraight) picture.paint(context, width, height);
+  if (!isStraight) picture.paint(context, width, height, crop);
   else if (image) paintImage(context, image, width, height);
   else blank(context);
 }

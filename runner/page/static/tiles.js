@@ -3,7 +3,7 @@
 import { alertStatus, camera, decisionOf, enlarge, inControl, listen, publish, select, store, whyUndecided } from "./store.js";
 import { drawFirst, reportSize, showGuides, transferCanvases } from "./link.js";
 import { pending, request, whyNoControl } from "./requests.js";
-import { dragRegion, isPart, shownRegion } from "./roi.js";
+import { dragRegion, isCropped, isPart, shownRegion } from "./roi.js";
 import { RegionFrame, showsPart } from "./region_frame.js";
 import { zoomRegion } from "./zoom.js";
 import { bandsOf, boxesOf, gridOf, heightsOf, narrowBands, spreadBands } from "./layout.js";
@@ -270,9 +270,11 @@ function refreshFraming(name, { measured, shown, view, frame }) {
   setText(shown, [framing, straight, partText(name)].filter(Boolean).join(", "));
 }
 
-/** That a camera sends a part of its image only, and how to end that. @param {string} name */
+/** That a camera sends, or this page shows, a part of its image only, and how to end that. @param {string} name */
 function partText(name) {
   const [info, now] = [camera(name), decisionOf(name)];
+  const seen = isCropped(name) && shownRegion(name);
+  if (info && seen) return withKey(`${percent(shareOf(seen, info))} of its image shown, by this page`, "full_image");
   return info && now && isPart(name) ? withKey(`only ${percent(shareOf(now.roi, info))} of its image sent`, "full_image") : "";
 }
 
@@ -341,7 +343,7 @@ function refreshCaption(name, { rates, form, reason }) {
   const region = differs.includes("size") || differs.includes("ROI");
   const kbps = [sample?.kbps, now?.kbps, now?.demand_kbps].map(whole).join(`${THIN}/${THIN}`);
   const repair = sample?.buffer_ms ? `; the jitter buffer waits up to ${sample.buffer_ms} ms for retransmissions` : "";
-  const part = now && isPart(name) ? ` of ${percent(shareOf(now.roi, camera(name) ?? now.roi))} of the image` : "";
+  const part = now && isPart(name) && !isCropped(name) ? ` of ${percent(shareOf(now.roi, camera(name) ?? now.roi))} of the image` : "";
   const shape = `${size(sample?.width, sample?.height)} · ×${factor(now?.scaling)}${part}`;
   const of = now?.slow_fps && !isSilent ? ` of ${whole(camera(name)?.fps)}` : "";
   const rated = `pictures a second · ${KBPS}: received / allocated / demanded`;
@@ -405,7 +407,7 @@ function speakAll() {
 export function startTiles() {
   listen("hello", build);
   listen("layout", () => draft || groupTiles());
-  listen("state sample requests control socket theme selected straight", refreshAll);
+  listen("state sample requests control socket theme selected straight crop", refreshAll);
   listen("status", onStatus);
   listen("view birdseye", groupTiles);
   listen("selected", moveFocus);

@@ -314,6 +314,7 @@ const orders = {
     straight = names;
     applyStraight();
   },
+  crop: ({ name, region }) => find(name)?.canvas.setCrop(region),
   ground: ({ picture, lines }) => ground.attach(picture, lines),
   above: ({ shown, width, height, ratio }) => ground.show({ shown, width, height, ratio }),
   size: ({ name, ...display }) => find(name)?.setDisplay(display),

@@ -34,7 +34,7 @@ export function zoomRegion(name, box, view) {
   const size = () => boxSize(box);
   const positionOf = ({ clientX, clientY }) => ({ x: clientX - box.getBoundingClientRect().x, y: clientY - box.getBoundingClientRect().y });
 
-  /** The region requested or in force; null: it may not be changed. */
+  /** The region requested, shown or in force; null: it may not be changed. */
   function current() {
     const why = shownRegion(name) ? whyNoRegion(name) : null;
     if (why && performance.now() - hinted > HINT_EVERY_MS) {
