@@ -8,10 +8,10 @@ import subprocess
 
 import numpy as np
 import pytest
+from told_camera import told_camera
 
 from browser import all_live, measure, opened, shot, until
 from rig import answers, free_port, needs_browser, process
-from told_camera import told_camera
 
 pytestmark = [pytest.mark.gst, needs_browser]
 image = pytest.importorskip("PIL.Image")
