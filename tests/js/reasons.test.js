@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-import { limitWords, percent, reasonWords, regionWords, setterWords, sizeWords } from "../../runner/page/static/reasons.js";
+import { cropWords, limitWords, percent, reasonWords, regionWords, setterWords, sizeWords } from "../../runner/page/static/reasons.js";
 import { rate } from "../../runner/page/static/format.js";
 
 const FULL = { width: 1920, height: 1040 };
@@ -26,6 +26,11 @@ test("every bitrate has the same unit", () => {
   assert.deepEqual([12_345.6, 0.4, null].map((kbps) => rate(kbps)), ["12346 kbit/s", "0 kbit/s", "– kbit/s"]);
 });
 
+test("a region of one page costs nothing", () => {
+  const words = "This page alone shows 25 % of the image, which is sent and recorded whole. Full image (f) ends this.";
+  assert.equal(cropWords({ x: 0, y: 0, width: 960, height: 520 }, FULL, "Full image (f)"), words);
+});
+
 test("a part of the image is never none of it", () => assert.deepEqual([0.25, 0.001].map(percent), ["25 %", "less than 1 %"]));
 
 const SHARE = "Half size: 1181 of 6000 kbit/s, its share of the 6500";
@@ -45,6 +50,14 @@ const TABLE = [
   [
     { kbps: 900, demand_kbps: 900, scaling: 1, reason: "900 of 900 kbit/s, as the camera encodes it" }, {},
     "Full size: 900 of 900 kbit/s, as the camera encodes it.",
+  ],
+  [
+    { kbps: 1800, demand_kbps: 1800, scaling: 1, reason: "1800 of 1800 kbit/s, as the camera encodes it, more than its b_full of 1500" }, {},
+    "Full size: 1800 of 1800 kbit/s, as the camera encodes it, more than its b_full of 1500.",
+  ],
+  [
+    { kbps: 900, demand_kbps: 4000, scaling: 1, reason: "900 of 4000 kbit/s, as the camera is asked to encode it, but it sends 2100" }, {},
+    "Full size: 900 of 4000 kbit/s, its share of the 6500 predicted, but it sends 2100 kbit/s.",
   ],
   [{ kbps: 6000, scaling: 1 }, {}, "Full size: 6000 of 6000 kbit/s, all that it can use."],
   [{ kbps: 7000 }, { mode: "single" }, "Half size: 7000 of 7000 kbit/s."],
