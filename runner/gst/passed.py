@@ -25,6 +25,7 @@ class PassedStream:
     def __init__(self, pad: Gst.Pad, camera: Camera, on_report: Callable[[str], None]) -> None:
         self._pad, self._camera, self._on_report = pad, camera, on_report
         self._caps: Gst.Caps | None = None  # those reported
+        self._is_odd = False  # whether something of these was reported
         self._left, self._newest = LOOKED_AT, 0
         self._order = BufferProbe(pad, self._on_picture)
         self._order.arm()
@@ -35,8 +36,12 @@ class PassedStream:
         if caps is None or (self._caps is not None and caps.is_equal(self._caps)):
             return
         self._caps = caps
-        for what in self._unexpected(structure(caps)):
+        found = list(self._unexpected(structure(caps)))
+        for what in found:
             self._on_report(what)
+        if self._is_odd and not found:
+            self._on_report(f"sends what is expected again: {_described(structure(caps))}")
+        self._is_odd = bool(found)
 
     def _unexpected(self, form: Gst.Structure) -> Iterator[str]:
         camera, sent = self._camera, tuple(form.get_int(key)[1] for key in ("width", "height"))
@@ -56,3 +61,8 @@ class PassedStream:
             return True
         self._newest = picture.pts or self._newest
         return self._left <= 0
+
+
+def _described(form: Gst.Structure) -> str:
+    sizes, profile = [form.get_int(key)[1] for key in ("width", "height")], form.get_string("profile")
+    return f"{sizes[0]}x{sizes[1]}" + (f", profile {profile}" if profile else "")

@@ -18,25 +18,31 @@ image = pytest.importorskip("PIL.Image")
 
 # Eight bars of colours, which a picture's place tells.
 CAMERA = (
-    "videotestsrc is-live=true pattern=smpte75 ! video/x-raw,format=I420,width=640,height=360,framerate=10/1"
+    "videotestsrc is-live=true pattern=smpte75 ! videoscale"
+    " ! capsfilter name=size caps=video/x-raw,format=I420,width=640,height=360,framerate=10/1"
     " ! x264enc name=encoder tune=zerolatency speed-preset=ultrafast bitrate=1000 key-int-max=10"
     " ! rtph264pay name=pay0 pt=96"
 )
 
 
 @pytest.fixture(scope="module")
-def address():
+def camera():
+    with told_camera(CAMERA) as camera:
+        yield camera
+
+
+@pytest.fixture(scope="module")
+def address(camera):
     """Of the page of a demo with this camera."""
     port = free_port()
-    with told_camera(CAMERA) as camera:
-        ports = [f"{key}={free_port()}" for key in ("media.port", "control.port")]
-        words = [f"camera={camera.rtsp}", "graph=pass_through", "fps_max=10", "duration_s=600", f"page.port={port}"]
-        sizes = ["cameras.camera.width_px=640", "cameras.camera.height_px=360"]
-        with process("demo", *words, *sizes, *ports, stdout=subprocess.DEVNULL) as child:
-            until(lambda: answers(port) or child.poll() is not None, seconds=120)
-            yield f"http://127.0.0.1:{port}/"
-            child.terminate()
-            child.wait(timeout=15)
+    ports = [f"{key}={free_port()}" for key in ("media.port", "control.port")]
+    words = [f"camera={camera.rtsp}", "graph=pass_through", "fps_max=10", "duration_s=600", f"page.port={port}"]
+    sizes = ["cameras.camera.width_px=640", "cameras.camera.height_px=360"]
+    with process("demo", *words, *sizes, *ports, stdout=subprocess.DEVNULL) as child:
+        until(lambda: answers(port) or child.poll() is not None, seconds=120)
+        yield f"http://127.0.0.1:{port}/"
+        child.terminate()
+        child.wait(timeout=15)
 
 
 @pytest.fixture
@@ -86,3 +92,14 @@ def test_the_page_alone_shows_a_region(page):
     page.locator("[data-control=roi-full]").click()
     until(lambda: shows(page, WHITE, BLUE))
     assert "by this page" not in shown.inner_text()
+
+
+def test_a_camera_that_changes_its_size_stays_live(page, camera):
+    camera.tell("size", "caps", "video/x-raw,format=I420,width=320,height=180,framerate=10/1")
+    until(lambda: measure(page)["camera"]["width"] == 320)
+    drawn = measure(page)["camera"]["drawn"]
+    until(lambda: measure(page)["camera"]["drawn"] > drawn + 20)
+    all_live(page)
+    camera.tell("size", "caps", "video/x-raw,format=I420,width=640,height=360,framerate=10/1")
+    until(lambda: measure(page)["camera"]["width"] == 640)
+    all_live(page)

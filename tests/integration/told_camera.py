@@ -54,9 +54,8 @@ def told_camera(media: str, *, feedback: bool = False) -> Iterator[ToldCamera]:
 
 def main() -> None:
     """Serve until killed."""
+    from runner.gst import GLib, Gst  # isort: skip (names the versions)
     from gi.repository import GstRtsp, GstRtspServer
-
-    from runner.gst import GLib, Gst
 
     rtsp, http, media, feedback = sys.argv[1:]
     server, factory = GstRtspServer.RTSPServer(), GstRtspServer.RTSPMediaFactory()
