@@ -18,7 +18,7 @@ image = pytest.importorskip("PIL.Image")
 
 # Eight bars of colours, which a picture's place tells.
 CAMERA = (
-    "videotestsrc is-live=true pattern=smpte75 ! videoscale"
+    "videotestsrc name=pattern is-live=true pattern=smpte75 ! videoscale"
     " ! capsfilter name=size caps=video/x-raw,format=I420,width=640,height=360,framerate=10/1"
     " ! x264enc name=encoder tune=zerolatency speed-preset=ultrafast bitrate=1000 key-int-max=10"
     " ! rtph264pay name=pay0 pt=96"
@@ -37,7 +37,11 @@ def address(camera):
     port = free_port()
     ports = [f"{key}={free_port()}" for key in ("media.port", "control.port")]
     words = [f"camera={camera.rtsp}", "graph=pass_through", "fps_max=10", "duration_s=600", f"page.port={port}"]
-    sizes = ["cameras.camera.width_px=640", "cameras.camera.height_px=360"]
+    sizes = [
+        "cameras.camera.width_px=640",
+        "cameras.camera.height_px=360",
+        "cameras.camera.rate_quality.b_full_kbps=600",
+    ]
     with process("demo", *words, *sizes, *ports, stdout=subprocess.DEVNULL) as child:
         until(lambda: answers(port) or child.poll() is not None, seconds=120)
         yield f"http://127.0.0.1:{port}/"
@@ -103,3 +107,15 @@ def test_a_camera_that_changes_its_size_stays_live(page, camera):
     camera.tell("size", "caps", "video/x-raw,format=I420,width=640,height=360,framerate=10/1")
     until(lambda: measure(page)["camera"]["width"] == 640)
     all_live(page)
+
+
+def test_one_that_sends_more_than_is_stated_is_named_and_costs_what_it_sends(page, camera):
+    def decided():
+        return page.evaluate("tod.state")["cameras"]["camera"]
+
+    camera.tell("pattern", "pattern", "snow")
+    until(lambda: "as the camera encodes it, more than its b_full of 600" in decided()["reason"])
+    until(lambda: 800 < decided()["kbps"] < 1500)
+    camera.tell("pattern", "pattern", "smpte75")
+    until(lambda: decided()["kbps"] < 500)
+    assert "more than" not in decided()["reason"]

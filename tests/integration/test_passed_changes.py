@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import time
 from contextlib import contextmanager
 
+import inside
 import pytest
 from told_camera import told_camera
 
@@ -63,3 +65,44 @@ def test_another_profile_is_said_and_decoded_where_that_is_possible():
         until(lambda: any("sends what is expected again: 320x240, profile" in line for line in reported))
         seen = len(client.sizes)
         until(lambda: len(client.sizes) > seen + 20)
+
+
+LONG = (  # ten seconds between key pictures
+    "videotestsrc is-live=true pattern=snow ! video/x-raw,format=I420,width=320,height=240,framerate=25/1"
+    " ! x264enc name=encoder tune=zerolatency speed-preset=ultrafast bitrate=1000 key-int-max=250"
+    " option-string=scenecut=0 ! rtph264pay pt=96"
+    ' ! capssetter name=pay0 caps="application/x-rtp,rtcp-fb-nack-pli=(boolean){feedback}"'
+)
+
+
+@pytest.mark.parametrize("feedback", [True, False])
+def test_a_damaged_picture_is_marked_until_a_key_picture_which_is_asked_for(feedback, monkeypatch):
+    """One that takes requests (RTP profile AVPF) sends it at once; another's next one may be ten seconds away."""
+    from runner.apply import OperatorSide
+
+    due = []  # a packet to lose
+    inside.losing(
+        monkeypatch, "rtpjitterbuffer", "sink", lambda packet: packet.get_size() > 200 and bool(due and due.pop())
+    )
+    units = []
+    media = LONG.format(feedback=str(feedback).lower())
+    with (
+        told_camera(media, feedback=feedback) as camera,
+        passing(camera, "graph.retransmission_ms=0") as (side, plan, _),
+    ):
+        operator = OperatorSide([plan], lambda *_: None, lambda _, unit: units.append(unit.damaged))
+        try:
+            until(lambda: units and not units[-1])
+            asked = camera.key_pictures_asked
+            due.append(True)
+            until(lambda: units[-1])
+            began = len(units)
+            while units[-1]:
+                side.send_key_frames(["rear"])  # as the vehicle does while an operator reports damage
+                time.sleep(0.5)
+            healed = units.index(False, began)
+        finally:
+            operator.stop()
+        assert not any(units[healed:])
+        assert (camera.key_pictures_asked > asked) == feedback
+        assert (healed - began < 100) == feedback  # of 250 pictures from one to the next
