@@ -53,6 +53,7 @@ from runner.system.camera_control import CameraControls
 if TYPE_CHECKING:
     from runner.gst.clip_writer import write_clip
     from runner.gst.encoded_again import read_again
+    from runner.gst.first_look import first_look
     from runner.gst.lanes import run_lanes
     from runner.gst.parameter_sets import parameter_set_notes
     from runner.gst.pictures import decode_video
@@ -89,6 +90,7 @@ __all__ = [
     "check_vehicle",
     "decode_video",
     "discover",
+    "first_look",
     "parameter_set_notes",
     "read_again",
     "read_video",
@@ -104,6 +106,7 @@ SELDOM = {  # by name, its module
     "SoundReception": "sound_receiver",
     "decode_video": "pictures",
     "discover": "sequence",
+    "first_look": "first_look",
     "parameter_set_notes": "parameter_sets",
     "read_again": "encoded_again",
     "read_video": "video_reader",
@@ -284,8 +287,7 @@ class VehicleSide:
         pipeline, refusal = self._pipeline(name), self._refusal(name)
         if pipeline is None:
             return CameraReading(fault=refusal, lost=lost, copies=copies, refused=refused)
-        fault, untimed, slow_fps = pipeline.source_fault or refusal, pipeline.untimed, pipeline.slow_fps
-        rest = fault, lost, untimed, slow_fps, copies, refused
+        rest = pipeline.source_fault or refusal, lost, pipeline.untimed, pipeline.slow_fps, copies, refused
         return CameraReading(self._controls.applied(name, dict(pipeline.knobs.applied)), pipeline.counters(), *rest)
 
     def _on_found(self, name: str) -> None:
@@ -328,8 +330,7 @@ class VehicleSide:
         if follow_cameras(pipeline, plan, login.accept):
             login.follow(bus)
         end = pipeline.get_by_name(plan.source[-1].name).get_static_pad("src")
-        decoders = DecoderWatch(pipeline, end, self._left_out[plan.camera.name], report)
-        decoders.follow(bus)
+        DecoderWatch(pipeline, end, self._left_out[plan.camera.name], report).follow(bus)
 
     def _refusal(self, camera: str) -> str | None:
         """Why a camera must not be asked now: it refuses the login, and would lock the vehicle out."""
@@ -416,7 +417,6 @@ class OperatorSide:
             plan.camera.name: Receiver(plan, reports, on_unit, on_picture, arrivals, video, operator, login(), uplinks)
             for plan in plans
         }
-
         self._running: Mapping[str, Receiver] = {}  # replaced as a whole: other threads read it
         self._sound: SoundReceiver | None = None
         self._hears = False  # whether it is received

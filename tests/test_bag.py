@@ -568,7 +568,7 @@ def test_print_shows_a_stand_in_and_says_so(tod, bag):
 
 
 def test_a_bag_must_be_named_to_print_but_not_to_validate(tod):
-    rule = "conf/source/bag.yaml: bag: null: must be given, by source.bag= for all, or for each mounted camera as bag"
+    rule = "conf/source/bag.yaml: bag: null: must be given: source.bag=, or bag of each mounted camera"
     assert tod("print", *ROBOT).problems == [rule]
     assert tod("validate", *ROBOT).status == 0
 

@@ -652,7 +652,7 @@ def test_ports_of_two_cameras_with_graphs_of_their_own(conf: UserConf, tod: Comm
     [
         (
             ["source=file"],
-            ["conf/source/file.yaml: clip: null: must be given, by source.clip= for all, or for each mounted camera as clip"],
+            ["conf/source/file.yaml: clip: null: must be given: source.clip=, or clip of each mounted camera"],
         ),
         (["source=file", "source.clip=/no.mp4"], ["command line: source.clip: '/no.mp4': no such file"]),
         (["source=file", "source.clip=/dev/zero"], ["command line: source.clip: '/dev/zero': must be a file"]),
@@ -662,7 +662,7 @@ def test_ports_of_two_cameras_with_graphs_of_their_own(conf: UserConf, tod: Comm
         ),
         (
             ["source=rtsp"],
-            ["conf/source/rtsp.yaml: address: null: must be given, by source.address= for all, or for each mounted camera as address"],
+            ["conf/source/rtsp.yaml: address: null: must be given: source.address=, or address of each mounted camera"],
         ),
     ],
 )

@@ -134,7 +134,9 @@ def test_a_rate_below_the_cameras_is_reported_once():
 
 
 def test_a_camera_needs_a_topic():
-    with pytest.raises(ConfigError, match="topic: null: must be given, by source.topic= for all, or for each mounted camera as topic"):
+    with pytest.raises(
+        ConfigError, match=r"topic: null: must be given: source\.topic=, or topic of each mounted camera"
+    ):
         configuration([*WORDS, *TOPICS[:2]]).vehicle()
 
 

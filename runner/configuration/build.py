@@ -312,7 +312,7 @@ class Builder:
         for key in () if source.render else sorted(needs):
             given = camera.mount.get(key, source.settings.get(key))
             if given is None:
-                rule = f"must be given, by source.{key}= for all, or for each mounted camera as {key}"
+                rule = f"must be given: source.{key}=, or {key} of each mounted camera"
                 self._report_input(camera, ModelError(key, "null", rule))
             elif key == "address" and (broken := address_rule(str(given))):
                 self._report_input(camera, ModelError(key, repr(redacted(given)), broken))

@@ -31,7 +31,7 @@ from pathlib import Path
 from typing import Any
 
 from runner.configuration.config import configuration
-from runner.core.model import Camera, Vehicle
+from runner.core.model import Vehicle
 from runner.errors import ArgumentError, MissingBindings, RunError, UserError, reason, suggest
 from runner.graph import Plan
 from runner.inputs import input_problem
@@ -146,7 +146,7 @@ def examine(verb: str, setup: Setup, document: Mapping[str, Any]) -> Iterator[Di
     if verb in ("vehicle", "demo", "record"):
         yield from _devices(vehicle)
         yield from _connected()
-        yield from _ip_cameras(vehicle)
+        yield from _ip_cameras(setup)
     if verb in ("vehicle", "demo"):
         if not (document.get("link") or {}).get("lanes"):  # they make the devices of the uplinks
             yield from check_uplinks(setup.uplinks, setup.control.host)
@@ -312,14 +312,14 @@ def _connected() -> Iterator[Diagnosis]:
         yield Diagnosis(True, f"V4L2 cameras: {found}; `tod-runner doctor {CAMERAS}` lists them, with their YAML")
 
 
-def _ip_cameras(vehicle: Vehicle) -> Iterator[Diagnosis]:
+def _ip_cameras(setup: Setup) -> Iterator[Diagnosis]:
     """What the IP cameras offer, without a login."""
     with ThreadPoolExecutor() as pool:
-        cameras = (camera for camera in vehicle.cameras.values() if camera.address)
-        yield from pool.map(_ip_camera, cameras)
+        yield from pool.map(_ip_camera, (plan for plan in compile_plans(setup) if plan.camera.address))
 
 
-def _ip_camera(camera: Camera) -> Diagnosis:
+def _ip_camera(plan: Plan) -> Diagnosis:
+    camera = plan.camera
     name, video = f"camera {camera.name}: {camera.address}", camera.source.medium + 1
     try:
         found = describe(str(camera.address), camera.source.first_reply_s)
@@ -334,8 +334,20 @@ def _ip_camera(camera: Camera) -> Diagnosis:
     if found.status != OK:
         return Diagnosis(False, f"{name}: answers DESCRIBE with status {found.status}")
     what = f"{name} offers {found.video} video media"
-    fits = video <= found.video
-    return Diagnosis(fits, what if fits else f"{what}, counted from 0: source.medium is {camera.source.medium}")
+    if video > found.video:
+        return Diagnosis(False, f"{what}, counted from 0: source.medium is {camera.source.medium}")
+    return _passed_on(plan, name) if camera.graph.passes else Diagnosis(True, what)
+
+
+def _passed_on(plan: Plan, name: str) -> Diagnosis:
+    """What is wrong with the pictures of a camera that are passed on."""
+    try:
+        from runner.apply import first_look
+    except MissingBindings:
+        return Diagnosis(True, f"{name}: its pictures are not looked at without GStreamer")
+    count, wrong = first_look(plan, plan.camera.source.first_reply_s)
+    what = f"{name}: {count} pictures looked at"
+    return Diagnosis(bool(count) and not wrong, f"{what}: {'; '.join(wrong)}" if wrong else what)
 
 
 def _cores(vehicle: Vehicle) -> Diagnosis:

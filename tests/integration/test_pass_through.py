@@ -95,6 +95,16 @@ def test_what_viewers_will_have_trouble_with_is_said(sent, said):
         until(lambda: any(said in line for line in reported))
 
 
+def test_doctor_looks_at_the_first_pictures(tod):
+    robot = ("vehicle=delivery_robot", "+source@cameras.rear.source=rtsp", "+graph@cameras.rear.graph=pass_through")
+    with ip_camera(free_port(), media=media(B_FRAMES)) as (address, _):
+        result = tod("doctor", "vehicle", *robot, f"+cameras.rear.address={address}")
+    line = next(line for line in result.out.splitlines() if "camera rear" in line)
+    assert line.startswith(f"MISSING camera rear: {address}: ")
+    assert "sends B-frames: its pictures come late and out of order; switch them off in the camera" in line
+    assert "sends 320x240, but width_px and height_px say 848x480" in line
+
+
 @pytest.mark.parametrize(
     "sent, found",
     [

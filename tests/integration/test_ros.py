@@ -611,4 +611,4 @@ def test_a_node_of_another_machine_that_knows_the_address_is_not_connected(ros2,
 def test_a_camera_without_a_topic(ros):
     status, lines = refused(ros, "~cameras.rear.topic")
     assert status == 2
-    assert lines[0].endswith("topic: null: must be given, by source.topic= for all, or for each mounted camera as topic")
+    assert lines[0].endswith("topic: null: must be given: source.topic=, or topic of each mounted camera")
