@@ -11,6 +11,7 @@ from runner.gst.caps import structure
 from runner.gst.probes import BufferProbe, PassingBuffer
 
 LOOKED_AT = 60  # pictures in which B-frames are looked for: encoders that use them do so in every group
+IN_PIECES = 10  # of these without a time: more than parameter sets that come for themselves
 # What browsers decode everywhere; ITU-T H.264, A.2. Of H.265, whether they decode it at all differs.
 PLAYED = ("constrained-baseline", "baseline", "main", "high", "progressive-high", "constrained-high")
 
@@ -26,7 +27,7 @@ class PassedStream:
         self._pad, self._camera, self._on_report = pad, camera, on_report
         self._caps: Gst.Caps | None = None  # those reported
         self._is_odd = False  # whether something of these was reported
-        self._left, self._newest = LOOKED_AT, 0
+        self._left, self._newest, self._untimed = LOOKED_AT, 0, 0
         self._order = BufferProbe(pad, self._on_picture)
         self._order.arm()
 
@@ -56,6 +57,10 @@ class PassedStream:
     def _on_picture(self, _pad: Gst.Pad, picture: PassingBuffer) -> bool:
         """From a streaming thread."""
         self._left -= 1
+        self._untimed += picture.pts is None  # the time is that of the last piece, or of the only one
+        if self._untimed > IN_PIECES:
+            self._on_report("sends pictures in pieces, as if each were one: set one slice a picture in the camera")
+            return True
         if picture.pts is not None and picture.pts < self._newest:
             self._on_report("sends B-frames: its pictures come late and out of order; switch them off in the camera")
             return True

@@ -38,6 +38,8 @@ class Habits:
     shift         seconds by which the RTP time of a picture is wrong, from the picture's number and the connection's
     ntp_shift     seconds by which its wall clock is wrong, from the seconds since the start; None: no sender reports
     marks         whether the last packet of a picture has the marker bit
+    marks_each    whether the last packet of each NAL unit has it
+    aggregates    how the payloader puts several NAL units into a packet
     """
 
     description: tuple[str, ...] = ("v=0", "o=- 1 1 IN IP4 127.0.0.1", "s=camera", "t=0 0", "a=control:*", *VIDEO)
@@ -51,6 +53,8 @@ class Habits:
     shift: Callable[[int, int], float] = lambda _picture, _connection: 0.0
     ntp_shift: Callable[[float], float] | None = lambda _seconds: 0.0
     marks: bool = True
+    marks_each: bool = False
+    aggregates: str = "none"
 
 
 class OddCamera:
@@ -184,7 +188,7 @@ class _Connection:
     # --- the stream ---------------------------------------------------------------------------------------------------
 
     def _stream(self) -> None:
-        for picture, packets in enumerate(_pictures(self._habits.encoder, self._ended)):
+        for picture, packets in enumerate(_pictures(self._habits, self._ended)):
             if not self._playing.is_set():
                 continue
             with suppress(OSError):
@@ -195,7 +199,8 @@ class _Connection:
 
     def _send_packet(self, packet: bytes, picture: int, packets: list[bytes]) -> None:
         shifted = _time(packet) + round(90000 * self._habits.shift(picture, self._number))
-        second = packet[1] & 0x7F | (0x80 if self._habits.marks and packet is packets[-1] else 0)
+        is_last = packet is packets[-1] or (self._habits.marks_each and _ends_unit(packet))
+        second = packet[1] & 0x7F | (0x80 if self._habits.marks and is_last else 0)
         assert self._send
         self._send(packet[:1] + bytes([second]) + packet[2:4] + struct.pack(">I", shifted % 2**32) + packet[8:])
 
@@ -222,13 +227,20 @@ def _time(packet: bytes) -> int:
     return int.from_bytes(packet[4:8], "big")
 
 
-def _pictures(encoder: str, ended: threading.Event) -> Iterator[list[bytes]]:
+def _ends_unit(packet: bytes) -> bool:
+    """Whether a NAL unit ends with it (RFC 6184, section 5.8)."""
+    fragment, end = 28, 0x40
+    return packet[12] & 0x1F != fragment or bool(packet[13] & end)
+
+
+def _pictures(habits: Habits, ended: threading.Event) -> Iterator[list[bytes]]:
     """The RTP packets of each picture."""
     from runner.gst import Gst
 
     size = f"video/x-raw,format=I420,width=320,height=240,framerate={FPS}/1"
-    payloader = "rtph264pay config-interval=-1 pt=96 mtu=1200 aggregate-mode=none"
-    line = f"videotestsrc is-live=true pattern=ball ! {size} ! {encoder} ! {payloader} ! appsink name=sink sync=false"
+    payloader = f"rtph264pay config-interval=-1 pt=96 mtu=1200 aggregate-mode={habits.aggregates}"
+    packets_of = f"{size} ! {habits.encoder} ! {payloader}"
+    line = f"videotestsrc is-live=true pattern=ball ! {packets_of} ! appsink name=sink sync=false"
     pipeline: Any = Gst.parse_launch(line)
     sink = pipeline.get_by_name("sink")
     pipeline.set_state(Gst.State.PLAYING)

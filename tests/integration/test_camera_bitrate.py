@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from types import SimpleNamespace
 
 import pytest
+from odd_camera import Habits, odd_camera
 from told_camera import told_camera
 
 from rig import faults, streaming, until, watching
@@ -62,8 +66,45 @@ def test_pictures_go_on_while_it_fails():
         with passing(camera, command) as (side, plan, reported), watching(plan) as client:
             until(lambda: len(client.sizes) > 20)
             ask(side, 400)
-            until(lambda: any("its bitrate cannot be set: curl: status 52: curl: (52)" in line for line in reported))
+            until(lambda: any("its bitrate cannot be set: curl: status 22: curl: (22)" in line for line in reported))
             seen = len(client.sizes)
             until(lambda: len(client.sizes) > seen + 20)
             assert "bitrate" not in side.read()["rear"].applied
             assert faults(reported)[0] == "rear: pipeline built"
+
+
+def test_a_camera_whose_stream_ends_with_each_change_comes_back():
+    with odd_camera(Habits()) as camera, told_to(camera.drop) as address:
+        words = (f'source.address="{camera.address}"', "fps_max=15")
+        with passing(SimpleNamespace(rtsp=camera.address), f'[curl, -fsS, "{address}/{{kbps}}"]', *words) as parts:
+            side, plan, reported = parts
+            with watching(plan) as client:
+                until(lambda: client.frames_with_retry() > 10)
+                ask(side, 400)
+                until(lambda: any("works again" in line for line in reported))
+                seen = len(client.sizes)
+                until(lambda: len(client.sizes) > seen + 20)
+                assert side.read()["rear"].applied["bitrate"] == 400
+
+
+@contextmanager
+def told_to(do):
+    """An HTTP server that does something at each request. Yields its address."""
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self):
+            do()
+            self.send_response(200)
+            self.send_header("Content-Length", "0")
+            self.end_headers()
+
+        def log_message(self, *_):
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}"
+    finally:
+        server.shutdown()
+        server.server_close()

@@ -80,13 +80,13 @@ def main() -> None:
 
     class Settings(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
-            if self.path == "/asked":
-                text = str(asked[0])
-            else:
+            text, status = str(asked[0]), 200
+            if self.path != "/asked":
                 name, key, value = urllib.request.unquote(self.path)[1:].split("/", 2)
-                Gst.util_set_object_arg(elements[name], key, value)
-                text = "set"
-            self.send_response(200)
+                text, status = ("set", 200) if name in elements else ("no such element", 404)
+                if status == 200:
+                    Gst.util_set_object_arg(elements[name], key, value)
+            self.send_response(status)
             self.send_header("Content-Length", str(len(text)))
             self.end_headers()
             self.wfile.write(text.encode())
