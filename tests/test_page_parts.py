@@ -30,6 +30,7 @@ import aiohttp
 from runner.configuration.layout import NOWHERE, Layouts
 from runner.core.events import Attention
 from runner.core.roles import Role
+from runner.operator.seen import StatedView
 from runner.operator.station import LinkState
 from runner.page.access import LOGIN_POLICY, POLICY, Access, hosts
 from runner.page.control import GRACE_S, Control, combined_attention, page_of
@@ -75,7 +76,7 @@ def served(*overrides, layouts=None, login=None, keyring=None, note=print):
     """
     port = free_port()
     told = {"identity": "anna", "answer_s": 1.0, "attention": None, "link_state": LinkState()}
-    station = SimpleNamespace(state=None, note=note, **told)
+    station = SimpleNamespace(state=None, note=note, seen=StatedView(), **told)
     with pytest.MonkeyPatch.context() as patch:
         if login:
             patch.setattr("runner.page.front.Access", lambda _none, *rest: Access(login, *rest))
@@ -658,6 +659,67 @@ def test_the_driver_needs_the_pictures_of_every_window_and_the_focus_in_one_of_t
         await attention_becomes(station, "unfocused")
         await page.close()
         await attention_becomes(station, "absent")
+
+    in_windows(steps)
+
+
+SEEN = {"x": 0, "y": 0, "width": 480, "height": 200, "screen_width": 240, "screen_height": 100}
+
+
+async def view_becomes(station, wanted):
+    for _ in range(600):
+        view = {name: (seen.width, seen.screen_width) for name, seen in station.seen.view.items()}
+        if view == wanted:
+            return
+        await asyncio.sleep(0.1)
+    pytest.fail(f"view: {view}, not {wanted}")
+
+
+def test_what_is_seen_is_what_the_windows_of_the_page_in_control_show_while_somebody_watches():
+    async def steps(windows, station):
+        names = list(setup().vehicle.cameras)
+        nothing = dict.fromkeys(SEEN, 0)
+        page = await windows.open("driver", "here")
+        await received(page, "control", holder="you")
+        monitor = await windows.open("m", "here", show="rear_center")
+        stranger = await windows.open("s", "there")
+
+        async def state(small=SEEN):
+            """Of two cameras, the page shows one, the monitor the other."""
+            await page.send_json({"view": {name: small if name == "front_center" else nothing for name in names}})
+            await monitor.send_json({"view": {"rear_center": {**SEEN, "screen_width": 480}}})
+            await stranger.send_json({"view": {"front_center": nothing}})
+
+        await state()
+        await received(page, "control")
+        assert station.seen.view == {}  # nobody is known to watch
+        await page.send_json({"attention": "watching", "focused": True})
+        await monitor.send_json({"attention": "unfocused"})
+        both = {name: {"front_center": (480, 240), "rear_center": (480, 480)}.get(name, (0, 0)) for name in names}
+        await state()
+        await view_becomes(station, both)
+        await page.send_json({"view": {name: {**nothing, "x": -1} for name in names}})  # refused: it sees everything
+        reply = await received(page, "reply")
+        assert (reply["result"], reply["reason"]) == (
+            "refused",
+            f"view: {names[0]}: x: must be an integer from 0 to 65535",
+        )
+        await view_becomes(station, {})
+        await state()
+        await view_becomes(station, both)
+        await monitor.send_json({"attention": "hidden"})
+        await view_becomes(station, {})
+        await monitor.send_json({"attention": "watching", "focused": True})
+        await state()
+        await view_becomes(station, both)
+        await monitor.close()
+        await view_becomes(station, {**both, "rear_center": (0, 0)})
+        await stranger.send_json({"take_control": True})
+        await view_becomes(station, {})  # it has not stated whether anybody watches
+        await stranger.send_json({"attention": "watching", "focused": True})
+        await stranger.send_json({"view": {"front_center": nothing}})
+        await view_becomes(station, {"front_center": (0, 0)})
+        await view_becomes(station, {})  # it has stated nothing for two seconds
 
     in_windows(steps)
 

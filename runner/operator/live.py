@@ -23,6 +23,7 @@ from msgspec import UNSET
 from runner.configuration import agreement
 from runner.configuration.config import configuration
 from runner.core.evidence import REPORT_S
+from runner.core.view import View
 from runner.drive.log import Log
 from runner.errors import RunError
 from runner.metrics.side import SideMetrics
@@ -140,6 +141,15 @@ class LiveOperator:
         with self._following:
             self._demand.ask(cameras, is_open=is_open, now=time.monotonic())
         self._follow(self._demand)
+
+    def see(self, view: View | None, for_s: float = inf) -> None:
+        """State to the vehicle what this program shows, or uses, of each camera; from any thread.
+
+        view   by camera, the region of its full image and the size at which it is used; NOWHERE: nothing of it. Cameras
+               that are not named are used in full. None: nothing is stated any more, as without a call
+        for_s  how long it holds at most, s; then all is used in full
+        """
+        self.station.seen.state(view, for_s)
 
     def _follow(self, demand: Demand) -> None:
         with self._following:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from msgspec import UNSET
+from msgspec import UNSET, UnsetType
 
+from runner.core.view import View
 from runner.operator.latency import Latency
 from runner.operator.packet_count import PacketCount
 from runner.records.reception import Arrivals, ReceptionReport, UnitReceived
@@ -21,10 +22,13 @@ class ReceptionReports:
         self._packets = PacketCount()
         self._delay_s: float | None = None  # of the first access unit: reported delays are relative to it
 
-    def make(self, arrivals: Arrivals, now: float, as_of: float | None) -> ReceptionReport | None:
+    def make(
+        self, arrivals: Arrivals, now: float, as_of: float | None, view: View | UnsetType = UNSET
+    ) -> ReceptionReport | None:
         """The next report.
 
         as_of  the vehicle's time; None: it cannot be reached, so that there is no report of these arrivals
+        view   what this process shows of the cameras, if it is due
         """
         self._latency.add_newest(arrivals.newest, now)
         frames = [(name, frame) for name, some in arrivals.frames.items() for frame in some]
@@ -51,5 +55,6 @@ class ReceptionReports:
             sent=UNSET if sent is None else sent,
             run=self._run,
             uplink=self._uplink or UNSET,
+            view=view,
             offset_s=round(base, 4) if received else UNSET,
         )

@@ -36,6 +36,7 @@ from runner.operator.meter import MeasuredRates, ReceptionMeter
 from runner.operator.notes import Refusals, change_notes, driver_words
 from runner.operator.reception import ReceptionReports
 from runner.operator.requests import OnReply, Requests
+from runner.operator.seen import StatedView
 from runner.operator.sound import sound_sample, sound_words
 from runner.operator.uplinks import UplinkRow, uplink_rows
 from runner.records import combined, to_json
@@ -158,6 +159,7 @@ class Station:
         self.state: VehicleState | None = None  # None: the vehicle is offline
         self._published: VehicleState | None = None  # the last state that the vehicle published
         self.attention: Attention | None = None  # of the driver, as the page detects it
+        self.seen = StatedView()  # of the cameras
         self._presence = Presence.DRIVING
         self.telemetry: Telemetry | None = None
         self.addresses: Mapping[str, tuple[str, ...]] = {}  # that the vehicle sends from, by uplink, as it last said
@@ -311,8 +313,9 @@ class Station:
             return
         now = time.monotonic()
         as_of = self._requests.vehicle_now(now) if self._may_reach_vehicle() else None
+        view = UNSET if as_of is None else self.seen.report(now)
         for uplink, reports in self._reports.items():
-            if report := reports.make(arrivals.get(uplink, NOTHING_ARRIVED), now, as_of):
+            if report := reports.make(arrivals.get(uplink, NOTHING_ARRIVED), now, as_of, view):
                 self.link.publish(self._to_report, to_json(report), behind=True)  # its arrivals are in no other report
 
     def rows(self) -> list[CameraRow]:

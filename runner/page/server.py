@@ -32,6 +32,7 @@ from runner.page.layouts import Answer, PageLayouts
 from runner.page.loop import PageLoop
 from runner.page.summaries import Summaries
 from runner.page.viewer import PageViewer
+from runner.page.views import PageViews
 from runner.page.windows import Windows
 from runner.records import to_json
 from runner.records.lines import Note
@@ -101,6 +102,7 @@ class PageServer(Listener):
             state_attention,
             lambda shown, is_open: on_shown([names[index] for index in shown], is_open),
         )
+        self._views = PageViews(list(vehicle.cameras.values()), self._windows, station.seen)
         self._layouts = layouts or Layouts()
         self._page_layouts = PageLayouts(
             vehicle, self._layouts, self._call_soon, lambda stated: self._windows.broadcast("layout", stated)
@@ -158,6 +160,7 @@ class PageServer(Listener):
     # --- in the page's thread -----------------------------------------------------------------------------------------
 
     async def _start(self) -> None:
+        self._expiring = asyncio.create_task(self._views.expire())
         app = self._front.application(self._front.connections.grant_all if self._socket else None)
         app.router.add_get("/live", self._on_viewer)
         if self._socket:
@@ -235,6 +238,7 @@ class PageServer(Listener):
         finally:
             for task in tasks:
                 task.cancel()
+            self._views.forget(viewer)
             self._windows.closed(viewer)
 
     async def _listen(self, ws: web.WebSocketResponse, viewer: PageViewer, request: web.Request) -> None:
@@ -288,11 +292,11 @@ class PageServer(Listener):
             case {"attention": str(word)} if word in REPORTED:
                 viewer.attention, viewer.focused = Attention(word), document.get("focused") is True
                 self._windows.state_control()
-            case {"take_control": True} if viewer.monitor:
-                reason = "only a page can take control, not its monitors"
-                viewer.post("reply", {"id": document.get("id"), "result": "refused", "reason": reason})
+                self._views.state()
+            case {"view": _}:
+                self._views.take(viewer, document)
             case {"take_control": True}:
-                self._windows.take_control(viewer)
+                self._windows.take_control(viewer, document.get("id"))
             case _:
                 self._on_request(viewer, document)
 

@@ -63,9 +63,12 @@ class Windows:
         holder = self._control.holder_for(page_of(viewer, self._viewers, self._control))
         return "another" if holder == "you" and not viewer.visitor.may_drive else holder
 
-    def take_control(self, viewer: PageViewer) -> None:
+    def take_control(self, viewer: PageViewer, request_id: object) -> None:
+        if viewer.monitor:
+            reason = "only a page can take control, not its monitors"
+            return viewer.post("reply", {"id": request_id, "result": "refused", "reason": reason})
         self._control.take(viewer.token)
-        self.state_control()
+        return self.state_control()
 
     def select(self, viewer: PageViewer, camera: str) -> None:
         """Select a camera in all windows of a page."""
@@ -73,6 +76,17 @@ class Windows:
         for other in self._others(viewer):
             other.selected = camera
             other.post("selection", {"camera": camera})
+
+    def in_control(self) -> list[PageViewer]:
+        """The windows of the page in control."""
+        return [viewer for viewer in self._viewers if self.holder_for(viewer) == "you"]
+
+    @property
+    def attention(self) -> Attention | None:
+        """Whether the driver can see the pictures, from those windows; None: nothing is known."""
+        if driving := self.in_control():
+            return combined_attention([viewer.attention for viewer in driving])
+        return Attention.ABSENT if self._control.is_held else None
 
     def state_control(self) -> None:
         """Send each window the holder of control, and whether another window of its page has the focus or is hidden.
@@ -89,17 +103,11 @@ class Windows:
             abandoned = holder == "nobody" and self._control.is_held
             message = {"holder": holder, "abandoned": abandoned, "elsewhere": elsewhere, "covered": covered}
             viewer.post("control", message | ({"watching": watching} if viewer.visitor.may_drive else {}))
-        self._on_attention(self._attention())
+        self._on_attention(self.attention)
 
     def _state_shown(self) -> None:
         shown = {camera for viewer in self._viewers for camera in viewer.cameras}
         self._on_shown(shown, any(not viewer.monitor and viewer.visitor.may_drive for viewer in self._viewers))
-
-    def _attention(self) -> Attention | None:
-        driving = [viewer for viewer in self._viewers if self.holder_for(viewer) == "you"]
-        if driving:
-            return combined_attention([viewer.attention for viewer in driving])
-        return Attention.ABSENT if self._control.is_held else None
 
     def _others(self, viewer: PageViewer) -> list[PageViewer]:
         """The other windows of a viewer's page."""

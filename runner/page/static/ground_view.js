@@ -67,8 +67,9 @@ export class GroundView {
   setCameras(streams, dimensions) {
     this.session++;
     for (const layer of this.layers) layer.dispose();
-    const nothing = { layers: [], sights: [], shared_regions: "", drawn_labels: [], drawn: { picture: "", frames: "", lines: "" } };
-    Object.assign(this, { streams: dimensions ? streams : [], dimensions, ...nothing });
+    const nothing = { layers: [], sights: [], lattice: null, shared_regions: "", drawn_labels: [] };
+    const drawn = { picture: "", frames: "", lines: "" };
+    Object.assign(this, { streams: dimensions ? streams : [], dimensions, drawn, ...nothing });
     this.updateStreams();
   }
 
@@ -96,9 +97,14 @@ export class GroundView {
     return this.shown && this.streams.length > 0 && this.display.width > 0 && this.display.height > 0;
   }
 
+  /** Whether it is on the screen. */
+  isDrawing() {
+    return this.isOn() && this.canvas !== null && this.context !== null && !this.why;
+  }
+
   /** Draw what has changed: pictures or their status. */
   draw() {
-    if (!this.isOn() || !this.canvas || !this.context || this.why) return;
+    if (!this.isDrawing()) return;
     const seen = this.streams.map((stream) => stream.fromAbove());
     this.prepare();
     this.drawPictures(seen);

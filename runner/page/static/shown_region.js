@@ -14,13 +14,15 @@ export class ShownRegion {
   region_since = Infinity; // page time: pictures captured from this time on show the region
   size_since = Infinity;
 
-  /** @param {any} station see `Stream` */
-  constructor(station) {
+  /** @param {any} station see `Stream`  @param {import("./framing.js").Rectangle} full the image */
+  constructor(station, full) {
     this.station = station;
+    this.frame = full; // what is laid out on the screen, of which the pictures may show a part
   }
 
   /** The vehicle's decision. */
-  update({ roi, width, height, applied }) {
+  update({ roi, chosen = roi, width, height, applied }) {
+    this.frame = chosen;
     const { x, y, width: wide, height: high } = applied.roi ?? roi;
     const size = applied.size ?? { width, height };
     const isApplied = x === roi.x && y === roi.y && wide === roi.width && high === roi.height;

@@ -37,5 +37,5 @@ export function straightMesh(camera) {
   }));
   const points = lattice.map(sightline(optics)).map(projection({ ...camera, pose: optics.pose }));
   const shares = new Float32Array(points.length).fill(1);
-  return { places: lattice, points, shares, triangles: trianglesOf(COLUMNS + 1, rows + 1, points, shares) };
+  return { columns: COLUMNS + 1, places: lattice, points, shares, triangles: trianglesOf(COLUMNS + 1, rows + 1, points, shares) };
 }

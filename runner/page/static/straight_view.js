@@ -7,7 +7,8 @@ import { FILLS } from "./warp.js";
 export class StraightView {
   /** @param {any} camera as in hello */
   constructor(camera) {
-    const { places, points, shares, triangles } = straightMesh(camera);
+    const { columns, places, points, shares, triangles } = straightMesh(camera);
+    this.mesh = { columns, points };
     const { width, height } = camera;
     this.warp = new RemoteWarp(null);
     this.layer = this.warp.layer(places.map(({ x, y }) => ({ x, y: -y })), points);

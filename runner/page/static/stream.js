@@ -57,11 +57,11 @@ export class Stream {
       onRestart: () => this.live.onRestart(),
     });
     this.live = new Liveness(camera, station);
-    this.region = new ShownRegion(station);
+    this.full = { x: 0, y: 0, width: camera.width, height: camera.height };
+    this.region = new ShownRegion(station, this.full);
     this.canvas = new StreamCanvas(camera, station.dimensions);
     this.drawn = new DrawnPictures(camera, station);
     this.pace = new Pace(camera.fps);
-    this.full = { x: 0, y: 0, width: camera.width, height: camera.height };
   }
 
   get status() {

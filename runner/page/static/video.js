@@ -19,6 +19,7 @@ import { MOVING } from "./status.js";
 import { canStraighten } from "./straight.js";
 import { Stream } from "./stream.js";
 import { drawInTurn } from "./turns.js";
+import { WindowView } from "./window_view.js";
 // Used only by other modules, but imported here so that all modules are fetched in parallel.
 import "./beginning.js";
 import "./codec.js";
@@ -33,6 +34,7 @@ import "./pace.js";
 import "./playout.js";
 import "./projection.js";
 import "./overlay.js";
+import "./seen.js";
 import "./shown_region.js";
 import "./straight_view.js";
 import "./stream_canvas.js";
@@ -79,6 +81,7 @@ let first = null; // camera whose picture is drawn first, and with which sound k
 let straight = []; // cameras whose pictures are straightened
 const hearing = new Hearing(station.clock, (why) => console.warn(`the vehicle's sound: ${why}`));
 const ground = new GroundView(station.steering, (why) => toPage({ kind: "flat", why }));
+const seen = new WindowView(ground, send);
 let isAsleep = true; // no animation frame is requested
 let tickedAt = now();
 let wasLate = false; // at the last tick
@@ -140,6 +143,7 @@ function setConnected(open, ended = false) {
   if (station.connected === open) return;
   Object.assign(station, { connected: open, ended });
   reported = "";
+  seen.reset();
   if (!open) judgeAll();
   toPage({ kind: "socket", open, ended });
 }
@@ -237,6 +241,7 @@ function tick() {
   if (wasLate) return;
   checkConnection();
   judgeAll();
+  if (holder === "you" && station.connected && station.video) seen.state(streams, now()); // what others see does not count
 }
 
 function judgeAll() {
