@@ -288,7 +288,8 @@ class VehicleSide:
         if pipeline is None:
             return CameraReading(fault=refusal, lost=lost, copies=copies, refused=refused)
         rest = pipeline.source_fault or refusal, lost, pipeline.untimed, pipeline.slow_fps, copies, refused
-        return CameraReading(self._controls.applied(name, dict(pipeline.knobs.applied)), pipeline.counters(), *rest)
+        applied = self._controls.applied(name, dict(pipeline.knobs.applied))
+        return CameraReading(applied, pipeline.counters(), *rest, placed=pipeline.knobs.placed is not None)
 
     def _on_found(self, name: str) -> None:
         """From the thread that tries again. A viewer makes the server open its camera."""

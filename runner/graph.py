@@ -318,6 +318,11 @@ def video_codec(graph: Graph) -> str:
     return next((codec for codec in CODECS if any(codec in factory for factory in factories)), "")
 
 
+def places_pictures(graph: Graph) -> bool:
+    """Whether an encoded picture says which part of the full image it shows, see `runner.h264.region`."""
+    return graph.passes is None and "roi" in graph.knobs and video_codec(graph) == "h264"
+
+
 def may_lack_parameter_sets(plan: Plan) -> bool:
     """Whether key pictures after the first may lack parameter sets: unless a payloader repeats them at each."""
     codec = video_codec(plan.camera.graph)
@@ -335,12 +340,8 @@ def _quantities(camera: Camera, value: KnobValue, pace: float = 1.0) -> dict[str
     if isinstance(value, int):
         bps = round(1000 * value * pace)
         of_frames = _per_frame_rate(camera.graph.settings, camera.fps)
-        rate: dict[str, Value] = {
-            "kbps": max(1, round(bps / 1000)),
-            "bps": bps,
-            "controls": camera.capture.controls_text,
-        }
-        return {**rate, **of_frames, **_buffer(of_frames, value)}
+        rate: dict[str, Value] = {"kbps": max(1, round(bps / 1000)), "bps": bps}
+        return {**rate, "controls": camera.capture.controls_text, **of_frames, **_buffer(of_frames, value)}
     if isinstance(value, Roi):
         # The crop element sees the native picture; an ROI is relative to the full image inside it.
         native_width, native_height = camera.source_size

@@ -12,6 +12,7 @@ from runner.core.commands import KnobValue
 from runner.core.model import Camera, Value
 from runner.graph import Assignment, assignments, text
 from runner.gst.caps import structure
+from runner.gst.placed import PlacedPictures
 from runner.gst.probes import IdleProbe
 
 _PARSERS = {"GstCaps": Gst.Caps.from_string, "GstStructure": Gst.Structure.new_from_string}
@@ -42,6 +43,7 @@ class KnobPanel:
         self._pending: dict[str, KnobValue] = {}
         self.applied: dict[str, KnobValue] = {}
         self._pace = 1.0
+        self.placed: PlacedPictures | None = None  # is told of each turn, between two frames
         self._between_frames = IdleProbe(self._apply_pending)
 
     def set_now(self, values: Mapping[str, KnobValue]) -> None:
@@ -57,8 +59,9 @@ class KnobPanel:
             self._pending |= values
         requested = [each for knob, value in values.items() for each in self._assignments(knob, value)]
         changed = [each for each in requested if self._differs(each)] or requested[:1]
-        if is_only_change and len(changed) == 1:
-            # A single property needs no synchronisation: the encoder applies it from its next frame on.
+        if is_only_change and len(changed) == 1 and "roi" not in values:
+            # A single property needs no synchronisation: the encoder applies it from its next frame on. Of the region
+            # it must be known which frame that is.
             self._apply_pending()
             return
         names = {name for name, _, _ in changed}
@@ -106,6 +109,8 @@ class KnobPanel:
                     self.applied[knob] = value
                 for fault in faults:
                     self._on_report(fault)
+            if self.placed:
+                self.placed.on_turned(values)
         self._on_turned()
 
     def _assignments(self, knob: str, value: KnobValue) -> list[Assignment]:

@@ -15,6 +15,7 @@ from runner.gst.held_up import HeldUp
 from runner.gst.knobs import KnobPanel
 from runner.gst.lost import LostCameras
 from runner.gst.picture_rate import PictureRate
+from runner.gst.placed import PlacedPictures
 from runner.gst.probes import BufferProbe, PassingBuffer, TypeProbe
 from runner.gst.rate_limit import RateLimits
 from runner.gst.repeats import RepeatDetector
@@ -115,6 +116,7 @@ class CameraPipeline:
         self.sent_frames = SentFrames(payloader) if payloader else None
         if payloader:
             add_capture_time(payloader)
+        self.knobs.placed = PlacedPictures.of(pipeline, plan.camera, self._sent)
         self.knobs.set_now(self._allowed(self._first))
         self._held_up = HeldUp(last)
         self.requests = RequestLimit(last, on_report)

@@ -61,6 +61,10 @@ _Callback = CFUNCTYPE(c_int, c_void_p, POINTER(_ProbeInfo), c_void_p)
 _add_probe = _function("gst_pad_add_probe", c_ulong, c_void_p, c_uint, _Callback, c_void_p, c_void_p)
 _get_size = _function("gst_buffer_get_size", c_size_t, c_void_p)
 _extract = _function("gst_buffer_extract", c_size_t, c_void_p, c_size_t, c_char_p, c_size_t)
+_make_writable = _function("gst_mini_object_make_writable", c_void_p, c_void_p)
+_allocate = _function("gst_allocator_alloc", c_void_p, c_void_p, c_size_t, c_void_p)
+_replace = _function("gst_buffer_replace_memory_range", None, c_void_p, c_uint, c_int, c_void_p)
+_fill = _function("gst_buffer_fill", c_size_t, c_void_p, c_size_t, c_char_p, c_size_t)
 _get_reference = _function("gst_buffer_get_reference_timestamp_meta", POINTER(_ReferenceTimestamp), c_void_p, c_void_p)
 _get_structure = _function("gst_event_get_structure", c_void_p, c_void_p)
 _get_name = _function("gst_structure_get_name", c_char_p, c_void_p)
@@ -139,6 +143,10 @@ class _Probe(ABC):
     def add_to(self, pad: Gst.Pad) -> None:
         _add_probe(int(_pointer(pad.__gpointer__, None)), self._kinds, _on_probe, self._key, None)
 
+    def pass_on(self, info: Any) -> Gst.PadProbeReturn:
+        """Called with the `_ProbeInfo` of what passes."""
+        return self.handle(info.contents.data)
+
     @abstractmethod
     def handle(self, address: int | None) -> Gst.PadProbeReturn:
         """Called with the address of what passes; None while nothing does."""
@@ -192,6 +200,32 @@ class PassProbe(_Probe):
         if passes is None:
             return Gst.PadProbeReturn.REMOVE
         return Gst.PadProbeReturn.OK if passes(self._pad, PassingBuffer(address)) else Gst.PadProbeReturn.DROP
+
+
+class RewritingProbe(_Probe):
+    """Asks a method of its owner, which it does not keep alive, what to pass on in place of the content of a buffer.
+
+    rewritten  called in the streaming thread with the pad and each buffer; None: it passes as it is
+    """
+
+    def __init__(self, pad: Gst.Pad, rewritten: Callable[[Gst.Pad, PassingBuffer], bytes | None]) -> None:
+        super().__init__(Gst.PadProbeType.BUFFER)
+        self._pad, self._rewritten = pad, WeakMethod(rewritten)
+        self.add_to(pad)
+
+    def pass_on(self, info: Any) -> Gst.PadProbeReturn:
+        rewritten, passing = self._rewritten(), info.contents
+        if rewritten is None:
+            return Gst.PadProbeReturn.REMOVE
+        data = rewritten(self._pad, PassingBuffer(passing.data))
+        if data is not None:
+            passing.data = _make_writable(passing.data)
+            _replace(passing.data, 0, -1, _allocate(None, len(data), None))
+            _fill(passing.data, 0, data, len(data))
+        return Gst.PadProbeReturn.OK
+
+    def handle(self, address: int | None) -> Gst.PadProbeReturn:
+        raise NotImplementedError
 
 
 class IdleProbe(_Probe):
@@ -282,7 +316,7 @@ def _dispatch(_pad: int, info: Any, key: int) -> int:
     if probe is None:
         return int(Gst.PadProbeReturn.REMOVE)
     try:
-        return int(probe.handle(info.contents.data))
+        return int(probe.pass_on(info))
     except Exception:
         traceback.print_exc()
         return int(probe.on_fault)

@@ -8,7 +8,9 @@ from itertools import pairwise
 from math import inf
 from typing import NamedTuple
 
+from runner.core.model import Roi
 from runner.h264.keyframe import grey_idr
+from runner.h264.region import MOST_BYTES, region_of
 from runner.h264.sps import SPS, Bits
 
 SLICE, IDR, SEI = 1, 5, 6  # NAL unit types (ITU-T H.264, table 7-1)
@@ -32,6 +34,7 @@ class AccessUnit(NamedTuple):
     exact     False: the decoded picture still shows content that was never sent
     damaged   whether the decoded picture still shows earlier packet loss
     whole     False: a decoder that starts late shows an older picture in part, see `RecentUnits`
+    region    what it shows of the camera's full image, as it states itself; None: all, or it does not state it
     """
 
     data: bytes
@@ -42,6 +45,7 @@ class AccessUnit(NamedTuple):
     exact: bool = True
     damaged: bool = False
     whole: bool = True
+    region: Roi | None = None
 
 
 def read_unit(
@@ -58,16 +62,17 @@ def read_unit(
     """
     if codec == "h265":
         return None if damaged else _read_h265(data, captured, arrived)
-    recovery = None
+    recovery, region = None, None
     for header, at in nal_units(data):
         kind = header & 0x1F
         if kind == IDR and damaged:
             grey = grey_idr(data)
-            return AccessUnit(grey, captured, arrived, key=True, exact=False) if grey else None
+            return AccessUnit(grey, captured, arrived, key=True, exact=False, region=region) if grey else None
         if SLICE <= kind <= IDR:
-            return None if damaged else AccessUnit(data, captured, arrived, kind == IDR, recovery)
+            return None if damaged else AccessUnit(data, captured, arrived, kind == IDR, recovery, region=region)
         if kind == SEI:
             recovery = _recovery(data[at : at + 16]) if recovery is None else recovery
+            region = region_of(data[at : at + MOST_BYTES]) or region
     return None
 
 

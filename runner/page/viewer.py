@@ -18,6 +18,8 @@ from runner.page.login import OPERATOR, Visitor
 HEADER = struct.Struct("<BBHIdd")  # camera, flags, 0, sequence, captured ms, arrived ms (since 1970)
 KEY, CATCH_UP, RESTART = 1, 2, 4  # flags: a decoder can start here; decode but do not draw; reset the decoder first
 DAMAGED = 8  # flag: the picture shows that packets were lost
+REGION = struct.Struct("<HHHH")  # of the full image that the picture shows: x, y, width, height, px
+PLACED = 16  # flag: a region follows the header
 MAX_UNITS = 30  # queued for one camera; a viewer that is further behind gets a burst in their place
 MAX_TEXTS = 500
 SOUND = 255  # in place of a camera's index
@@ -136,7 +138,10 @@ class PageViewer:
     def _pack(self, camera: int, flags: int, unit: AccessUnit) -> bytes:
         self._sequence = (self._sequence + 1) % 2**32
         flags |= (KEY if unit.key else 0) | (0 if unit.exact else CATCH_UP) | (DAMAGED if unit.damaged else 0)
-        return HEADER.pack(camera, flags, 0, self._sequence, _ms(unit.captured), _ms(unit.arrived)) + unit.data
+        region = unit.region and REGION.pack(unit.region.x, unit.region.y, unit.region.width, unit.region.height)
+        flags |= PLACED if region else 0
+        head = HEADER.pack(camera, flags, 0, self._sequence, _ms(unit.captured), _ms(unit.arrived))
+        return head + (region or b"") + unit.data
 
 
 @dataclass

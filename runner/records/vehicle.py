@@ -22,7 +22,7 @@ from runner.core.events import (
     Steering,
 )
 from runner.core.limits import Count, Limits, NonNegative, Share
-from runner.core.model import Mode
+from runner.core.model import Mode, Roi
 from runner.records import Amount, Clock, Json, Number, Time, to_json
 from runner.records.decisions import Applied, CameraDecision, UplinkDecisions, applied_to_json, decided
 from runner.records.reception import UplinkSent
@@ -51,6 +51,13 @@ class CameraState(CameraDecision):
 
     weight: Annotated[Amount, "in the allocation"]
     applied: Applied
+    chosen: Annotated[
+        Roi | UnsetType, "the operator's region of interest, if `roi` is another; absent: it is the same"
+    ] = UNSET
+    placed: Annotated[
+        bool | UnsetType,
+        "true: each of its pictures that shows less than the full image says which part; absent: they do not say",
+    ] = UNSET
     fault: Annotated[str | None, "None: none known"] = None
     untimed: Annotated[
         bool | UnsetType, "true: its source provides no capture times, so latency is unknown; absent otherwise"
@@ -63,11 +70,21 @@ class CameraState(CameraDecision):
     ] = UNSET
 
     @classmethod
-    def at(cls, setting: Setting, weight: Number, camera: str, reading: CameraReading) -> CameraState:
+    def at(
+        cls,
+        setting: Setting,
+        weight: Number,
+        camera: str,
+        reading: CameraReading,
+        chosen: Roi | None = None,
+    ) -> CameraState:
+        """chosen: the operator's region of interest; None: the one that is decided."""
         return cls(
             **decided(setting),
             weight=weight,
             applied=applied_to_json(camera, reading.applied),
+            chosen=UNSET if chosen in (None, setting.roi) else chosen,
+            placed=reading.placed or UNSET,
             fault=reading.fault or reading.lost,
             untimed=reading.untimed or UNSET,
             slow_fps=reading.slow_fps or UNSET,
@@ -282,6 +299,7 @@ class CameraReading(NamedTuple):
     slow_fps       the rate of its pictures, Hz, if that has been well below its own for a while; else None
     copies         viewers outside the vehicle: each is sent a copy of the stream
     refused        by operator whose receiver is refused, why
+    placed         whether each picture that shows less than the full image says which part
     """
 
     applied: KnobValues = NOTHING
@@ -292,6 +310,7 @@ class CameraReading(NamedTuple):
     slow_fps: int | None = None
     copies: int = 0
     refused: Mapping[str, str] = NOTHING
+    placed: bool = False
 
 
 class SoundReading(NamedTuple):

@@ -157,7 +157,9 @@ def vehicle_state(run: Run, cameras: Mapping[str, CameraReading], t: float, caus
     """The state as the vehicle publishes it."""
     decision, since = run.decision, run.state.attention_since
     states = {
-        name: CameraState.at(decision.settings[name], plain(run.state.weights[name]), name, camera)
+        name: CameraState.at(
+            decision.settings[name], plain(run.state.weights[name]), name, camera, run.state.rois[name]
+        )
         for name, camera in cameras.items()
     }
     return VehicleState(

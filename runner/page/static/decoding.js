@@ -7,6 +7,7 @@ export const KEY = 1;
 export const CATCH_UP = 2;
 export const RESTART = 4;
 export const DAMAGED = 8;
+export const PLACED = 16; // the unit states its region
 
 const QUEUE = 40; // units waiting in the decoder: beyond this, restarting from a burst is faster
 const LAG_MS = 2000; // extra delay: as long as the burst that would replace it
@@ -19,7 +20,11 @@ const NO_VIDEO = "This browser has no WebCodecs.";
 /** @type {VideoColorSpaceInit} */
 const BT709 = { primaries: "bt709", transfer: "bt709", matrix: "bt709", fullRange: false };
 
-/** @typedef {{flags: number, sequence: number, captured: number, arrived: number, data: Uint8Array}} Unit */
+/**
+ * @typedef {{flags: number, sequence: number, captured: number, arrived: number, data: Uint8Array, region: Rectangle|null}} Unit
+ * region: what it shows of the full image, if it says so itself
+ * @typedef {import("./framing.js").Rectangle} Rectangle
+ */
 
 /**
  * @typedef {object} Viewer who shows the pictures

@@ -132,7 +132,7 @@ export class GroundView {
     const frames = JSON.stringify(seen.map(({ newest }) => newest?.meta.timestamp ?? null));
     if (warp.isBusy || (picture === drawn.picture && (frames === drawn.frames || !warp.isDue))) return;
     Object.assign(drawn, { picture, frames });
-    this.share(seen.map(({ region }) => region));
+    this.share(seen.map((each) => each.frame));
     const { px_per_m } = groundPlacement(size, dimensions);
     const { extent } = groundOf(dimensions);
     const middle = { x: -(extent.left + extent.right) / 2, y: (extent.front + extent.rear) / 2 };

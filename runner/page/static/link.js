@@ -115,9 +115,9 @@ export const showCrop = (name, region) => worker.postMessage({ order: "crop", na
 /** @param {string[]} names of the cameras whose pictures are straightened */
 export const showStraight = (names) => worker.postMessage({ order: "straight", names });
 
-/** Report the size of a picture's box on the screen, in CSS pixels, and how the picture is placed in it. */
-export const reportSize = (name, { clientWidth: width, clientHeight: height }, view) =>
-  worker.postMessage({ order: "size", name, width, height, ratio: devicePixelRatio, view });
+/** Report the size of a picture's box on the screen, in CSS pixels, how the picture is placed in it, and whether it is covered. */
+export const reportSize = (name, { clientWidth: width, clientHeight: height }, view, covered) =>
+  worker.postMessage({ order: "size", name, width, height, ratio: devicePixelRatio, view, covered });
 
 /** Ask the worker; for tests and benchmarks. */
 export function ask(what, name) {

@@ -26,6 +26,21 @@ export function drawOverlay(context, area, mirrored, status, text, css) {
   readably(context, area, mirrored, () => drawStatus(context, area, status, text, css));
 }
 
+/** Fill a canvas with what stands for a part of the image that was not sent: no picture looks like it. */
+export function drawUnsent(context, width, height) {
+  const step = Math.max(8, Math.round(Math.min(width, height) / 12));
+  context.fillStyle = "#1d242b";
+  context.fillRect(0, 0, width, height);
+  context.strokeStyle = "#46525e";
+  context.lineWidth = step / 6;
+  context.beginPath();
+  for (let x = step - height; x < width; x += step) {
+    context.moveTo(x, height);
+    context.lineTo(x + height, 0);
+  }
+  context.stroke();
+}
+
 /**
  * Draw with the origin in an area's corner so that it reads correctly on the screen.
  * @param {OffscreenCanvasRenderingContext2D} context

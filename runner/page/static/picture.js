@@ -24,10 +24,9 @@ class FramePicture {
     this.painted = { width: this.width, height: this.height };
   }
 
-  /** Fill a canvas of this size. @param {import("./framing.js").Rectangle|null} crop the part to be shown, px; null: all */
-  paint(context, width, height, crop = null) {
-    const { x, y, width: wide, height: high } = crop ?? { x: 0, y: 0, ...this.painted };
-    context.drawImage(this.frame, x, y, wide, high, 0, 0, width, height);
+  /** @param {import("./framing.js").Rectangle} place in the canvas */
+  paint(context, place) {
+    context.drawImage(this.frame, place.x, place.y, place.width, place.height);
   }
 
   /** Upload to the bound texture. @param {WebGL2RenderingContext} gl */
@@ -79,13 +78,9 @@ class PlanePicture {
     return image;
   }
 
-  /**
-   * As above.
-   * @param {import("./framing.js").Rectangle|null} crop px of the image, which may be smaller than the picture
-   */
-  paint(context, width, height, crop = null) {
-    const image = this.pixels();
-    paintImage(context, crop ? cut(image, crop) : image, width, height);
+  /** @param {import("./framing.js").Rectangle} place in the canvas */
+  paint(context, place) {
+    paintImage(context, this.pixels(), place);
   }
 
   /** Upload to the bound texture. @param {WebGL2RenderingContext} gl */
@@ -125,21 +120,14 @@ function memoryFor(width, height, size) {
   return found < 0 ? { bytes: new Uint8Array(size), image: new ImageData(width, height) } : spare.splice(found, 1)[0];
 }
 
-/** A part of an image. @param {ImageData} image  @param {import("./framing.js").Rectangle} part px */
-function cut({ data, width: wide }, { x, y, width, height }) {
-  const found = new ImageData(width, height);
-  for (let row = 0; row < height; row++) {
-    const from = 4 * ((y + row) * wide + x);
-    found.data.set(data.subarray(from, from + 4 * width), 4 * row * width);
-  }
-  return found;
-}
-
-/** Fill a canvas of this size with an image. @param {ImageData|ImageBitmap} image */
-export function paintImage(context, image, width, height) {
-  if (image instanceof ImageBitmap) return context.drawImage(image, 0, 0, width, height);
+/** Paint an image into a place of a canvas. @param {ImageData|ImageBitmap} image  @param {import("./framing.js").Rectangle} place */
+export function paintImage(context, image, place) {
+  const { x, y, width, height } = place;
+  if (image instanceof ImageBitmap) return context.drawImage(image, x, y, width, height);
+  const [wide, high] = [width, height].map((length) => Math.max(1, Math.round(length)));
   // Scaled here, since a second canvas would wait for the page's main thread, as drawImage(VideoFrame) does.
-  context.putImageData(width === image.width && height === image.height ? image : scaled(image, new ImageData(width, height)), 0, 0);
+  const fitting = wide === image.width && high === image.height ? image : scaled(image, new ImageData(wide, high));
+  context.putImageData(fitting, Math.round(x), Math.round(y));
 }
 
 /**

@@ -37,6 +37,10 @@ export interface CameraState {
   weight: number;
   /** by knob, the value read back; empty for a camera without a pipeline */
   applied: Record<string, any>;
+  /** the operator's region of interest, if `roi` is another; absent: it is the same */
+  chosen?: Roi;
+  /** true: each of its pictures that shows less than the full image says which part; absent: they do not say */
+  placed?: boolean;
   /** null: none known */
   fault: string | null;
   /** true: its source provides no capture times, so latency is unknown; absent otherwise */

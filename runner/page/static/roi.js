@@ -16,12 +16,20 @@ const refreshers = new Map(); // by camera: shows the pending region
 const crops = new Map(); // by camera that is sent as it encodes: the part that this page shows, where that is not all
 let croppedOf = ""; // vehicle of these cameras
 
-/** The region that the picture shows: as read back, otherwise as decided; of one that only this page crops, as chosen. */
+/**
+ * The region that is laid out on the screen: of a camera that only this page crops, as chosen here. If pictures say what they
+ * show, it is the one that the operator has chosen, in which each has its place; otherwise they fill the box, and it is
+ * theirs: as read back, or else as decided.
+ */
 export const shownRegion = (name) => {
   const now = decisionOf(name);
-  if (now && camera(name)?.passed) return crops.get(name) ?? fullRegion(name);
-  return now?.applied.roi ?? now?.roi ?? null;
+  if (!now) return null;
+  if (camera(name)?.passed) return crops.get(name) ?? fullRegion(name);
+  return now.chosen ?? (now.placed ? now.roi : (now.applied.roi ?? now.roi));
 };
+
+/** The region that the operator has chosen: of it, no more may be sent than is seen. */
+export const chosenRegion = (name) => decisionOf(name)?.chosen ?? decisionOf(name)?.roi;
 
 /** Whether a camera's region is this page's own: the camera sends its whole picture, whatever is chosen. */
 export const isCropped = (name) => crops.has(name);
@@ -91,7 +99,7 @@ export function fullRegion(name) {
 /** Whether a camera is to send, or may still send, a part of its image only; or this page shows a part only. */
 export function isPart(name) {
   if (isCropped(name)) return true;
-  const [full, decided] = [fullRegion(name), decisionOf(name)?.roi];
+  const [full, decided] = [fullRegion(name), chosenRegion(name)];
   return [decided, pendingRegion(name)].some((region) => region && !sameRegion(region, full));
 }
 
@@ -180,5 +188,5 @@ export function pendingRegion(name) {
   const requested = pending(`roi:${name}`)?.event;
   if (requested) return { x: requested.x, y: requested.y, width: requested.width, height: requested.height };
   const now = decisionOf(name);
-  return now?.applied.roi && !sameRegion(now.applied.roi, now.roi) ? now.roi : null;
+  return now?.applied.roi && !now.chosen && !sameRegion(now.applied.roi, now.roi) ? now.roi : null;
 }

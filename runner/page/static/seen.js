@@ -90,8 +90,8 @@ function seenThrough({ columns, points }, isUsed, steps, frame) {
     if (i % columns === columns - 1 || !isUsed(i)) continue;
     const [a, b, c, d] = cornersOf(i, columns).map((corner) => points[corner]);
     for (const point of [a, b, c, d]) if (point) widen(box, point);
-    for (const [from, to, step] of /** @type {const} */ ([[a, b, steps.across], [c, d, steps.across], [a, c, steps.down], [b, d, steps.down]]))
-      magnify(from, to, step);
+    for (const [from, to] of [[a, b], [c, d]]) magnify(from, to, steps.across);
+    for (const [from, to] of [[a, c], [b, d]]) magnify(from, to, steps.down);
   }
   const [left, right] = [Math.max(frame.x, box.left), Math.min(frame.x + frame.width, box.right)];
   const [top, bottom] = [Math.max(frame.y, box.top), Math.min(frame.y + frame.height, box.bottom)];
@@ -105,7 +105,10 @@ function widen(box, { x, y }) {
   Object.assign(box, { top: Math.min(box.top, y), bottom: Math.max(box.bottom, y) });
 }
 
-/** @param {Rectangle} part  @param {number} scale px of the screen for each px of the image  @returns {Seen} in whole px, with all of the part */
+/**
+ * In whole px, with all of a part.
+ * @param {Rectangle} part  @param {number} scale px of the screen for each px of the image  @returns {Seen}
+ */
 function seen({ x, y, width, height }, scale) {
   if (!(width > 0 && height > 0 && scale > 0)) return NOWHERE;
   const [left, top] = [Math.floor(x + NOISE), Math.floor(y + NOISE)];

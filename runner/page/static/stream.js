@@ -6,13 +6,15 @@ import { described, DrawnPictures } from "./drawn_pictures.js";
 import { Liveness } from "./liveness.js";
 import { Pace } from "./pace.js";
 import { pictureOf } from "./picture.js";
-import { ShownRegion } from "./shown_region.js";
+import { seenInBox } from "./seen.js";
+import { sameRegion, ShownRegion } from "./shown_region.js";
 import { frozenAfter, STALLED } from "./status.js";
 import { StraightView } from "./straight_view.js";
 import { StreamCanvas } from "./stream_canvas.js";
 import { FILLS } from "./warp.js";
 
 const NEW_REGION = "NEW REGION"; // while it is unknown which part of the image a picture shows
+const NOT_SENT = "PART NOT SENT"; // of what the screen shows of the image
 
 /** @typedef {import("./picture.js").Picture} Picture */
 /**
@@ -77,7 +79,9 @@ export class Stream {
   /** The vehicle's decision about this camera; undefined: the vehicle does not have it. */
   onDecision(decision) {
     if (this.live.onDecision(decision)) this.resetTimes();
+    const { frame } = this.region;
     if (decision) this.region.update(decision);
+    if (this.region.stated(this.shown) && !sameRegion(frame, this.region.frame)) this.canvas.painted_text = null; // laid out anew
   }
 
   /** @param {import("./decoding.js").Unit} unit from the station */
@@ -98,7 +102,7 @@ export class Stream {
   async queuePicture(frame, meta) {
     const { decoder } = this.decoding;
     const size = { width: frame.displayWidth, height: frame.displayHeight };
-    const wide = this.isInBirdseye || this.straight ? Infinity : this.canvas.wholeOnScreen(size);
+    const wide = this.isInBirdseye || this.straight ? Infinity : widthOnScreen(this, size, meta);
     const picture = await pictureOf(frame, wide).catch(() => null);
     if (!picture) return void this.decoding.counts.errors++;
     const isOld = meta.timestamp < (this.waiting?.meta.timestamp ?? 0);
@@ -190,7 +194,8 @@ export class Stream {
     const fill = picture ? FILLS.picture : STALLED.includes(status) ? FILLS.alarm : FILLS.none;
     const { captured = NaN } = (picture && shown?.meta) ?? {};
     const label = this.overlayText(now()) || (this.live.isNew ? this.live.noteText() : region ? "" : NEW_REGION);
-    return { picture, fill, captured, newest: shown, region: this.region.region ?? this.full, status, label };
+    const frame = this.region.stated(shown) ? this.region.frame : (this.region.region ?? this.full);
+    return { picture, fill, captured, newest: shown, region: region ?? frame, frame, status, label };
   }
 
   /** Whether the bird's-eye view alone shows the picture. */
@@ -269,7 +274,7 @@ export class Stream {
     const time = now();
     this.live.judge(this.drawing(), time);
     this.live.noteWaiting(time);
-    if (this.canvas.isOutdated(this.overlayText(time), this.live.noteText())) this.paint(time);
+    if (this.canvas.isOutdated(this.overlayText(time), noteOf(this))) this.paint(time);
     this.why = this.live.declined || this.decoding.refused;
     const reported = `${this.status} ${this.why}`;
     const changed = reported !== this.reported;
@@ -293,8 +298,9 @@ export class Stream {
     const { shown, status } = this;
     const region = this.live.moves && this.canvas.isShown ? this.drawnRegion() : null;
     const steered = shown && region && { region, rad: this.station.steering.angleAt(shown.meta.captured) };
-    const [isStraight, text, note] = [this.straight !== null, this.overlayText(time), this.live.noteText()];
-    if (!this.canvas.paint({ shown, isStraight, status, text, note, steered })) return;
+    const [isStraight, text, note] = [this.straight !== null, this.overlayText(time), noteOf(this)];
+    const place = this.region.placeOf(shown);
+    if (!this.canvas.paint({ shown, isStraight, place, status, text, note, steered })) return;
     const mark = this.live.isLateToo(time) ? "damaged late" : status;
     if (mark !== this.mark) this.station.onMark(this.name, mark);
     this.mark = mark;
@@ -302,7 +308,7 @@ export class Stream {
 
   /** The region in the canvas, of the image that the guides are made for; null: unknown. */
   drawnRegion() {
-    if (!this.straight) return this.region.ofSized(this.shown) && (this.canvas.crop ?? this.region.ofSized(this.shown));
+    if (!this.straight) return this.region.stated(this.shown) ? this.region.frame : this.region.ofSized(this.shown);
     return this.region.of(this.shown) && this.shown?.image ? this.full : null;
   }
 
@@ -314,7 +320,7 @@ export class Stream {
     const picture = this.shown?.picture;
     return {
       status: this.status,
-      note: this.live.noteText(),
+      note: noteOf(this),
       ...this.counts,
       ...this.decoding.counts,
       error: this.decoding.error,
@@ -332,6 +338,27 @@ export class Stream {
     closeShown(this.shown);
     this.shown = null;
   }
+}
+
+/** Width of a picture of this size on the screen, px. @param {Stream} stream */
+function widthOnScreen({ canvas, region }, size, meta) {
+  const [own, { frame }] = [region.statedIn(meta), region];
+  return own ? (canvas.widthOnScreen(frame) * own.width) / frame.width : canvas.widthOnScreen(size);
+}
+
+/** What is no alarm, but must not look like a whole picture. @param {Stream} stream */
+function noteOf({ live, straight, region, shown, canvas }) {
+  const place = straight ? null : region.placeOf(shown);
+  const isCut = place && canvas.isShown && !includes(place.region, seenInBox(place.frame, canvas.display));
+  return live.noteText() || (isCut && live.moves ? NOT_SENT : "");
+}
+
+const NEAR_PX = 1; // a smaller part cannot be seen
+
+/** Whether a region includes all of a part, to within a px. */
+function includes(region, part) {
+  const isWithin = (from, length, low, long) => from >= low - NEAR_PX && from + length <= low + long + NEAR_PX;
+  return isWithin(part.x, part.width, region.x, region.width) && isWithin(part.y, part.height, region.y, region.height);
 }
 
 /** Free a picture at once: garbage collection may be late. @param {Shown|null} shown */

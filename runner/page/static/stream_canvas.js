@@ -2,7 +2,7 @@
 
 import { placement, visible, WHOLE } from "./framing.js";
 import { ESTIMATED, GuideLines, labelPicture } from "./guide_lines.js";
-import { drawNote, drawOverlay, readably } from "./overlay.js";
+import { drawNote, drawOverlay, drawUnsent, readably } from "./overlay.js";
 import { paintImage } from "./picture.js";
 import { resize } from "./resizing.js";
 import { STALLED } from "./status.js";
@@ -12,10 +12,13 @@ import { straightOptics } from "./straight.js";
  * @typedef {object} Seen
  * @property {import("./stream.js").Shown|null} shown
  * @property {boolean} isStraight whether the picture is to be straightened
+ * @property {Place|null} place of the picture in what the canvas shows; null: all of it
  * @property {string} status
  * @property {string} text of the alarm, "" for none
  * @property {string} note
  * @property {{region: import("./framing.js").Rectangle, rad: number|null}|null} steered of the guides
+ * @typedef {{region: import("./framing.js").Rectangle, frame: import("./framing.js").Rectangle}} Place
+ * regions of the full image: of the picture, and of the canvas
  */
 
 export class StreamCanvas {
@@ -25,9 +28,7 @@ export class StreamCanvas {
   context = null;
   isFresh = true; // whether nothing was painted into the canvas yet
   isPictureResizeDue = false; // whether the canvas keeps an old size for now
-  display = { width: 0, height: 0, ratio: 1, view: WHOLE };
-  /** @type {import("./framing.js").Rectangle|null} */
-  crop = null; // the part of the full image that is shown, chosen on this page alone; null: all of it
+  display = { width: 0, height: 0, ratio: 1, view: WHOLE, covered: false };
   /** @type {string|null} */
   painted_text = ""; // text in the canvas, "" for the plain picture; null: to be painted again
 
@@ -56,32 +57,17 @@ export class StreamCanvas {
     return this.isPictureResizeDue || Boolean(this.guides?.isResizeDue);
   }
 
-  /** Show a part of the pictures only. @param {import("./framing.js").Rectangle|null} region px of the full image; null: all */
-  setCrop(region) {
-    this.crop = region;
-    this.painted_text = null; // painted again at the next tick
-  }
-
-  /** The crop in px of a picture as it is painted; null: all of it. @param {import("./picture.js").Picture} picture */
-  cropOf({ painted: { width, height } }) {
-    if (!this.crop) return null;
-    const [across, down] = [width / this.camera.width, height / this.camera.height];
-    const px = (value, least, most) => Math.max(least, Math.min(Math.round(value), most));
-    const [x, y] = [px(this.crop.x * across, 0, width - 1), px(this.crop.y * down, 0, height - 1)];
-    return { x, y, width: px(this.crop.width * across, 1, width - x), height: px(this.crop.height * down, 1, height - y) };
-  }
-
   setStraight(on) {
     this.guides?.setOptics(on ? straightOptics(this.camera) : this.camera);
   }
 
   /** @param {Seen} seen  @returns {boolean} whether there is a canvas */
-  paint({ shown, isStraight, status, text, note, steered }) {
+  paint({ shown, isStraight, place, status, text, note, steered }) {
     const { canvas, context } = this;
     if (!canvas || !context) return false;
-    const crop = shown && !isStraight ? this.cropOf(shown.picture) : null;
-    this.resize(canvas, shown, crop, isStraight, STALLED.includes(status));
-    if (shown && !["off", "refused", "unsupported"].includes(status)) paintPicture(context, shown, crop, isStraight);
+    const laid = isStraight ? null : place;
+    this.resize(canvas, shown, isStraight, laid, STALLED.includes(status));
+    if (shown && !["off", "refused", "unsupported"].includes(status)) paintPicture(context, shown, isStraight, laid);
     else blank(context);
     this.guides?.draw(steered && { ...steered, picture: canvas, display: this.display });
     if (isStraight && shown?.image && !this.camera.calibrated && !this.guides?.shown) this.labelEstimate(context, canvas);
@@ -120,10 +106,11 @@ export class StreamCanvas {
    * The canvas has the picture's size. For a lasting alarm it is an integer multiple of it, close to the size on the
    * screen, so that words are sharp while the aspect ratio, and with it the page's layout, stays the same.
    */
-  resize(canvas, shown, crop, isStraight, sharp) {
+  resize(canvas, shown, isStraight, place, sharp) {
     const { width: wide, height: high, ratio } = this.display;
     const box = { width: Math.round(wide * ratio) || 480, height: Math.round(high * ratio) || 270 };
-    const own = isStraight ? (shown?.image ?? this.straightSize()) : (crop ?? shown?.picture.painted ?? box);
+    const painted = shown && place ? sizeWith(shown.picture.painted, place, this.camera) : shown?.picture.painted;
+    const own = isStraight ? (shown?.image ?? this.straightSize()) : (painted ?? box);
     const times = sharp ? Math.min(6, Math.max(1, Math.ceil(this.widthOnScreen(own) / own.width))) : 1;
     const size = { width: own.width * times, height: own.height * times };
     if (this.isFresh) Object.assign(canvas, size); // nothing is shown yet
@@ -138,15 +125,10 @@ export class StreamCanvas {
     return { width: wide, height: Math.round((wide * height) / width) };
   }
 
-  /** Width of what is painted on the screen, including cropped parts, in px of the screen; 0: not known yet. */
+  /** Width of a picture on the screen, including cropped parts, in px of the screen; 0: not known yet. */
   widthOnScreen(picture) {
     const { ratio, view } = this.display;
     return placement(this.display, picture, view).width * ratio;
-  }
-
-  /** The same of a whole picture, of which a part may be painted. */
-  wholeOnScreen(picture) {
-    return this.crop ? (this.widthOnScreen(this.crop) * this.camera.width) / this.crop.width : this.widthOnScreen(picture);
   }
 
   /** The part of the canvas that is on the screen. */
@@ -160,14 +142,34 @@ export class StreamCanvas {
 const textOf = (...texts) => texts.filter(Boolean).join("\n");
 
 /**
- * @param {OffscreenCanvasRenderingContext2D} context  @param {import("./stream.js").Shown} shown
- * @param {import("./framing.js").Rectangle|null} crop of the picture, px  @param {boolean} isStraight
+ * Size of a canvas in which a picture keeps its own; at most the camera's.
+ * @param {import("./framing.js").Size} painted  @param {Place} place  @param {import("./framing.js").Size} camera
  */
-function paintPicture(context, { picture, image = null }, crop, isStraight) {
+function sizeWith(painted, { region, frame }, camera) {
+  const [across, down] = [painted.width / region.width, painted.height / region.height];
+  const times = Math.min(1, camera.width / (frame.width * across), camera.height / (frame.height * down));
+  const sideOf = (length) => Math.max(1, Math.round(length * times));
+  return { width: sideOf(frame.width * across), height: sideOf(frame.height * down) };
+}
+
+/**
+ * @param {OffscreenCanvasRenderingContext2D} context  @param {import("./stream.js").Shown} shown  @param {boolean} isStraight
+ * @param {Place|null} place
+ */
+function paintPicture(context, { picture, image = null }, isStraight, place) {
   const { width, height } = context.canvas;
-  if (!isStraight) picture.paint(context, width, height, crop);
-  else if (image) paintImage(context, image, width, height);
+  const all = { x: 0, y: 0, width, height };
+  if (place) drawUnsent(context, width, height);
+  if (!isStraight) picture.paint(context, place ? boxOf(place, all) : all);
+  else if (image) paintImage(context, image, all);
   else blank(context);
+}
+
+/** Where in a canvas a picture is. @param {Place} place  @param {import("./framing.js").Size} canvas */
+function boxOf({ region, frame }, { width, height }) {
+  const [across, down] = [width / frame.width, height / frame.height];
+  const [x, y] = [(region.x - frame.x) * across, (region.y - frame.y) * down];
+  return { x, y, width: region.width * across, height: region.height * down };
 }
 
 function blank(context) {

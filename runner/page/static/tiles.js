@@ -249,11 +249,14 @@ function setView(name, view) {
   reportFrame(name);
 }
 
+/** Whether an enlarged picture takes the place of this one. */
+const isCovered = (name) => store.view !== "drive" && tiles.has(store.enlarged) && store.enlarged !== name;
+
 function reportFrame(name) {
   const part = tiles.get(name);
   if (!part) return;
   part.measured = boxSize(part.box);
-  reportSize(name, part.box, part.view);
+  reportSize(name, part.box, part.view, isCovered(name));
   refreshFraming(name, part);
 }
 

@@ -7,6 +7,7 @@
 import { ageOf, skewOf } from "./ages.js";
 import { isTopView } from "./arrange.js";
 import { Clock, now } from "./clock.js";
+import { PLACED } from "./decoding.js";
 import { described } from "./drawn_pictures.js";
 import { hasEnded } from "./ended.js";
 import { GroundView } from "./ground_view.js";
@@ -24,7 +25,6 @@ import { WindowView } from "./window_view.js";
 import "./beginning.js";
 import "./codec.js";
 import "./counter.js";
-import "./decoding.js";
 import "./framing.js";
 import "./ground.js";
 import "./guide_lines.js";
@@ -48,6 +48,7 @@ const RECONNECT_MS = 500;
 const REPORT_MS = 250;
 const HUNG = 6; // reports without an answer of the page's main thread: keys do nothing, either
 const HEADER = 24;
+const REGION = 8; // bytes after it, of a unit that states its region
 const MAX_LOGGED = 200;
 
 const station = {
@@ -94,6 +95,13 @@ const log = []; // [page time, camera, mark] when a changed mark was drawn
 
 const toPage = (message) => postMessage(message);
 const find = (name) => streams.find((stream) => stream.name === name);
+
+/** Show a part of a camera's pictures only. @param {import("./framing.js").Rectangle|null} region px of the full image; null: all */
+function showCrop(stream, region) {
+  if (!stream) return;
+  stream.region.setCrop(region);
+  stream.canvas.painted_text = null; // laid out anew
+}
 
 // --- the socket -------------------------------------------------------------------------------------------------------
 
@@ -212,13 +220,21 @@ function onUnit(buffer) {
   const view = new DataView(buffer);
   const index = view.getUint8(0);
   const receiver = index === SOUND ? hearing : streams.find(({ camera }) => camera.index === index);
+  const flags = view.getUint8(1);
+  const region = flags & PLACED ? regionAt(view, HEADER) : null;
   receiver?.receive({
-    flags: view.getUint8(1),
+    flags,
     sequence: view.getUint32(4, true),
     captured: view.getFloat64(8, true),
     arrived: view.getFloat64(16, true),
-    data: new Uint8Array(buffer, HEADER),
+    data: new Uint8Array(buffer, HEADER + (region ? REGION : 0)),
+    region,
   });
+}
+
+function regionAt(view, begin) {
+  const [x, y, width, height] = [0, 2, 4, 6].map((offset) => view.getUint16(begin + offset, true));
+  return { x, y, width, height };
 }
 
 // --- drawing and status -----------------------------------------------------------------------------------------------
@@ -319,7 +335,7 @@ const orders = {
     straight = names;
     applyStraight();
   },
-  crop: ({ name, region }) => find(name)?.canvas.setCrop(region),
+  crop: ({ name, region }) => showCrop(find(name), region),
   ground: ({ picture, lines }) => ground.attach(picture, lines),
   above: ({ shown, width, height, ratio }) => ground.show({ shown, width, height, ratio }),
   size: ({ name, ...display }) => find(name)?.setDisplay(display),

@@ -1,6 +1,6 @@
 /** States to the station, from the worker, what this window shows of each camera. */
 
-import { seenFromAbove, seenInBox, seenStraight, Stating, united } from "./seen.js";
+import { NOWHERE, seenFromAbove, seenInBox, seenStraight, Stating, united } from "./seen.js";
 
 /** @typedef {import("./stream.js").Stream} Stream */
 /** @typedef {import("./seen.js").Seen} Seen */
@@ -52,6 +52,7 @@ export class WindowView {
 }
 
 /** @param {Stream} stream */
-function seenInTile({ camera, canvas, region, straight }) {
-  return straight ? seenStraight(region.frame, canvas.display, straight.mesh, camera) : seenInBox(region.frame, canvas.display);
+function seenInTile({ camera, canvas: { display }, region: { frame }, straight }) {
+  if (display.covered) return NOWHERE;
+  return straight ? seenStraight(frame, display, straight.mesh, camera) : seenInBox(frame, display);
 }
