@@ -13,6 +13,7 @@ from runner.gst.rtspsrc import limit_teardown
 from runner.gst.streams import passed_counts
 
 CHECK_S = 0.05
+AGAIN_S = 0.5  # after an error
 
 
 def first_look(plan: Plan, limit_s: float) -> tuple[int, list[str]]:
@@ -33,7 +34,11 @@ def first_look(plan: Plan, limit_s: float) -> tuple[int, list[str]]:
         pipeline.set_state(Gst.State.PLAYING)
         while time.monotonic() < end and (count := passed_counts(sent)[0]) < LOOKED_AT:
             message = bus.timed_pop_filtered(int(CHECK_S * Gst.SECOND), Gst.MessageType.ERROR)
-            if message:
+            if message and not count and time.monotonic() < end - AGAIN_S:
+                pipeline.set_state(Gst.State.NULL)
+                time.sleep(AGAIN_S)  # a camera may still be ending its last session
+                pipeline.set_state(Gst.State.PLAYING)
+            elif message:
                 found.append(message.parse_error()[0].message)
                 break
             stream.look()
