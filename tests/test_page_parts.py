@@ -29,6 +29,7 @@ import aiohttp
 
 from runner.configuration.layout import NOWHERE, Layouts
 from runner.core.events import Attention
+from runner.core.model import Roi
 from runner.core.roles import Role
 from runner.operator.seen import StatedView
 from runner.operator.station import LinkState
@@ -37,7 +38,7 @@ from runner.page.control import GRACE_S, Control, combined_attention, page_of
 from runner.page.history import MAX_SAMPLES, History
 from runner.page.login import COOKIE, PageLogin
 from runner.page.server import PageServer
-from runner.page.viewer import CATCH_UP, HEADER, KEY, RESTART, PageViewer
+from runner.page.viewer import CATCH_UP, HEADER, KEY, PLACED, REGION, RESTART, PageViewer
 from runner.records.operator import CameraSample, LatencyStages, Sample
 from runner.records.vehicle import Outcome, Position
 from runner.security import keyring
@@ -927,6 +928,15 @@ def test_the_header_states_times_in_ms_and_an_unknown_capture_as_nan():
     assert HEADER.unpack_from(viewer.pop()) == (0, KEY | RESTART, 0, 1, 250.0, 500.0)
     viewer = PageViewer("me", range(1), lambda camera: [unit(5, key=True)])
     assert math.isnan(HEADER.unpack_from(viewer.pop())[4])
+
+
+def test_a_unit_that_states_its_region_has_it_behind_the_header():
+    placed = unit(5, key=True)._replace(region=Roi(2, 300, 640, 480))
+    viewer = PageViewer("me", range(1), lambda camera: [placed])
+    message = viewer.pop()
+    assert HEADER.unpack_from(message)[1] == KEY | RESTART | PLACED
+    assert REGION.unpack_from(message, HEADER.size) == (2, 300, 640, 480)
+    assert message[HEADER.size + REGION.size :] == placed.data
 
 
 def test_control_belongs_to_one_page():

@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING
 
 from gi.repository import Gst
 
+from runner.core.model import Roi
 from runner.graph import Plan, video_codec
 from runner.gst.arriving import NTP_EPOCH_S
 from runner.gst.caps import structure
 from runner.gst.probes import BufferProbe, PassingBuffer
 from runner.gst.stream_receiver import StreamReceiver
 from runner.gst.video_files import VideoFile, VideoFiles
-from runner.h264.access_unit import AccessUnit, read_unit
+from runner.h264.access_unit import AccessUnit, read_unit, stated_region
 from runner.h264.damage import HEAD_BYTES, Damage
 from runner.records.reception import Arrival
 from runner.system.recent import RecentValue
@@ -68,7 +69,9 @@ class Reception:
 
 
 OnUnit = Callable[[str, AccessUnit], None]  # camera, access unit
-OnPicture = Callable[[str, float | None, int, int, bytes], None]  # camera, captured, width, height, rows of RGB
+# Camera, captured, width, height, rows of RGB, and the region of the full image that the picture states; None: none.
+OnPicture = Callable[[str, float | None, int, int, bytes, Roi | None], None]
+MAX_DECODING = 64  # pictures in a decoder whose regions are kept
 PICTURES = (
     "videoconvert ! video/x-raw,format=RGB "
     "! appsink name={name} emit-signals=true sync=false async=false max-buffers=1 drop=true"
@@ -108,6 +111,7 @@ class Receiver(StreamReceiver):
         self._sampled = 0  # arrivals that have been read
         self.newest: Arrival | None = None  # access unit, complete or not, that has left the jitter buffer
         self._on_unit, self._on_picture = on_unit, on_picture
+        self._regions: deque[tuple[int | None, Roi]] = deque(maxlen=MAX_DECODING)  # by PTS
         self._codec = video_codec(plan.camera.graph)
         # Of a camera that encodes by itself, others have long received what its pictures refer to.
         self._joins = plan.camera.graph.passes is not None
@@ -212,6 +216,8 @@ class Receiver(StreamReceiver):
         self._refused = 0
         self._frames += 1  # after its arrival is recorded: no sample counts a frame without one
         self._damaged += damaged
+        if self._on_picture and self._codec == "h264" and (region := stated_region(buffer.extract(0, HEAD_BYTES))):
+            self._regions.append((buffer.pts, region))
         if self._on_unit:
             unit = read_unit(buffer.extract(0, size), captured, arrived, damaged=incomplete, codec=self._codec)
             if unit:
@@ -231,7 +237,8 @@ class Receiver(StreamReceiver):
         picture, buffer = structure(sample.get_caps()), sample.get_buffer()
         width, height = picture.get_int("width")[1], picture.get_int("height")[1]
         data = buffer.extract_dup(0, buffer.get_size())  # a copy: the decoder reuses its memory
-        self._on_picture(self._name, capture_time(buffer), width, height, data)  # type: ignore[misc]
+        region = dict(list(self._regions)).get(buffer.pts)
+        self._on_picture(self._name, capture_time(buffer), width, height, data, region)  # type: ignore[misc]
         return Gst.FlowReturn.OK
 
 

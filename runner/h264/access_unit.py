@@ -76,6 +76,16 @@ def read_unit(
     return None
 
 
+def stated_region(data: bytes) -> Roi | None:
+    """The region that the beginning of an H.264 access unit states; None: none."""
+    for header, at in nal_units(data):
+        if SLICE <= header & 0x1F <= IDR:
+            break
+        if header & 0x1F == SEI and (region := region_of(data[at : at + MOST_BYTES])):
+            return region
+    return None
+
+
 def starts(data: bytes, codec: str) -> tuple[bool, int | None]:
     """Whether a decoder can start with an access unit, and its recovery_frame_cnt if a refresh wave begins there."""
     unit = read_unit(data, None, 0.0, codec=codec)

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.configuration.config import configuration
+from runner.core.model import Roi
 from runner.errors import UserError, suggest
 from runner.operator.awaited import Awaited, watched
 from runner.plans import compile_plans
@@ -34,11 +35,14 @@ class Frame(NamedTuple):
 
     captured  s since 1970 by the vehicle's clock; None if the transport does not carry it
     image     uint8, height x width x 3, RGB; its size is that of the sent stream
+    region    what it shows of the camera's full image, px; None: all of it, or the stream does not say, see
+              docs/operator.md
     """
 
     camera: str
     captured: float | None
     image: NDArray[np.uint8]
+    region: Roi | None = None
 
 
 class Frames(Awaited[Frame]):
@@ -48,10 +52,12 @@ class Frames(Awaited[Frame]):
         self._newest: dict[str, Frame] = {}
         super().__init__(self._newest, lambda: self._newest.pop(next(iter(self._newest))))
 
-    def put(self, camera: str, captured: float | None, width: int, height: int, data: bytes) -> None:
+    def put(
+        self, camera: str, captured: float | None, width: int, height: int, data: bytes, region: Roi | None = None
+    ) -> None:
         """Add a picture from the decoder, whose rows may be padded."""
         rows = np.frombuffer(data, np.uint8).reshape(height, -1)[:, : width * 3]
-        frame = Frame(camera, captured, rows.reshape(height, width, 3))
+        frame = Frame(camera, captured, rows.reshape(height, width, 3), region)
         with self._changed:
             self._newest[camera] = frame
             self._changed.notify()

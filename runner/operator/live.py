@@ -23,6 +23,7 @@ from msgspec import UNSET
 from runner.configuration import agreement
 from runner.configuration.config import configuration
 from runner.core.evidence import REPORT_S
+from runner.core.model import Roi
 from runner.core.view import View
 from runner.drive.log import Log
 from runner.errors import RunError
@@ -349,10 +350,10 @@ def live_operator(
         station.listeners.append(DriveLog(station, drive, recorded))
     video = apply.VideoFiles(log, drive.video, drive.video_shift) if log and setup.log.video else None
 
-    def publish(camera: str, captured: float | None, width: int, height: int, data: bytes) -> None:
+    def publish(camera: str, captured: float | None, width: int, height: int, data: bytes, region: Roi | None) -> None:
         assert pictures
         state = station.state
-        pictures.put(camera, captured, width, height, data, state.cameras.get(camera) if state else None)
+        pictures.put(camera, captured, width, height, data, state.cameras.get(camera) if state else None, region)
 
     def build(on_unit: OnUnit | None, on_sound: OnSound | None) -> OperatorSide:
         logged = log is not None

@@ -37,15 +37,23 @@ class DecodedPictures:
         self._node.close()
 
     def put(
-        self, name: str, captured: float | None, width: int, height: int, data: bytes, state: CameraState | None
+        self,
+        name: str,
+        captured: float | None,
+        width: int,
+        height: int,
+        data: bytes,
+        state: CameraState | None,
+        region: Roi | None = None,
     ) -> None:
         """Publish a picture.
 
         captured  the stamp, s since 1970 by the vehicle's clock; None: unknown, published as a stamp of 0
         data      rows of RGB, of any length
         state     the camera's state, as last published by the vehicle
+        region    that the picture states; None: none
         """
-        lens = intrinsics_of(self._cameras[name], state, width, height)
+        lens = intrinsics_of(self._cameras[name], state, width, height, region)
         self._node.publish_picture(
             f"~/camera/{ros_name(name)}",
             data,
@@ -59,8 +67,16 @@ class DecodedPictures:
         )
 
 
-def intrinsics_of(camera: Camera, state: CameraState | None, width: int, height: int) -> Intrinsics | None:
-    """Intrinsics of a picture of this size; None while it differs from the size and region that the vehicle applied."""
+def intrinsics_of(
+    camera: Camera, state: CameraState | None, width: int, height: int, region: Roi | None = None
+) -> Intrinsics | None:
+    """Intrinsics of a picture of this size.
+
+    region   that the picture states; None: none
+    returns  None while pictures that state none differ from the size and region that the vehicle applied
+    """
+    if state and state.placed:
+        return delivered_intrinsics(camera, region or camera.full_roi, width, height)
     applied = state.applied if state else {}
     if applied.get("size") != {"width": width, "height": height} or "roi" not in applied:
         return None

@@ -71,10 +71,10 @@ class Received:
         with self.lock:
             self.units[unit.captured] = unit
 
-    def on_picture(self, _camera, captured, width, height, data):
+    def on_picture(self, _camera, captured, width, height, data, region):
         rows = np.frombuffer(data, np.uint8).reshape(height, -1)[:, : 3 * width]
         with self.lock:
-            self.pictures[captured] = rows.reshape(height, width, 3).copy()
+            self.pictures[captured] = rows.reshape(height, width, 3).copy(), region
 
 
 def test_each_picture_says_what_it_shows_through_200_changes_of_region():
@@ -101,7 +101,9 @@ def test_each_picture_says_what_it_shows_through_200_changes_of_region():
             ended.set()
             pushing.join()
             station.stop()
-    compared = [(received.units[at], shown) for at, shown in received.pictures.items() if at in received.units]
+    compared = [(received.units[at], shown) for at, (shown, _) in received.pictures.items() if at in received.units]
+    handed = {at: region for at, (_, region) in received.pictures.items() if at in received.units}
+    assert handed == {at: received.units[at].region for at in handed}
     assert len(compared) > CHANGES
     stated = {unit.region for unit, _ in compared}
     assert len(stated) > CHANGES / 3

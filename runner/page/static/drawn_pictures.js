@@ -45,7 +45,7 @@ const finite = (ms) => (Number.isFinite(ms) ? ms : null);
 /** For tests: a picture as decoded, its luma and its capture time. @param {import("./stream.js").Shown|null|undefined} shown */
 export async function described(shown) {
   if (!shown) return shown;
-  const { sequence, captured } = shown.meta;
+  const { sequence, captured, region } = shown.meta;
   const { width, height, bytes, planes } = /** @type {any} */ (await shown.picture.decoded());
   const [{ offset, stride }] = planes;
   const luma = new Uint8Array(width * height);
@@ -53,7 +53,7 @@ export async function described(shown) {
     const from = offset + row * stride;
     luma.set(bytes.subarray(from, from + width), row * width);
   }
-  return { width, height, sequence, captured, luma: base64(luma) };
+  return { width, height, sequence, captured, region, luma: base64(luma) };
 }
 
 function base64(bytes) {

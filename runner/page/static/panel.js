@@ -2,7 +2,7 @@
 
 import { camera, decisionOf, inControl, listen, mode, store, whyUndecided } from "./store.js";
 import { pending, request, showProblem, whyNoControl } from "./requests.js";
-import { AS_ENCODED, fullRegion, isCropped, isLocked, isPart, sendRegion, shownRegion, toggleLocked } from "./roi.js";
+import { AS_ENCODED, chosenRegion, fullRegion, isCropped, isLocked, isPart, sendRegion, shownRegion, toggleLocked } from "./roi.js";
 import { RegionFrame } from "./region_frame.js";
 import { SMALLEST } from "./region.js";
 import { makeSlider } from "./slider.js";
@@ -200,7 +200,7 @@ function refreshSettings(info, now) {
   const whyNoFactor = info.passed ? `${capital(AS_ENCODED)}.` : why;
   refreshFactors(info, now, whyNoFactor);
   fill(free, now?.scaling ?? "", whyNoFactor, pending(`scaling:${name()}`));
-  const seen = info.passed ? shownRegion(name()) : now?.roi;
+  const seen = info.passed ? shownRegion(name()) : chosenRegion(name());
   for (const side of SIDES) fill(sides[side], seen?.[side] ?? "", whyNoRoi, pending(`roi:${name()}`));
   setAttribute(locked, "aria-pressed", isLocked());
   apply.disabled = Boolean(whyNoRoi);

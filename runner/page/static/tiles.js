@@ -3,7 +3,7 @@
 import { alertStatus, camera, decisionOf, enlarge, inControl, listen, publish, select, store, whyUndecided } from "./store.js";
 import { drawFirst, reportSize, showGuides, transferCanvases } from "./link.js";
 import { pending, request, whyNoControl } from "./requests.js";
-import { dragRegion, isCropped, isPart, shownRegion } from "./roi.js";
+import { chosenRegion, dragRegion, isCropped, isPart, shownRegion } from "./roi.js";
 import { RegionFrame, showsPart } from "./region_frame.js";
 import { zoomRegion } from "./zoom.js";
 import { bandsOf, boxesOf, gridOf, heightsOf, narrowBands, spreadBands } from "./layout.js";
@@ -275,10 +275,10 @@ function refreshFraming(name, { measured, shown, view, frame }) {
 
 /** That a camera sends, or this page shows, a part of its image only, and how to end that. @param {string} name */
 function partText(name) {
-  const [info, now] = [camera(name), decisionOf(name)];
+  const [info, chosen] = [camera(name), chosenRegion(name)];
   const seen = isCropped(name) && shownRegion(name);
   if (info && seen) return withKey(`${percent(shareOf(seen, info))} of its image shown, by this page`, "full_image");
-  return info && now && isPart(name) ? withKey(`only ${percent(shareOf(now.roi, info))} of its image sent`, "full_image") : "";
+  return info && chosen && isPart(name) ? withKey(`only ${percent(shareOf(chosen, info))} of its image sent`, "full_image") : "";
 }
 
 function layOutEnlarged() {
