@@ -21,6 +21,7 @@ from runner.core.events import parse
 from runner.core.model import plain
 from runner.core.step import start, step
 from runner.h264.access_unit import read_unit
+from runner.operator.seen import StatedView
 from runner.operator.station import LinkState
 from runner.page.server import PageServer
 from runner.records.vehicle import CameraReading, CameraState, VehicleState
@@ -70,6 +71,7 @@ class Station(SimpleNamespace):
             "answer_s": 1.0,
             "attention": None,
             "link_state": LinkState(),
+            "seen": StatedView(),
         }
         latency = SimpleNamespace(captured=lambda camera, at: at)  # both clocks are one
         super().__init__(state=self.published(), latency=latency, **told)

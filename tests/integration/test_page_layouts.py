@@ -45,6 +45,7 @@ from runner.core.model import plain
 from runner.core.roles import Role
 from runner.core.step import start, step
 from runner.h264.access_unit import read_unit
+from runner.operator.seen import StatedView
 from runner.operator.station import LinkState
 from runner.page.login import Visitor
 from runner.page.server import PageServer
@@ -82,8 +83,17 @@ class Station(SimpleNamespace):
         }
         totals = (plain(run.decision.total), plain(run.decision.asked))
         state = VehicleState(1.0, "", run.decision.mode, *totals, cameras, driving=run.state.driving, believed=BELIEVED)
-        own = {"identity": OWN, "answer_s": 1.0, "link_state": LinkState(), "latency": UNCHANGED, "own_time": float}
-        super().__init__(state=state, note=print, attention=None, requests=[], seen=[], vehicle=vehicle, run=run, **own)
+        own = {
+            "identity": OWN,
+            "answer_s": 1.0,
+            "link_state": LinkState(),
+            "latency": UNCHANGED,
+            "own_time": float,
+            "seen": StatedView(),
+        }
+        super().__init__(
+            state=state, note=print, attention=None, requests=[], attentions=[], vehicle=vehicle, run=run, **own
+        )
 
     def ask(self, document, on_reply):
         self.requests.append(document)
@@ -128,7 +138,7 @@ def served(picture, layouts, *words, vehicle=SMALL_ROBOT, conf=None):
 
     def send():
         while not ended.wait(EVERY_S):
-            station.seen.append(station.attention)
+            station.attentions.append(station.attention)
             for name in vehicle.cameras:
                 if name not in page.silent:
                     page.show(name, read_unit(picture, time.time() - page.behind_s, time.time()))
@@ -359,9 +369,9 @@ def test_a_busy_page_delays_neither_pictures_nor_alarms_even_as_webgl_starts(chr
         page.keyboard.press("v")
         server.silent.add("mast")
         until(lambda: station.attention in ("watching", "unfocused"))
-        station.seen.clear()
+        station.attentions.clear()
         drawn, ended = drawn_while_busy(page, "", 8)  # the GPU is detected 3 s after the start
-        assert "slow" in station.seen, "keys do nothing meanwhile"
+        assert "slow" in station.attentions, "keys do nothing meanwhile"
         until(lambda: station.attention in ("watching", "unfocused"))
         assert drawn == {"front", "rear"}
         marks = [
