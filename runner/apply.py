@@ -158,8 +158,7 @@ class VehicleSide:
         self._left_out: dict[str, set[str]] = {plan.camera.name: set() for plan in plans}  # decoders
         self._wanted: dict[str, dict[str, KnobValue]] = {plan.camera.name: {} for plan in plans}
         self.on_turned: Callable[[], None] = lambda: None
-        commands = {plan.camera.name: plan.command for plan in plans if plan.command}
-        self._controls = CameraControls(commands, self._on_knobs_turned, on_report)
+        self._controls = CameraControls({p.camera.name: p.command for p in plans}, self._on_knobs_turned, on_report)
         self._glib = GlibThread()
         self._server: CameraServer | None = None
         streams = (*plans, *((sound,) if sound else ()))

@@ -26,16 +26,19 @@ SHOWN = 200  # characters of what a call that failed has said
 class CameraControls:
     """Those of all cameras that have a command.
 
-    commands   by camera
+    commands   by camera; None: it has none
     on_set     called, from any thread, when a camera has accepted a bitrate
     on_report  called, from any thread, with a camera and why its command fails, once for each reason
     """
 
     def __init__(
-        self, commands: Mapping[str, KnobCommand], on_set: Callable[[], None], on_report: Callable[[str, str], None]
+        self,
+        commands: Mapping[str, KnobCommand | None],
+        on_set: Callable[[], None],
+        on_report: Callable[[str, str], None],
     ) -> None:
         self._by_name = {
-            name: _Control(command, on_set, partial(on_report, name)) for name, command in commands.items()
+            name: _Control(command, on_set, partial(on_report, name)) for name, command in commands.items() if command
         }
 
     def turn(self, changed: Mapping[str, KnobValues]) -> None:
