@@ -42,7 +42,7 @@ def loaded(*words: str) -> tuple[int, set[str]]:
 RUNNING = {  # modules of the project and heavy packages; `validate` reads maps and queries GStreamer's registry
     "print": (62, COMPOSING),
     "replay": (69, COMPOSING),
-    "validate": (144, COMPOSING | {"numpy", "gi", "asyncio"}),  # asyncio: by PyGObject from 3.50 on
+    "validate": (146, COMPOSING | {"numpy", "gi", "asyncio"}),  # asyncio: by PyGObject from 3.50 on
 }
 HELP = {
     "vehicle": {"paho"},
