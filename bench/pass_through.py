@@ -2,8 +2,8 @@
 
   python bench/pass_through.py CLIP.mp4 [--pairs 3] [--seconds 20] [--fps 15]
 
-The clip is served as an IP camera, which encodes it in H.264 with 4 Mbit/s as it plays, a key picture a second, and
-ends the stream with the clip. Processor time is that of the vehicle's process; latency is from the arrival at the
+The clip, repeated, is served as an IP camera, which encodes it in H.264 with 4 Mbit/s as it plays, a key picture a
+second. Processor time is that of the vehicle's process; latency is from the arrival at the
 vehicle to the operator, and to its decoder. Quality is that of the delivered pictures compared with the camera's own,
 at the camera's bitrate. A viewer's first picture is the first one that is not marked as damaged: of the first viewer,
 for whom the camera is connected, and of later ones. The last rows are of a link of half the camera's rate, also with a
@@ -64,7 +64,7 @@ def main() -> None:
     other: list[Row] = []
     with tempfile.TemporaryDirectory() as directory:
         sizes = {"width": WIDTH, "height": HEIGHT, "kbps": KBPS, "fps": options.fps}
-        media = CAMERA.format(clip=options.clip.resolve(), **sizes)
+        media = CAMERA.format(clip=repeated(options.clip, Path(directory) / "clip.mp4"), **sizes)
         for number in range(options.pairs):
             for way, word in WAYS.items():
                 with told_camera(media) as camera:
@@ -83,6 +83,13 @@ def main() -> None:
                 print(f"half the rate {number + 1}: {way}", file=sys.stderr)
     drives = [row for way, drives in found.items() for row in rows(way, drives)]
     show([*drives, *other, *(row for way, each in half.items() for row in of_half(way, each))])
+
+
+def repeated(clip: Path, into: Path) -> Path:
+    """The clip again and again, so that no drive meets its end."""
+    line = ["ffmpeg", "-v", "error", "-stream_loop", "-1", "-i", str(clip), "-t", "300", "-an", "-c", "copy", str(into)]
+    subprocess.run(line, check=True)
+    return into
 
 
 SETTABLE = [
@@ -145,12 +152,12 @@ def viewed(way: str, camera: ToldCamera, word: str, options: argparse.Namespace)
                         time.sleep(0.05)
                     waited.append(later.first_whole_s())
                 print(f"{way}: viewer {number + 2} after {waited[-1]:.2f} s", file=sys.stderr)
-            own = Path(into) / "own.h264"
+            own, since = Path(into) / "own.h264", len(first.units)
             line = ["ffmpeg", "-v", "error", "-rtsp_transport", "tcp", "-i", camera.rtsp, "-t", "10", "-c", "copy"]
             subprocess.run([*line, str(own)], check=True)
             delivered = Path(into) / "delivered.h264"
             delivered.write_bytes(b"".join(first.units))
-        scores = quality(own, delivered)
+        scores = quality(own, delivered, since)
     return [
         Row(f"{way}: first picture of the first viewer", waited[0], "s"),
         spread(f"{way}: of later viewers", waited[1:], "s"),
@@ -190,15 +197,18 @@ class Viewer:
         self._side.stop()
 
 
-def quality(own: Path, delivered: Path) -> list[float]:
-    """MSSIM of each delivered picture that shows one of the camera's, compared with the one that is most like it."""
+def quality(own: Path, delivered: Path, since: int) -> list[float]:
+    """MSSIM of each delivered picture, compared with that of the camera's own which is most like it.
+
+    since  the number of the first one that may be among the camera's own
+    """
     references = list(decoded(own))
     small = np.stack([each[::8, ::8].astype(np.int16) for each in references])
     scores = meter((WIDTH, HEIGHT), Fraction(1), 1, None)
     for number, picture in enumerate(decoded(delivered)):
         apart = np.abs(small - picture[::8, ::8].astype(np.int16)).mean(axis=(1, 2))
         nearest = int(apart.argmin())
-        if 0 < nearest < len(references) - 1:  # else the camera's own may not be among them
+        if number >= since and 0 < nearest < len(references) - 1:  # else its own may not be among them
             scores.add(number, references[nearest], picture)
     return list(scores.close().values())
 

@@ -22,6 +22,7 @@ on another.
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import time
 from collections.abc import Iterator, Mapping
@@ -147,6 +148,7 @@ def examine(verb: str, setup: Setup, document: Mapping[str, Any]) -> Iterator[Di
         yield from _devices(vehicle)
         yield from _connected()
         yield from _ip_cameras(setup)
+        yield from _commands(setup)
     if verb in ("vehicle", "demo"):
         if not (document.get("link") or {}).get("lanes"):  # they make the devices of the uplinks
             yield from check_uplinks(setup.uplinks, setup.control.host)
@@ -337,6 +339,15 @@ def _ip_camera(plan: Plan) -> Diagnosis:
     if video > found.video:
         return Diagnosis(False, f"{what}, counted from 0: source.medium is {camera.source.medium}")
     return _passed_on(plan, name) if camera.graph.passes else Diagnosis(True, what)
+
+
+def _commands(setup: Setup) -> Iterator[Diagnosis]:
+    """Whether the programs are here that set bitrates in cameras."""
+    for camera in setup.vehicle.cameras.values():
+        if camera.graph.command:
+            program = camera.graph.command.words[0]
+            what = f"camera {camera.name}: {program}, which sets its bitrate"
+            yield Diagnosis(shutil.which(program) is not None, what)
 
 
 def _passed_on(plan: Plan, name: str) -> Diagnosis:
