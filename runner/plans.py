@@ -17,6 +17,7 @@ from runner.settings import Media, Setup
 
 if TYPE_CHECKING:
     from runner.sound import SoundPlan
+    from runner.voice import VoicePlan
 
 
 def compile_plans(setup: Setup) -> list[Plan]:
@@ -36,12 +37,20 @@ def sound_plan(setup: Setup) -> SoundPlan | None:
     return compile_sound(setup.sound, setup.media)
 
 
-def stream_addresses(media: Media, plans: Iterable[Plan], sound: SoundPlan | None) -> Iterator[str]:
+def voice_plan(setup: Setup) -> VoicePlan | None:
+    """That of the operator's voice; None: the vehicle has no loudspeaker."""
+    if setup.voice is None:
+        return None
+    from runner.voice import compile_voice
+
+    return compile_voice(setup.voice, setup.media)
+
+
+def stream_addresses(media: Media, plans: Iterable[Plan], *others: SoundPlan | VoicePlan | None) -> Iterator[str]:
     """Where each stream of a vehicle is, in words."""
     for plan in plans:
         yield f"{plan.camera.name}: {rtsp_url(media, plan.camera.name) if plan.serves else 'connects to the operator'}"
-    if sound:
-        yield f"{sound.name}: {rtsp_url(media, sound.name)}"
+    yield from (f"{other.name}: {rtsp_url(media, other.name)}" for other in others if other)
 
 
 def as_offered(setup: Setup, report: Callable[[str], None]) -> Setup:

@@ -328,6 +328,39 @@ class Sound:
 
 
 @dataclass(frozen=True, slots=True)
+class Voice:
+    """The operator's voice at the vehicle's loudspeaker, as defined in YAML: elements may hold {placeholders}.
+
+    jitter_buffer_ms  how long the vehicle waits for a missing packet
+    operator          elements from the page's microphone to the RTSP client
+    vehicle           elements behind the RTSP server, in front of the loudspeaker
+    loudspeaker       elements that play raw sound
+    device, file      for the loudspeaker; None: none is named
+    others            as in `Sound`
+    """
+
+    kbps: int
+    packet_ms: int
+    header_bytes: int
+    jitter_buffer_ms: int
+    dscp: int
+    port: int
+    operator: tuple[Element, ...]
+    vehicle: tuple[Element, ...]
+    loudspeaker: tuple[Element, ...]
+    wire_microphone: tuple[Element, ...]
+    wire_operator: tuple[Element, ...]
+    wire_vehicle: tuple[Element, ...]
+    device: str | None = None
+    file: str | None = None
+    needs: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def needs_file(self) -> bool:
+        return any(value == "{file}" for element in self.loudspeaker for value in element.properties.values())
+
+
+@dataclass(frozen=True, slots=True)
 class Dimensions:
     """The vehicle seen from above, m: what the page draws on the ground.
 
@@ -386,6 +419,7 @@ class Setup:
     inputs      keys and buttons of the operator's page
     uplinks     by name, in order; none: the system's routes decide by which way the vehicle sends
     sound       of the vehicle; None: none is sent
+    voice       of the operator; None: the vehicle has no loudspeaker
     """
 
     vehicle: Vehicle
@@ -406,6 +440,7 @@ class Setup:
     inputs: Inputs = Inputs()
     uplinks: Mapping[str, Uplink] = field(default_factory=dict)
     sound: Sound | None = None
+    voice: Voice | None = None
 
     def with_cameras(self, cameras: Mapping[str, Camera]) -> Setup:
         """The same, of a vehicle with these cameras."""

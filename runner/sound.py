@@ -38,6 +38,14 @@ class SoundPlan:
     name: str = SOUND
 
     @property
+    def lists(self) -> dict[str, dict[str, tuple[Element, ...]]]:
+        """By side, its elements by the key that lists them."""
+        return {
+            "vehicle": {"source": self.source, "vehicle": self.vehicle, "wire.vehicle": self.wire_vehicle},
+            "operator": {"operator": self.operator, "wire.operator": self.wire_operator},
+        }
+
+    @property
     def pipeline(self) -> str:
         """The vehicle's side as GStreamer parses it."""
         return launch((*self.source, *self.vehicle))

@@ -421,7 +421,7 @@ def test_a_mistake_in_a_file(conf: UserConf, tod: Command, file: str, changes: d
             "/camera@cameras.rear",
             "defaults: 'camera/compact_480p': no such file; "
             "expected one of the groups /vehicle, /cameras, /modes, /graph, /source, /pqos, "
-            "/recording, /study, /sound, /link, /experiment",
+            "/recording, /study, /sound, /voice, /link, /experiment",
         ),
         (
             "@cameras.rear",

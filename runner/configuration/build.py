@@ -17,7 +17,7 @@ from runner.configuration.graphs import MOUNT_KEYS, given, read_graph, read_reco
 from runner.configuration.origin import Composed
 from runner.configuration.rule_lists import call_entry, check_order
 from runner.configuration.uplinks import Ways, built_uplinks, reserves_kbps, uplink_problems
-from runner.core.budget import SOUND
+from runner.core.budget import SOUND, VOICE
 from runner.core.capture import Capture
 from runner.core.commands import KnobValue
 from runner.core.hull import Curve, concave
@@ -53,12 +53,14 @@ from runner.settings import (
     RosSettings,
     Setup,
     Sound,
+    Voice,
     address_rule,
 )
 
 if TYPE_CHECKING:
     from runner.configuration.experiment import LinkSettings, TimedRequest
     from runner.sound import SoundPlan
+    from runner.voice import VoicePlan
 
 SAMPLE_KNOBS: Mapping[str, KnobValue] = {"sending": True, "roi": Roi(0, 0, 16, 16), "size": (16, 16), "bitrate": 1}
 TOPIC = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")  # design.ros2.org, topic and service names
@@ -66,12 +68,12 @@ TOPIC_RULE = "must be the name of a topic: letters, digits and _ between slashes
 CAMERA_NEEDS = ("width_px", "height_px", "fps", "rate_quality")  # keys that the schema requires, set by the kind
 SECTIONS = (
     *("media", "control", "page", "log", "latency", "keys", "insecure", "metrics", "ros", "strict", "uplinks"),
-    "sound",
+    *("sound", "voice"),
 )
 
 T = TypeVar("T")
 
-PlanCheck = Callable[["Plan | SoundPlan"], Iterable[ModelError]]
+PlanCheck = Callable[["Plan | SoundPlan | VoicePlan"], Iterable[ModelError]]
 
 
 @dataclass
@@ -122,9 +124,10 @@ class Builder:
             self._report(("ros",), error)
         listening = {"page.port": page.port} if page.serve else {}
         sound = self._sound(media, built) if "sound" in document else None
+        voice = self._voice(media, built) if "voice" in document else None
         self._check_places(built)
         self._check_ports(built, {"media.port": media.port, "control.port": control.port, **listening})
-        self._check_rtp_ports(built, media, sound)
+        self._check_rtp_ports(built, media, sound, voice)
         for index, camera in enumerate(built.values()):
             self._check_compiles(camera, media, index, recording)
             if camera.source.render:
@@ -155,6 +158,7 @@ class Builder:
             inputs=inputs or Inputs(),
             uplinks=built_uplinks(ways),
             sound=sound,
+            voice=voice,
         )
 
     def checked(self, built: T | None) -> T:
@@ -386,13 +390,29 @@ class Builder:
             self._report(("sound",), error)
         return sound
 
-    def _check_rtp_ports(self, cameras: Mapping[str, Camera], media: Media, sound: Sound | None) -> None:
+    def _voice(self, media: Media, cameras: Mapping[str, Camera]) -> Voice | None:
+        """The same of the operator's voice."""
+        from runner.configuration.voice import read_voice, voice_problems
+
+        voice = self.part(("voice",), read_voice)
+        if voice is None:
+            return None
+        if VOICE in cameras:
+            rule = "is the name of the operator's voice; give this camera another one, or choose no voice"
+            self.problems.append(self.composed.problem(("cameras", VOICE), None, rule))
+        for error in voice_problems(voice, media, self.check, runnable=self.runnable):
+            self._report(("voice",), error)
+        return voice
+
+    def _check_rtp_ports(
+        self, cameras: Mapping[str, Camera], media: Media, sound: Sound | None, voice: Voice | None
+    ) -> None:
         """Check that each camera behind the RTSP server finds its ports: an even one for RTP, the next for RTCP."""
         first, last = media.rtp_ports
         pairs = (last + 1) // 2 - (first + 1) // 2
         served = sum(camera.graph.transport == "rtsp" for camera in cameras.values())
-        if pairs < served + bool(sound):
-            of_sound = " and for the sound" if sound else ""
+        if pairs < served + bool(sound) + bool(voice):
+            of_sound = " and for the sound" * bool(sound) + " and for the voice" * bool(voice)
             rule = f"must hold two ports, of which the first is even, for each of {served} cameras{of_sound}"
             self._report((), ModelError("media.rtp_ports", f"[{first}, {last}]", rule))
 

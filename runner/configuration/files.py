@@ -16,8 +16,8 @@ SITE = "tod-runner-site"  # name of the site file to Hydra, like that of no file
 SITE_VARIABLE = "TOD_SITE"  # of the environment: names the site file
 LAYOUT = "layout"  # folder in the user's directory where the operator's page saves layouts; not a group
 GROUPS = (
-    *("vehicle", "cameras", "modes", "graph", "source", "pqos", "recording", "study", "sound", "link"),
-    "experiment",
+    *("vehicle", "cameras", "modes", "graph", "source", "pqos", "recording", "study", "sound", "voice"),
+    *("link", "experiment"),
 )
 
 

@@ -12,6 +12,7 @@ INSIDE_MTU = 14  # RTP header (RFC 3550) and fragmentation header (RFC 6184, FU-
 
 
 SOUND = "sound"  # its name among the streams of a vehicle, which no camera then has
+VOICE = "voice"  # likewise of the operator's voice, which takes nothing of the uplink
 
 
 def sound_kbps(kbps: int, packet_ms: int, header_bytes: int) -> Kbps:

@@ -19,11 +19,14 @@ from runner.graph import Plan, assignments, text
 
 if TYPE_CHECKING:
     from runner.sound import SoundPlan
+    from runner.voice import VoicePlan
 
 PARTS = ("vehicle", "operator", "recording")  # of a plan
 
 
-def check_plan(registry: Registry, plan: Plan | SoundPlan, parts: Collection[str] = PARTS) -> list[ModelError]:
+def check_plan(
+    registry: Registry, plan: Plan | SoundPlan | VoicePlan, parts: Collection[str] = PARTS
+) -> list[ModelError]:
     """Everything a registry does not allow: unknown elements and properties, wrong types and ranges, fixed knobs.
 
     Known elements that are missing are reported by `missing_plugins` and `missing_recorders`.
@@ -52,14 +55,10 @@ def check_plan(registry: Registry, plan: Plan | SoundPlan, parts: Collection[str
     return found or _check_links(registry, plan, parts)
 
 
-def _check_sound(registry: Registry, plan: SoundPlan, parts: Collection[str]) -> list[ModelError]:
-    """The same of the vehicle's sound, with keys below `sound`."""
-    elements = {
-        "vehicle": {"source": plan.source, "vehicle": plan.vehicle, "wire.vehicle": plan.wire_vehicle},
-        "operator": {"operator": plan.operator, "wire.operator": plan.wire_operator},
-    }
-    known, sides = {*PACKAGE_OF, *plan.needs}, [side for side in elements if side in parts]
-    lists = [pair for side in sides for pair in elements[side].items()]
+def _check_sound(registry: Registry, plan: SoundPlan | VoicePlan, parts: Collection[str]) -> list[ModelError]:
+    """The same of the vehicle's sound or the operator's voice, with keys below `sound` or `voice`."""
+    known, sides = {*PACKAGE_OF, *plan.needs}, [side for side in plan.lists if side in parts]
+    lists = [pair for side in sides for pair in plan.lists[side].items()]
     found = [error for where, its in lists for error in _check_elements(registry, its, where, known)]
     lines = {"vehicle": (*plan.source, *plan.vehicle), "operator": plan.operator}
     for side in () if found else sides:

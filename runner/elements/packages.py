@@ -11,6 +11,7 @@ from runner.graph import Plan
 
 if TYPE_CHECKING:
     from runner.sound import SoundPlan
+    from runner.voice import VoicePlan
 
 PACKAGES = {  # elements by Debian package; `doctor` and messages on missing plugins name the package
     "gstreamer1.0-plugins-base": "videoconvert videoscale videorate videotestsrc decodebin appsrc appsink"
@@ -24,7 +25,7 @@ PACKAGES = {  # elements by Debian package; `doctor` and messages on missing plu
     "gstreamer1.0-libav": "avdec_h264 avdec_h265 avdec_ffv1 avenc_ffv1",
     "gstreamer1.0-rtsp": "rtspclientsink",
     "gstreamer1.0-x": "textoverlay",
-    "gstreamer1.0-alsa": "alsasrc",
+    "gstreamer1.0-alsa": "alsasrc alsasink",
     "gstreamer1.0-pipewire": "pipewiresrc",
 }
 HARDWARE = {  # plugin by element that exists only with its hardware
@@ -36,7 +37,7 @@ PACKAGE_OF = {element: package for package, elements in PACKAGES.items() for ele
 
 
 def missing_plugins(
-    registry: Registry, plan: Plan | SoundPlan, sides: Sequence[str] = ("vehicle", "operator")
+    registry: Registry, plan: Plan | SoundPlan | VoicePlan, sides: Sequence[str] = ("vehicle", "operator")
 ) -> list[str]:
     """One sentence for each known element that streaming needs on these sides and the registry lacks."""
     needed = {"vehicle": (*plan.source, *plan.vehicle), "operator": plan.operator}

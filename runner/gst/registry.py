@@ -22,6 +22,7 @@ from runner.gst.enums import enum_values
 if TYPE_CHECKING:
     from runner.elements.dump import Dump
     from runner.sound import SoundPlan
+    from runner.voice import VoicePlan
 
 
 class LiveRegistry(Registry):
@@ -80,7 +81,7 @@ missing_plugins = partial(packages.missing_plugins, LIVE)
 why_missing = partial(packages.why_missing, LIVE)
 
 
-def require_plugins(plans: Iterable[Plan | SoundPlan], sides: Sequence[str]) -> None:
+def require_plugins(plans: Iterable[Plan | SoundPlan | VoicePlan], sides: Sequence[str]) -> None:
     """Check that every plugin that streaming needs on these sides is installed.
 
     raises  RunError with the packages to install, for all cameras at once

@@ -30,6 +30,7 @@ from typing import TYPE_CHECKING, Any
 
 from runner.configuration.config import configuration
 from runner.configuration.uplinks import KEYS, described, pqos_of_uplinks
+from runner.core.budget import SOUND, VOICE
 from runner.core.commands import wanted
 from runner.core.decision import Decision
 from runner.core.events import BitratePredicted, Event, ModeSelected, TotalSet
@@ -37,7 +38,7 @@ from runner.core.model import Kbps, Mode, Vehicle, exact, plain
 from runner.core.step import start, step
 from runner.errors import ArgumentError, MissingBindings
 from runner.graph import Plan, may_lack_parameter_sets
-from runner.plans import compile_plans, sound_plan
+from runner.plans import compile_plans, sound_plan, voice_plan
 from runner.records import to_json
 from runner.records.decisions import CameraDecision, uplinks_decided
 from runner.redact import redacted
@@ -45,8 +46,11 @@ from runner.verbs import Arguments
 
 if TYPE_CHECKING:
     from runner.sound import SoundPlan
+    from runner.voice import VoicePlan
 
 Uplinks = Mapping[str, Mapping[str, str]]  # by name, what is to be said of each
+Others = Sequence["SoundPlan | VoicePlan"]  # streams beside the cameras'
+LOADS = {SOUND: "taken from the total", VOICE: "on the downlink, while somebody speaks"}
 
 
 def run(arguments: Arguments) -> int:
@@ -55,10 +59,10 @@ def run(arguments: Arguments) -> int:
         return _sweep(arguments)
     if form == "yaml":
         return _print_configuration(arguments)
-    vehicle, plans, sound, decision, uplinks = _plan(arguments)
-    text = json.dumps(as_json(plans, sound, decision, uplinks), indent=2, ensure_ascii=False) if form == "json" else ""
+    vehicle, plans, others, decision, uplinks = _plan(arguments)
+    text = json.dumps(as_json(plans, others, decision, uplinks), indent=2, ensure_ascii=False) if form == "json" else ""
     notes = _notes(plans, uplinks) if form == "json" else []
-    _print(text or as_text(vehicle, plans, sound, decision, uplinks), [*notes, *_parameter_sets(plans)])
+    _print(text or as_text(vehicle, plans, others, decision, uplinks), [*notes, *_parameter_sets(plans)])
     return 0
 
 
@@ -76,8 +80,8 @@ def _sweep(arguments: Arguments) -> int:
 
     runs = prepare_all(arguments, _plan)
     lines = [
-        json.dumps({"overrides": words, **as_json(plans, sound, decision, uplinks)}, ensure_ascii=False)
-        for words, (_, plans, sound, decision, uplinks) in runs
+        json.dumps({"overrides": words, **as_json(plans, others, decision, uplinks)}, ensure_ascii=False)
+        for words, (_, plans, others, decision, uplinks) in runs
     ]
     notes = (note for _, (_, plans, *_, uplinks) in runs for note in _notes(plans, uplinks))
     _print("\n".join(lines), list(dict.fromkeys(notes)))
@@ -96,12 +100,13 @@ def _parameter_sets(plans: Sequence[Plan]) -> list[str]:
     return [f"{plan.camera.name}: {sentence}" for plan in suspected for sentence in parameter_set_notes(plan)]
 
 
-def _plan(arguments: Arguments) -> tuple[Vehicle, Sequence[Plan], SoundPlan | None, Decision, Uplinks]:
+def _plan(arguments: Arguments) -> tuple[Vehicle, Sequence[Plan], Others, Decision, Uplinks]:
     total = arguments.number("total_kbps")
     config = configuration(arguments.overrides, arguments.conf, site=arguments.site)
     setup = config.setup()
     decision = decide(setup.vehicle, None if total is None else exact(total))
-    return setup.vehicle, compile_plans(setup), sound_plan(setup), decision, _uplinks(config.document)
+    others = [plan for plan in (sound_plan(setup), voice_plan(setup)) if plan]
+    return setup.vehicle, compile_plans(setup), others, decision, _uplinks(config.document)
 
 
 def _uplinks(document: Mapping[str, Any]) -> Uplinks:
@@ -137,7 +142,7 @@ def decide(vehicle: Vehicle, total: Kbps | None) -> Decision:
     return run.decision
 
 
-def as_json(plans: Sequence[Plan], sound: SoundPlan | None, decision: Decision, uplinks: Uplinks) -> dict[str, Any]:
+def as_json(plans: Sequence[Plan], others: Others, decision: Decision, uplinks: Uplinks) -> dict[str, Any]:
     cameras = {
         plan.camera.name: {
             "vehicle": plan.vehicle_line(wanted(decision.settings[plan.camera.name])),
@@ -149,12 +154,12 @@ def as_json(plans: Sequence[Plan], sound: SoundPlan | None, decision: Decision, 
         for plan in plans
     }
     document: dict[str, Any] = {"mode": decision.mode.value, "total_kbps": plain(decision.total), "cameras": cameras}
-    if sound:
-        document["sound"] = {
-            "vehicle": sound.vehicle_line(),
-            "operator": sound.operator_line(),
-            "server": sound.server,
-            "kbps_on_the_wire": plain(sound.wire_kbps),
+    for other in others:
+        document[other.name] = {
+            "vehicle": other.vehicle_line(),
+            "operator": other.operator_line(),
+            "server": other.server,
+            "kbps_on_the_wire": plain(other.wire_kbps),
         }
     if not uplinks:
         return document
@@ -168,9 +173,7 @@ def _command(plan: Plan, decision: Decision) -> list[str] | None:
     return plan.command.with_bitrate(kbps) if plan.command and kbps else None
 
 
-def as_text(
-    vehicle: Vehicle, plans: Sequence[Plan], sound: SoundPlan | None, decision: Decision, uplinks: Uplinks
-) -> str:
+def as_text(vehicle: Vehicle, plans: Sequence[Plan], others: Others, decision: Decision, uplinks: Uplinks) -> str:
     lines = [f"# {vehicle.name}, mode {decision.mode}, total {plain(decision.total)} kbit/s"]
     for name, way in uplinks.items():
         share = decision.uplinks.get(name)
@@ -188,11 +191,11 @@ def as_text(
             lines.append(f"# server: {plan.server}")
         if command := _command(plan, decision):
             lines.append(f"# sets the bitrate: {shlex.join(command)}")
-    if sound:
-        lines += ["", f"# sound: {plain(sound.wire_kbps)} kbit/s on the wire, taken from the total"]
-        lines.append(f"gst-launch-1.0 {sound.vehicle_line()}")
-        lines.append(f"gst-launch-1.0 {sound.operator_line()}")
-        lines.append(f"# server: {sound.server}")
+    for other in others:
+        lines += ["", f"# {other.name}: {plain(other.wire_kbps)} kbit/s on the wire, {LOADS[other.name]}"]
+        lines.append(f"gst-launch-1.0 {other.vehicle_line()}")
+        lines.append(f"gst-launch-1.0 {other.operator_line()}")
+        lines.append(f"# server: {other.server}")
     return "\n".join(lines)
 
 

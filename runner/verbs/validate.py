@@ -68,6 +68,7 @@ if TYPE_CHECKING:
     from concurrent.futures import Executor
 
     from runner.sound import SoundPlan
+    from runner.voice import VoicePlan
 
 FOLDERS = (*GROUPS, LAYOUT)  # of checked files
 DATA = ("maps", "traces")  # folders for data that pqos files name; a bandwidth map may be YAML
@@ -462,7 +463,7 @@ def _registry_check(notes: dict[str, None], target: str | None) -> PlanCheck | N
         notes[f"nothing was checked against the GStreamer registry: {error}"] = None
         return None
 
-    def check(plan: Plan | SoundPlan) -> list[ModelError]:
+    def check(plan: Plan | SoundPlan | VoicePlan) -> list[ModelError]:
         records = missing_recorders(registry, plan) if isinstance(plan, Plan) else ()
         missing = (*missing_plugins(registry, plan), *records)
         notes.update({f"not checked: {sentence}": None for sentence in missing})
