@@ -46,7 +46,7 @@ from runner.gst.timers import Guarded, every, later
 from runner.gst.video_files import VideoFile, VideoFiles
 from runner.gst.watched import WatchedSource
 from runner.records.reception import Arrivals, SentFrame, UplinkReceived, UplinkSent
-from runner.records.vehicle import NOTHING_ENCODED, CameraReading, SenderStages, SoundReading
+from runner.records.vehicle import CameraReading, SenderStages, SoundReading, VoiceReading
 from runner.settings import Media, Uplink
 from runner.system.camera_control import CameraControls
 
@@ -64,9 +64,11 @@ if TYPE_CHECKING:
     from runner.gst.sound_pipeline import SoundPipeline
     from runner.gst.sound_receiver import OnSamples, OnSound, SoundPacket, SoundReceiver, SoundReception
     from runner.gst.video_reader import Unit, read_video
+    from runner.gst.voice_sender import VoiceSender
     from runner.ros.cameras import SharedPicture
     from runner.security.keyring import Keyring
     from runner.sound import SoundPlan
+    from runner.voice import VoicePlan
 
 __all__ = [
     "LIVE",
@@ -83,6 +85,7 @@ __all__ = [
     "Unit",
     "VehicleSide",
     "VideoFiles",
+    "VoiceSender",
     "check_machine",
     "check_operator",
     "check_plan",
@@ -109,12 +112,12 @@ SELDOM = {  # by name, its module
     "first_look": "first_look",
     "parameter_set_notes": "parameter_sets",
     "read_again": "encoded_again",
+    "VoiceSender": "voice_sender",
     "read_video": "video_reader",
     "run_lanes": "lanes",
     "write_clip": "clip_writer",
 }
-LOOK_MS = 20  # how often it looks which frames have left: their times are known as precisely as this
-TAILS_MS = 10  # how often receivers check for frames whose end is missing
+LOOK_MS, TAILS_MS = 20, 10  # between two looks which frames have left; between two checks for frames without an end
 
 
 def _captured(pad: Gst.Pad, unit: PassingBuffer) -> float | None:
@@ -131,6 +134,7 @@ class VehicleSide:
     uplinks    by name, see `runner.gst.uplinks`; none: the system's routes decide
     may_listen  whether viewers may connect at an address of an uplink, too
     sound      served beside the cameras; None: there is none
+    voice      played of the operator in control; None: there is no loudspeaker
     raises     RunError if the port is in use, or a plugin that `video` needs is not installed
 
     `on_turned` is called, from any thread, after knobs were set and read back: `applied` may have changed.
@@ -147,22 +151,22 @@ class VehicleSide:
         uplinks: Mapping[str, Uplink] = NOTHING,
         may_listen: Callable[[str], bool] = lambda address: False,
         sound: SoundPlan | None = None,
+        voice: VoicePlan | None = None,
     ) -> None:
         self._on_report, self._video = on_report, video
         kind: Any = uplinks and import_module("runner.gst.uplinks").VehicleUplinks
         self._uplinks = kind(uplinks, on_report, may_listen) if kind else None
         passphrase = keyring.watched_passphrase(lambda what: on_report("keys", what)).get if keyring else None
         plans = with_clip_range(with_video(plans, video, "vehicle"))
-        self._lock = threading.Lock()
+        self._lock, self._glib = threading.Lock(), GlibThread()
         self._logins = {p.camera.name: Login(p, partial(on_report, p.camera.name)) for p in plans}
         self._left_out: dict[str, set[str]] = {plan.camera.name: set() for plan in plans}  # decoders
         self._wanted: dict[str, dict[str, KnobValue]] = {plan.camera.name: {} for plan in plans}
         self.on_turned: Callable[[], None] = lambda: None
         self._controls = CameraControls({p.camera.name: p.command for p in plans}, self._on_knobs_turned, on_report)
-        self._glib = GlibThread()
         self._server: CameraServer | None = None
         streams = (*plans, *((sound,) if sound else ()))
-        self._lost = LostCameras(streams, lost, stream_problem, self._on_found)
+        self._lost = LostCameras((*streams, *((voice,) if voice else ())), lost, stream_problem, self._on_found)
         openings = Openings(self._build, self._lost, on_report, self._refusal, self._uplinks)
         self._callers = {p.camera.name: CameraCaller(p, openings, passphrase) for p in plans if not p.serves}
         self._looks = [self._guarded_look(plan.camera.name) for plan in plans]
@@ -171,8 +175,8 @@ class VehicleSide:
         served = [plan for plan in streams if not isinstance(plan, Plan) or plan.serves]
 
         def start() -> None:
-            if served:
-                self._server = CameraServer(served, media, openings, keyring)
+            if served or voice:
+                self._server = CameraServer(served, media, openings, keyring, voice)
             for name, caller in self._callers.items():
                 if name not in lost:
                     caller.start()
@@ -209,10 +213,13 @@ class VehicleSide:
         """By camera and uplink, what was sent, see `runner.gst.uplinks`."""
         return self._uplinks.counts() if self._uplinks else {}
 
-    def give_control(self, drivers: Sequence[str]) -> None:
-        """Set who drives, or is about to: their viewers are always admitted, see `runner.gst.viewers`."""
+    def give_control(self, drivers: Sequence[str], in_control: str = "") -> None:
+        """Set who drives, or is about to: their viewers are always admitted, see `runner.gst.viewers`.
+
+        in_control  who may speak, "": nobody
+        """
         if self._server:
-            self._server.admission.give_control(drivers)
+            self._server.give_control(drivers, in_control)
 
     def push(self, camera: str, frame: Any, form: str | None = None, captured: float | None = None) -> bool:
         """Push a frame of a camera whose frames come from Python; see `runner.live.LiveVehicle`."""
@@ -236,13 +243,12 @@ class VehicleSide:
 
     def read_sound(self) -> SoundReading:
         """What its elements say now. From any thread."""
-        server, pipeline = self._server, self._server and self._server.pipelines.get(SOUND)
-        return SoundReading(
-            encoded=pipeline.counters() if pipeline else NOTHING_ENCODED,
-            lost=self._lost.reasons().get(SOUND),
-            copies=server.copies().get(SOUND, 0) if server else 0,
-            refused=server.admission.refused().get(SOUND, NOTHING) if server else NOTHING,
-        )
+        return self._server.read_sound() if self._server else SoundReading()
+
+    def read_voice(self) -> VoiceReading:
+        """What is known of the loudspeaker."""
+        loudspeaker = self._server and self._server.loudspeaker
+        return loudspeaker.reading() if loudspeaker else VoiceReading()
 
     def stages(self) -> dict[str, SenderStages]:
         """By camera, latency from capture to the encoder, and through it, ms; unknown ones are omitted.

@@ -46,6 +46,11 @@ def voice_plan(setup: Setup) -> VoicePlan | None:
     return compile_voice(setup.voice, setup.media)
 
 
+def other_plans(setup: Setup) -> tuple[SoundPlan | None, VoicePlan | None]:
+    """Those of streams beside the cameras'."""
+    return sound_plan(setup), voice_plan(setup)
+
+
 def stream_addresses(media: Media, plans: Iterable[Plan], *others: SoundPlan | VoicePlan | None) -> Iterator[str]:
     """Where each stream of a vehicle is, in words."""
     for plan in plans:

@@ -16,6 +16,7 @@ from runner.system.backoff import pause_s
 
 if TYPE_CHECKING:
     from runner.sound import SoundPlan
+    from runner.voice import VoicePlan
 
 BACKOFF_S = (1.0, 10.0)  # between two attempts: doubled from the first value up to the second
 POLL_S = 0.25
@@ -45,9 +46,9 @@ class LostCameras:
 
     def __init__(
         self,
-        plans: Sequence[Plan | SoundPlan],
+        plans: Sequence[Plan | SoundPlan | VoicePlan],
         lost: Mapping[str, str],
-        problem: Callable[[Plan | SoundPlan], str | None],
+        problem: Callable[[Plan | SoundPlan | VoicePlan], str | None],
         on_found: Callable[[str], None],
     ) -> None:
         self._plans, self._problem, self._on_found = {plan.name: plan for plan in plans}, problem, on_found

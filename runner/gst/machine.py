@@ -14,32 +14,41 @@ from runner.gst.source import source_problem
 if TYPE_CHECKING:
     from runner.gst.video_files import VideoFiles
     from runner.sound import SoundPlan
+    from runner.voice import VoicePlan
 
 
-def check_machine(plans: Sequence[Plan], sound: SoundPlan | None = None, *, strict: bool = True) -> dict[str, str]:
+def check_machine(
+    plans: Sequence[Plan], sound: SoundPlan | None = None, voice: VoicePlan | None = None, *, strict: bool = True
+) -> dict[str, str]:
     """Check that every plugin of the vehicle's side is installed and every source (file, device) opens.
 
     strict   a source that does not open is an error
-    returns  by camera whose source does not open, why; likewise of the sound, by its name
+    returns  by camera whose source does not open, why; likewise of sound and loudspeaker, by their names
     raises   RunError with the remedy, for all cameras at once
     """
-    streams = (*plans, *((sound,) if sound else ()))
+    streams = [*plans, *(each for each in (sound, voice) if each)]
     require_plugins(streams, ("vehicle",))
     refused = {plan.name: why for plan in streams if (why := stream_problem(plan))}
     if refused and strict:
-        of_sound = {plan.name for plan in streams if not isinstance(plan, Plan)}
-        named = ((name if name in of_sound else f"camera {name}", why) for name, why in refused.items())
+        others = {plan.name for plan in streams if not isinstance(plan, Plan)}
+        named = ((name if name in others else f"camera {name}", why) for name, why in refused.items())
         raise RunError("\n".join(f"{name}: {why}" for name, why in named))
     return refused
 
 
-def stream_problem(plan: Plan | SoundPlan) -> str | None:
-    """Why the source of a camera or of sound does not open; None if it opens."""
+def stream_problem(plan: Plan | SoundPlan | VoicePlan) -> str | None:
+    """Why the source of a camera or of sound, or the loudspeaker, does not open; None if it opens."""
     if isinstance(plan, Plan):
         return source_problem(plan)
-    from runner.gst.sound_pipeline import sound_problem
+    from runner.sound import SoundPlan
 
-    return sound_problem(plan)
+    if isinstance(plan, SoundPlan):
+        from runner.gst.sound_pipeline import sound_problem
+
+        return sound_problem(plan)
+    from runner.gst.loudspeaker import loudspeaker_problem
+
+    return loudspeaker_problem(plan)
 
 
 def with_video(plans: Sequence[Plan], video: VideoFiles | None, side: str) -> Sequence[Plan]:

@@ -101,9 +101,9 @@ class ServedCameras:
         self.threads.set_max_threads(-1)  # one per client
         self.pipelines: dict[str, CameraPipeline | SoundPipeline] = {}
         self._holds: list[tuple[float, GstRtspServer.RTSPClient, GstRtspServer.RTSPMedia]] = []
-        addresses = address_pool(media)
+        self.addresses = address_pool(media)
         self.named = {
-            plan.name: ServedCamera(plan, CameraFactory(plan, addresses, permissions), rtsp_url(media, plan.name))
+            plan.name: ServedCamera(plan, CameraFactory(plan, self.addresses, permissions), rtsp_url(media, plan.name))
             for plan in plans
         }
         for camera in self.named.values():

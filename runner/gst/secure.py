@@ -15,6 +15,7 @@ from gi.repository import Gio, GLib, Gst, GstRtsp, GstRtspServer
 from runner.core.roles import Role
 from runner.errors import RunError, UserError
 from runner.gst.pipeline import encrypt
+from runner.gst.rtspsrc import is_rtsp_client
 from runner.gst.srtp import provide_rtcp_key
 from runner.security.identities import Identities, Presented
 from runner.security.keyring import MEDIA_SECRET, Holder, Keyring, Watched, rtsp_password, srt_passphrase
@@ -127,7 +128,8 @@ class StreamLogin:
         client.set_property("user-id", keyring.holder.name)
         client.set_property("user-pw", rtsp_password(keyring.secret, self._vehicle))
         client.connect("accept-certificate", self._accept)
-        provide_rtcp_key(client)
+        if is_rtsp_client(client):  # not the sender of voice: it sends RTCP with the key of its stream
+            provide_rtcp_key(client)
 
     def _accept(self, _client: Gst.Element, _connection: object, certificate: Gio.TlsCertificate, _: object) -> bool:
         self._accepted = certificate if self._check.verify(certificate) == self._expected else None

@@ -11,10 +11,13 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from functools import partial
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 from gi.repository import GLib, GstRtsp, GstRtspServer
 
+from runner.core.budget import SOUND, VOICE
 from runner.errors import RunError
 from runner.graph import FEEDBACK, Plan, rtsp_url
 from runner.gst.admission import FORBIDDEN, OK, UNAVAILABLE, Admission
@@ -30,14 +33,17 @@ from runner.gst.rtsp_requests import camera_name, has_password, has_query, path
 from runner.gst.sessions import SessionPool, is_held, on_session_removed
 from runner.gst.timers import every
 from runner.gst.viewers import over_uplink
+from runner.records.vehicle import NOTHING_ENCODED, SoundReading
 from runner.settings import Endpoint, Media
 from runner.system.ports import check_port_free, ip_address_of
 from runner.system.reports import LimitedReports
 
 if TYPE_CHECKING:
+    from runner.gst.loudspeaker import Loudspeaker
     from runner.gst.secure import ViewerCheck
     from runner.security.keyring import Keyring
     from runner.sound import SoundPlan
+    from runner.voice import VoicePlan
 
 BACKLOG = 128  # connections waiting to be accepted; with the library's 5, further viewers would retry after 1 s
 MAX_BODY_BYTES = 65_536  # of a request; the library's limit is 4 GB ...
@@ -46,8 +52,11 @@ LAG_S = 1.0  # a TCP viewer that lags by more is disconnected
 WATCH_MS = 200
 SESSIONS_EVERY_S = 1.0
 GIVE_BACK_S = 10.0  # interval at which memory of ended pipelines and of replaced encoders is returned to the system
-METHODS = ("options", "describe", "setup", "play", "pause", "get-parameter", "set-parameter", "teardown")
-MOVED = GstRtsp.RTSPStatusCode.MOVED_PERMANENTLY
+METHODS = (
+    *("options", "describe", "announce", "setup", "play", "record", "pause", "get-parameter", "set-parameter"),
+    "teardown",
+)
+MOVED, NOT_FOUND = GstRtsp.RTSPStatusCode.MOVED_PERMANENTLY, GstRtsp.RTSPStatusCode.NOT_FOUND
 
 # Default reasons for refusing a client that has not authenticated.
 NO_CERTIFICATE, NO_PASSWORD, WRONG_PASSWORD = (
@@ -61,10 +70,16 @@ class CameraServer:
     """RTSP server with mount points for the sound and for each camera: one plain, one with feedback for our receivers.
 
     keyring  of this vehicle; None: anyone may watch, and nothing is encrypted
+    voice    its loudspeaker; None: it has none
     """
 
     def __init__(
-        self, plans: Sequence[Plan | SoundPlan], media: Media, openings: Openings, keyring: Keyring | None
+        self,
+        plans: Sequence[Plan | SoundPlan],
+        media: Media,
+        openings: Openings,
+        keyring: Keyring | None,
+        voice: VoicePlan | None = None,
     ) -> None:
         check_port_free(media)
         on_report = openings.on_report
@@ -84,12 +99,20 @@ class CameraServer:
         self._cameras = ServedCameras(plans, media, openings, permissions, self._clients, self._stopped)
         self.pipelines = self._cameras.pipelines
         self.admission = Admission(self._cameras, self._clients, self._keys, media, on_report)
+        self._lost = openings.lost
+        self.loudspeaker: Loudspeaker | None = None
+        if voice:
+            kind: Any = import_module("runner.gst.loudspeaker").Loudspeaker
+            report = partial(on_report, VOICE)
+            self.loudspeaker = kind(voice, self._cameras.addresses, self._clients, self._keys, self._lost, report)
         self._left = LeftCameras(self._clients, self.pipelines)
         self._sessions, self._mounts = SessionPool(), GstRtspServer.RTSPMountPoints()
         self._sessions.connect("session-removed", on_session_removed)
         for name, camera in self._cameras.named.items():
             for mount in (name, f"{name}/{FEEDBACK}"):
                 self._mounts.add_factory(f"/{mount}", camera.factory)
+        if self.loudspeaker:
+            self._mounts.add_factory(f"/{VOICE}", self.loudspeaker.factory)
         own = ip_address_of(media.host)  # of a name with several, IPv4
         self._server = self._make_server(own)
         self._attached = self._server.attach(None)
@@ -141,7 +164,8 @@ class CameraServer:
             client.connect(f"{method}-request", self._on_answered)
         client.connect("pre-describe-request", self._on_describe)
         client.connect("describe-request", self._on_described)
-        client.connect("pre-setup-request", self.admission.on_setup)
+        client.connect("pre-announce-request", self._on_announce)
+        client.connect("pre-setup-request", self._on_setup)
         client.connect("setup-request", self._on_set_up)
         client.connect("play-request", self._on_playing)
         client.connect("teardown-request", self._on_teardown)
@@ -151,6 +175,8 @@ class CameraServer:
             connection = self._clients.remove(client)
             if connection:
                 self._left.add(connection.cameras)
+        if self.loudspeaker:
+            self.loudspeaker.on_closed(client)
         if connection and connection.refusal:
             address = connection.viewer.address
             self._report_refusal(f"refused an RTSP client at {address}: {connection.refusal}", address)
@@ -224,12 +250,21 @@ class CameraServer:
             connection.refusal = ""
         self._cameras.release(client)
 
+    def _on_announce(
+        self, client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext
+    ) -> GstRtsp.RTSPStatusCode:
+        return self.loudspeaker.on_announce(client, context) if self.loudspeaker else NOT_FOUND
+
+    def _on_setup(self, client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext) -> GstRtsp.RTSPStatusCode:
+        own = self.loudspeaker if camera_name(context) == VOICE else None
+        return (own or self.admission).on_setup(client, context)
+
     def _on_set_up(self, client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext) -> None:
         connection = self._clients.of(client)
         self._cameras.release(client)
-        if connection is None:
-            return
         name = camera_name(context)
+        if connection is None or name == VOICE:
+            return
         connection.cameras[name] = context.trans
         if context.trans.get_transport().lower_transport & GstRtsp.RTSPLowerTrans.TCP:
             connection.carry_video(self._cameras.named[name].plan.settings.dscp)
@@ -260,6 +295,22 @@ class CameraServer:
     def copies(self) -> dict[str, int]:
         """By camera, the number of viewers outside the vehicle; cameras without any are omitted. From any thread."""
         return self._clients.copies()
+
+    def give_control(self, drivers: Sequence[str], in_control: str) -> None:
+        """See `VehicleSide.give_control`."""
+        self.admission.give_control(drivers)
+        if self.loudspeaker:
+            self.loudspeaker.give_control(in_control)
+
+    def read_sound(self) -> SoundReading:
+        """What the elements of the sound say now. From any thread."""
+        pipeline = self.pipelines.get(SOUND)
+        return SoundReading(
+            encoded=pipeline.counters() if pipeline else NOTHING_ENCODED,
+            lost=self._lost.reasons().get(SOUND),
+            copies=self.copies().get(SOUND, 0),
+            refused=self.admission.refused().get(SOUND, {}),
+        )
 
     def _watch_connections(self) -> None:
         """Close readers that lag, and connections without a complete request or with one that does not end."""

@@ -38,13 +38,18 @@ def _rtcp_key(_client: Gst.Element, _stream: int) -> Gst.Caps:
 
 def _on_send(_client: Gst.Element, request: GstRtsp.RTSPMessage) -> bool:
     """Whether to send a request: always."""
+    join_keys(request)
+    return True
+
+
+def join_keys(request: GstRtsp.RTSPMessage) -> None:
+    """Write the keys of a request, if it has any, so that every server reads them."""
     from runner.gst.mikey import in_one_piece
 
     found, keys = request.get_header(KEY_HEADER, 0)
     if found == GstRtsp.RTSPResult.OK and (joined := KEY_DATA.sub(lambda data: in_one_piece(data[0]), keys)) != keys:
         request.remove_header(KEY_HEADER, -1)
         request.add_header(KEY_HEADER, joined)
-    return True
 
 
 def write_keys(media: GstSdp.SDPMedia) -> None:

@@ -33,7 +33,8 @@ class SupervisedPipeline:
     All methods are called in the thread of GLib's main loop. State changes run in separate threads, so that an element
     that deadlocks does not delay the others.
 
-    on_built   called with each new pipeline before it starts; returns the pad whose first buffer shows that it works
+    on_built   called with each new pipeline before it starts; returns the pad whose first buffer shows that it works,
+               None: `note_working` is called then
     on_report  called once with each reason, until the pipeline works again
     rebuilt    how often a pipeline that had worked was rebuilt
     must_wait   whether it must not be built again yet
@@ -42,7 +43,7 @@ class SupervisedPipeline:
     """
 
     def __init__(
-        self, launch: str, on_built: Callable[[Gst.Pipeline], Gst.Pad], on_report: Callable[[str], None]
+        self, launch: str, on_built: Callable[[Gst.Pipeline], Gst.Pad | None], on_report: Callable[[str], None]
     ) -> None:
         self._launch, self._on_built, self._on_report = launch, on_built, on_report
         self._pipeline: Gst.Pipeline | None = None
@@ -75,8 +76,9 @@ class SupervisedPipeline:
         bus.connect("message::error", self._on_failed)
         bus.connect("message::eos", self._on_failed)
         self._first = self._on_built(pipeline)
-        self._probe = BufferProbe(self._first, self._on_first_buffer)
-        self._probe.arm()
+        if self._first:
+            self._probe = BufferProbe(self._first, self._on_first_buffer)
+            self._probe.arm()
         self._change = set_state_in_thread(pipeline, Gst.State.PLAYING)
 
     def stop(self) -> None:
@@ -142,8 +144,12 @@ class SupervisedPipeline:
 
     def _on_working(self, pad: Gst.Pad) -> None:
         if pad is self._first and self._pipeline is not None:
-            self._works = self._worked = True
-            self._outage.report_recovery(time.monotonic())
+            self.note_working()
+
+    def note_working(self) -> None:
+        """This pipeline works."""
+        self._works = self._worked = True
+        self._outage.report_recovery(time.monotonic())
 
 
 class _AcknowledgementWatch:

@@ -103,6 +103,15 @@ class SoundState:
 
 
 @dataclass(frozen=True, slots=True)
+class VoiceState:
+    """The vehicle's loudspeaker."""
+
+    operator: Annotated[str | None, "id of the operator whose voice it plays; None: nobody is connected"] = None
+    speaking: Annotated[bool, "whether voice arrives"] = False
+    fault: Annotated[str | None, "why it does not open; None: it does"] = None
+
+
+@dataclass(frozen=True, slots=True)
 class VehicleState:
     """State of a vehicle that is online."""
 
@@ -127,6 +136,7 @@ class VehicleState:
         "by camera, how many leave the vehicle, if more than one: together they have the total; absent: one of each",
     ] = UNSET
     sound: Annotated[SoundState | UnsetType, "absent: the vehicle sends none"] = UNSET
+    voice: Annotated[VoiceState | UnsetType, "absent: the vehicle has no loudspeaker"] = UNSET
 
     @property
     def total_words(self) -> str:
@@ -200,6 +210,21 @@ class UplinkTelemetry:
 
 
 @dataclass(frozen=True, slots=True)
+class VoiceTelemetry:
+    """The operator's voice as the vehicle has received it; counters run since the start."""
+
+    operator: Annotated[str | None, "id of the operator that is connected; None: nobody is"]
+    packets: Annotated[Count, "received"]
+    lost: Annotated[Count, "packets that never arrived, or too late"]
+    level_db: Annotated[float | None, "of the last tenth of a second, dB below full scale; None: nothing arrived"]
+
+    @classmethod
+    def of(cls, voice: VoiceReading) -> VoiceTelemetry:
+        level_db = None if voice.level_db is None else round(voice.level_db, 1)
+        return cls(voice.operator, voice.packets, voice.missing, level_db)
+
+
+@dataclass(frozen=True, slots=True)
 class Telemetry:
     """Measured on the vehicle, a few times a second: also its heartbeat."""
 
@@ -212,6 +237,7 @@ class Telemetry:
     speed_factor: Annotated[Share | None, "as in `SpeedAdvice`; None: not advised"] = None
     uplinks: Annotated[Mapping[str, UplinkTelemetry] | UnsetType, "by uplink; absent: there is one"] = UNSET
     sound: Annotated[EncoderCounts | UnsetType, "packets of sound and their bytes; absent: it sends none"] = UNSET
+    voice: Annotated[VoiceTelemetry | UnsetType, "absent: the vehicle has no loudspeaker"] = UNSET
 
 
 @dataclass(frozen=True, slots=True)
@@ -324,6 +350,25 @@ class SoundReading(NamedTuple):
     lost: str | None = None
     copies: int = 0
     refused: Mapping[str, str] = NOTHING
+
+
+class VoiceReading(NamedTuple):
+    """What is known of the vehicle's loudspeaker; without a server, as the defaults.
+
+    operator  that is connected; None: nobody is
+    speaking  whether voice arrives
+    packets   received since the start
+    missing   of these, packets that never arrived, or too late
+    level_db  of the last tenth of a second, dB below full scale; None: nothing arrived
+    lost      why it does not open; None: it does
+    """
+
+    operator: str | None = None
+    speaking: bool = False
+    packets: int = 0
+    missing: int = 0
+    level_db: float | None = None
+    lost: str | None = None
 
 
 def state_to_json(state: VehicleState | None) -> Json:

@@ -42,7 +42,7 @@ from runner.mqtt.messages import (
     run_of,
     topic,
 )
-from runner.plans import as_offered, compile_plans, drive_steering, render_missing, sound_plan, stream_addresses
+from runner.plans import as_offered, compile_plans, drive_steering, other_plans, render_missing, stream_addresses
 from runner.records import to_json
 from runner.records.vehicle import ClockAnswer, Outcome, Settings, SpeedAdvice, SteeringAngle, Telemetry, VehicleState
 from runner.security.exposure import may_listen, vehicle_keyring
@@ -434,14 +434,14 @@ def live_vehicle(
     keyring = vehicle_keyring(setup)
     _check_ros(setup)
     render_missing(setup.vehicle, progress)
-    plans, sound = compile_plans(setup), sound_plan(setup)
-    lost, missing = apply.check_machine(plans, sound, strict=setup.strict), missing_devices(setup)
+    plans, (sound, voice) = compile_plans(setup), other_plans(setup)
+    lost, missing = apply.check_machine(plans, sound, voice, strict=setup.strict), missing_devices(setup)
     if log and setup.strict:
         check_free(log, "vehicle")
     console = _Console(say)
     with ExitStack() as ending:  # in reverse order, also of a vehicle that cannot start
         ending.callback(console.close)
-        versions = apply.versions(e for p in (*plans, sound) if p for e in (*p.source, *p.vehicle))
+        versions = apply.versions(e for p in (*plans, sound, voice) if p for e in (*p.source, *p.vehicle))
         drive = Log(log, "vehicle", document if log else {}, versions, console.say)
         ending.callback(drive.close)
 
@@ -462,6 +462,7 @@ def live_vehicle(
             setup.uplinks,
             partial(may_listen, setup),
             sound,
+            voice,
         )
         ending.callback(side.stop)
         ending.enter_context(_embedded_broker(setup, report))
@@ -487,6 +488,6 @@ def live_vehicle(
             ros.start(patient=not setup.strict)
         metrics.serve(live.problem, control.link)
         control.connect(live)
-        for line in stream_addresses(setup.media, plans, sound):
+        for line in stream_addresses(setup.media, plans, sound, voice):
             console.say(line)
         yield live

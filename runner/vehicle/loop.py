@@ -70,7 +70,7 @@ class Applier(Reader, Protocol):
     def stages(self) -> Mapping[str, SenderStages]: ...
     def sent_frames(self) -> Mapping[str, Iterable[SentFrame]]: ...
     def sent(self) -> Mapping[str, Mapping[str, UplinkSent]]: ...
-    def give_control(self, drivers: Sequence[str]) -> None: ...
+    def give_control(self, drivers: Sequence[str], in_control: str) -> None: ...
     def send_key_frames(self, cameras: Iterable[str], *, begin_anew: bool = False) -> None: ...
 
 
@@ -117,8 +117,8 @@ class ControlLoop:
 
     def __post_init__(self) -> None:
         vehicle = self.vehicle = self.setup.vehicle
-        has_sound = vehicle.sound is not None
-        self._readings = Readings(self.applier, vehicle.cameras, self.on_report, has_sound=has_sound)
+        has = {"has_sound": self.setup.sound is not None, "has_voice": self.setup.voice is not None}
+        self._readings = Readings(self.applier, vehicle.cameras, self.on_report, **has)
         self._inbox = Inbox()
         self.refusals = Refusals(self._now, self._inbox.is_full, self.on_report)
         self._operators, self._attention, self._replies = Operators(self.setup.expires_s), StatedAttention(), Replies()
@@ -381,7 +381,8 @@ class ControlLoop:
         self._guarded("driving", lambda: self.on_driving(now))
         if now.drivers != before.drivers:
             self._notice(copies_events(self._run.state, self._readings.streams, t))
-            self._guarded("control", lambda: self.applier.give_control(now.drivers))
+        if (now.drivers, now.in_control) != (before.drivers, before.in_control):
+            self._guarded("control", lambda: self.applier.give_control(now.drivers, now.in_control))
         if now.in_control != before.in_control:
             self._take(ControlPassed(t=t, operator=now.in_control))
 

@@ -27,6 +27,8 @@ from runner.records.vehicle import (
     UplinkMeasured,
     UplinkTelemetry,
     VehicleState,
+    VoiceState,
+    VoiceTelemetry,
 )
 from runner.settings import LatencyLimit
 from runner.vehicle.readings import Readings
@@ -73,6 +75,8 @@ class Publisher:
         state = vehicle_state(run, readings.cameras, now, self.cause)
         if (sound := readings.sound) is not None:
             state = replace(state, sound=SoundState(sound.lost, sound.refused or UNSET))
+        if (voice := readings.voice) is not None:
+            state = replace(state, voice=VoiceState(voice.operator, voice.speaking, voice.lost))
         if self._is_news(state, REASONS_S if has_viewer else UNSEEN_REASONS_S) and self.publish(state):
             self.again, self._published = False, state
 
@@ -117,7 +121,8 @@ class Publisher:
         links = run.state.links
         uplinks = {name: UplinkTelemetry(own, _measured(links.get(name))) for name, own in addresses.items()}
         sound = UNSET if readings.sound is None else readings.sound.encoded
-        return Telemetry(t, predicted, position, measured, refused, errors, factor, uplinks or UNSET, sound)
+        voice = UNSET if readings.voice is None else VoiceTelemetry.of(readings.voice)
+        return Telemetry(t, predicted, position, measured, refused, errors, factor, uplinks or UNSET, sound, voice)
 
     def _current_position(self, t: float) -> Position | None:
         """The position, while it is not stale; its speed becomes stale earlier."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterable, Mapping
 from typing import Protocol
 
-from runner.core.budget import SOUND
-from runner.records.vehicle import CameraReading, SoundReading
+from runner.core.budget import SOUND, VOICE
+from runner.records.vehicle import CameraReading, SoundReading, VoiceReading
+from runner.vehicle.spoken import Spoken
 
 
 class Reader(Protocol):
@@ -14,29 +16,45 @@ class Reader(Protocol):
 
     def read(self) -> Mapping[str, CameraReading]: ...
     def read_sound(self) -> SoundReading: ...
+    def read_voice(self) -> VoiceReading: ...
 
 
 class Readings:
-    """Of all streams; reports when the sound's source is lost, and when it is found again.
+    """Of all streams; reports when the sound's source or the loudspeaker is lost or found again, and who spoke.
 
     sound  None: the vehicle sends none
+    voice  None: it has no loudspeaker
     """
 
     def __init__(
-        self, reader: Reader, cameras: Iterable[str], on_report: Callable[[str], None], *, has_sound: bool
+        self,
+        reader: Reader,
+        cameras: Iterable[str],
+        on_report: Callable[[str], None],
+        *,
+        has_sound: bool,
+        has_voice: bool = False,
     ) -> None:
         self._reader, self._on_report = reader, on_report
         self.cameras: Mapping[str, CameraReading] = dict.fromkeys(cameras, CameraReading())
         self.sound = SoundReading() if has_sound else None
+        self.voice = VoiceReading() if has_voice else None
+        self._spoken = Spoken()
 
     def read(self) -> None:
         self.cameras = self._reader.read()
-        if self.sound is None:
-            return
-        before, self.sound = self.sound.lost, self._reader.read_sound()
-        if self.sound.lost != before:
-            found = "found again" if self.sound.lost is None else f"lost: {self.sound.lost}; trying again"
-            self._on_report(f"{SOUND}: {found}")
+        if self.sound is not None:
+            before, self.sound = self.sound.lost, self._reader.read_sound()
+            self._report_lost(SOUND, before, self.sound.lost)
+        if self.voice is not None:
+            before, self.voice = self.voice.lost, self._reader.read_voice()
+            self._report_lost(VOICE, before, self.voice.lost)
+            if spoken := self._spoken.look(self.voice, time.monotonic()):
+                self._on_report(spoken)
+
+    def _report_lost(self, name: str, before: str | None, now: str | None) -> None:
+        if now != before:
+            self._on_report(f"{name}: {'found again' if now is None else f'lost: {now}; trying again'}")
 
     @property
     def streams(self) -> Mapping[str, CameraReading | SoundReading]:

@@ -37,7 +37,7 @@ from runner.errors import ArgumentError, MissingBindings, RunError, UserError, r
 from runner.graph import Plan
 from runner.inputs import input_problem
 from runner.mqtt.broker import find_mosquitto
-from runner.plans import compile_plans, nearest_rate, sound_plan, voice_plan
+from runner.plans import compile_plans, nearest_rate, other_plans
 from runner.security.keyring import HOLDER, Keyring
 from runner.security.validity import date, expiring, invalid
 from runner.settings import Endpoint, RosSettings, Setup
@@ -220,7 +220,7 @@ def _elements(verb: str, setup: Setup) -> Iterator[Diagnosis]:
     from runner.elements.packages import missing_plugins, missing_recorders
 
     lines, missing = [], dict[str, None]()
-    others = [plan for plan in (sound_plan(setup), voice_plan(setup)) if plan]
+    others = [plan for plan in other_plans(setup) if plan]
     for plan in (*compile_plans(setup), *others):
         if verb == "operator":
             lines += [plan.operator]

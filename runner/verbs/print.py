@@ -38,7 +38,7 @@ from runner.core.model import Kbps, Mode, Vehicle, exact, plain
 from runner.core.step import start, step
 from runner.errors import ArgumentError, MissingBindings
 from runner.graph import Plan, may_lack_parameter_sets
-from runner.plans import compile_plans, sound_plan, voice_plan
+from runner.plans import compile_plans, other_plans
 from runner.records import to_json
 from runner.records.decisions import CameraDecision, uplinks_decided
 from runner.redact import redacted
@@ -105,7 +105,7 @@ def _plan(arguments: Arguments) -> tuple[Vehicle, Sequence[Plan], Others, Decisi
     config = configuration(arguments.overrides, arguments.conf, site=arguments.site)
     setup = config.setup()
     decision = decide(setup.vehicle, None if total is None else exact(total))
-    others = [plan for plan in (sound_plan(setup), voice_plan(setup)) if plan]
+    others = [plan for plan in other_plans(setup) if plan]
     return setup.vehicle, compile_plans(setup), others, decision, _uplinks(config.document)
 
 

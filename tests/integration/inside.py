@@ -35,6 +35,25 @@ def fail(pipeline: Any, why: str) -> None:
     pipeline.post_message(Gst.Message.new_error(source, error, ""))
 
 
+def holding_voice(monkeypatch: Any, flows: Any) -> None:
+    """Let no packet of voice reach a vehicle's jitter buffer while an event is not set."""
+    from runner.gst import Gst
+    from runner.gst.loudspeaker import _Heard
+
+    before = _Heard.on_element
+
+    def hold(_pad: Any, _info: Any) -> Any:
+        flows.wait()
+        return Gst.PadProbeReturn.OK
+
+    def on_element(heard: Any, pipeline: Any, parent: Any, element: Any) -> None:
+        if element.get_factory() and element.get_factory().get_name() == "rtpjitterbuffer":
+            element.get_static_pad("sink").add_probe(Gst.PadProbeType.BUFFER, hold)
+        before(heard, pipeline, parent, element)
+
+    monkeypatch.setattr(_Heard, "on_element", on_element)
+
+
 def losing(monkeypatch: Any, kind: str, pad: str, is_lost: Callable[[Any], bool], stream: str | None = None) -> None:
     """Let each element of a kind in an operator's receivers lose packets at a pad.
 

@@ -12,7 +12,7 @@ from runner.apply import Reception
 from runner.core.commands import Command, KnobValue
 from runner.graph import Plan
 from runner.records.reception import Arrivals, SentFrame, UplinkReceived, UplinkSent
-from runner.records.vehicle import CameraReading, EncoderCounts, SenderStages, SoundReading
+from runner.records.vehicle import CameraReading, EncoderCounts, SenderStages, SoundReading, VoiceReading
 
 FRAMES = 5  # delivered by a sending camera between two samples
 FRAME_BYTES = 1000
@@ -71,6 +71,9 @@ class RecordingVehicle:
     def read_sound(self) -> SoundReading:
         return SoundReading()
 
+    def read_voice(self) -> VoiceReading:
+        return VoiceReading()
+
     def stages(self) -> dict[str, SenderStages]:
         return {}
 
@@ -83,7 +86,7 @@ class RecordingVehicle:
     def send_key_frames(self, cameras: Iterable[str], *, begin_anew: bool = False) -> None:
         self.key_frames += cameras
 
-    def give_control(self, drivers: Sequence[str]) -> None:
+    def give_control(self, drivers: Sequence[str], in_control: str = "") -> None:
         self.drivers = tuple(drivers)
 
     def push(self, camera: str, frame: Any) -> bool:

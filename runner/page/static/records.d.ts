@@ -117,6 +117,16 @@ export interface SoundState {
   refused?: Record<string, string>;
 }
 
+/** The vehicle's loudspeaker */
+export interface VoiceState {
+  /** id of the operator whose voice it plays; null: nobody is connected */
+  operator: string | null;
+  /** whether voice arrives */
+  speaking: boolean;
+  /** why it does not open; null: it does */
+  fault: string | null;
+}
+
 /** State of a vehicle that is online */
 export interface VehicleState {
   /** s since the start of the run, or of the log that contains this */
@@ -150,6 +160,8 @@ export interface VehicleState {
   copies?: Record<string, number>;
   /** absent: the vehicle sends none */
   sound?: SoundState;
+  /** absent: the vehicle has no loudspeaker */
+  voice?: VoiceState;
 }
 
 /** Position of the vehicle; None: unknown */

@@ -1,0 +1,122 @@
+"""The operator's side of voice: what the page's microphone hears goes to the vehicle's loudspeaker."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from gi.repository import Gst, GstRtsp
+
+from runner.core.budget import VOICE
+from runner.gst.srtp import set_master_key, write_keys
+from runner.gst.supervised import SupervisedPipeline
+from runner.gst.timers import later
+from runner.gst.viewers import user_agent
+from runner.system.lateness import Lateness
+from runner.voice import MICROPHONE, VoicePlan
+
+if TYPE_CHECKING:
+    from runner.gst.secure import StreamLogin
+
+RATE, SAMPLE_BYTES = 48_000, 2  # of what the page sends, one channel
+LATE_S = 0.3  # what has come from the page so much later than usual is not sent: the key may have been released
+RECORDING = 2  # steps after which the client sends
+SILENT_MS = 20  # sent once connected: the client announces its stream when the first packet is there
+
+
+class VoiceSender:
+    """Connects while this operator is in control, so that a key press is heard at once. From any thread.
+
+    on_report  called with what happened to it
+    operator   id of the operator on the control link
+    login      credentials for the vehicle; None: the vehicle does not authenticate
+    """
+
+    def __init__(
+        self, plan: VoicePlan, on_report: Callable[[str, str], None], operator: str, login: StreamLogin | None
+    ) -> None:
+        self._plan, self._operator, self._login = plan, operator, login
+        self._on_report = partial(on_report, VOICE)
+        self._supervised = SupervisedPipeline(plan.sender, self._on_built, self._on_report)
+        self._wanted = self._connected = False
+        self._steps = 0  # of the client, towards sending
+        self._began = 0.0  # this pipeline, time.monotonic
+        self._source: Any = None
+        self._lateness = Lateness()
+
+    def follow(self, *, may_speak: bool) -> None:
+        """Be connected, or not, from now on. To be called a few times a second: it notices revoked keys."""
+        later(0, partial(self._follow, may_speak))
+
+    def _follow(self, may_speak: bool) -> None:
+        before, self._wanted = self._wanted, may_speak
+        if may_speak and not before:
+            self._supervised.start()
+        elif before and not may_speak:
+            self._connected = False
+            self._supervised.stop()
+        elif may_speak and self._login and (withdrawn := self._login.withdrawn()):
+            self._supervised.restart(withdrawn)
+
+    def push(self, samples: bytes, sent: float) -> None:
+        """Send what was spoken; dropped while the vehicle is not connected, and if it is old.
+
+        samples  S16LE at 48 kHz of one channel
+        sent     when it was, s, by any clock that runs steadily
+        """
+        now = time.monotonic()
+        late_s = self._lateness.add(sent, now)
+        if late_s < LATE_S and self._connected:
+            self._source.emit("push-buffer", _buffer(samples, now - late_s - self._began))
+
+    def stop(self) -> None:
+        """In GLib's thread; also a pipeline that hangs is given up."""
+        self._follow(may_speak=False)
+
+    def _on_built(self, pipeline: Gst.Pipeline) -> None:
+        self._connected, self._steps, self._began = False, 0, time.monotonic()
+        self._source, client = pipeline.get_by_name(MICROPHONE), pipeline.get_by_name(self._plan.operator[-1].name)
+        profiles = GstRtsp.RTSPProfile
+        client.set_property("profiles", profiles.SAVP if self._login else profiles.AVP)
+        client.set_property("protocols", GstRtsp.RTSPLowerTrans.UDP)  # see `runner.gst.loudspeaker`
+        client.set_property("user-agent", user_agent(self._operator))
+        client.connect("update-sdp", _join_keys)
+        pipeline.connect("deep-element-added", self._on_element)
+        pipeline.get_bus().connect("message::progress", self._on_progress, pipeline)
+        if self._login and (problem := self._login.prepare(pipeline, client)):
+            self._on_report(problem)
+        self._source.emit("push-buffer", _buffer(bytes(RATE * SAMPLE_BYTES * SILENT_MS // 1000), 0.0))
+
+    def _on_element(self, _pipeline: Gst.Bin, _parent: Gst.Bin, element: Gst.Element) -> None:
+        """Of those that the client adds."""
+        if element.get_factory() and element.get_factory().get_name() == "srtpenc":
+            set_master_key(element)
+        if element.find_property("qos-dscp"):
+            element.set_property("qos-dscp", self._plan.dscp)
+        if element.find_property("processing-deadline"):
+            element.set_property("sync", False)  # or it would hold packets until their time: pure latency
+
+    def _on_progress(self, _bus: Gst.Bus, message: Gst.Message, pipeline: Gst.Pipeline) -> None:
+        """It says so before it announces the stream, and again once the vehicle has set it up."""
+        _, code, _ = message.parse_progress()
+        if code == "record" and self._source.get_parent() is pipeline:
+            self._steps += 1
+            if self._steps == RECORDING:
+                self._connected = True
+                self._supervised.note_working()
+
+
+def _buffer(samples: bytes, at_s: float) -> Gst.Buffer:
+    """With its time: when it was spoken, and not when it arrives here."""
+    buffer = Gst.Buffer.new_wrapped(samples)
+    buffer.pts = round(at_s * Gst.SECOND)
+    buffer.duration = Gst.SECOND * len(samples) // (SAMPLE_BYTES * RATE)
+    return buffer
+
+
+def _join_keys(_client: Gst.Element, description: Any) -> None:
+    with suppress(IndexError):
+        write_keys(description.get_media(0))
