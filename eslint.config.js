@@ -17,7 +17,7 @@ export default [
     },
   },
   { files: STATIC, languageOptions: { ecmaVersion: 2023, globals: { ...globals.browser, ...globals.worker, Plotly: "readonly" } } },
-  { files: ["runner/page/static/hearing_worklet.js"], languageOptions: { globals: globals.audioWorklet } },
+  { files: ["runner/page/static/*_worklet.js"], languageOptions: { globals: globals.audioWorklet } },
   { files: ["runner/page/static/again.js", "runner/page/static/boot.js", "runner/drive/static/*.js"], languageOptions: { sourceType: "script" } },
   { files: ["tests/js/*.js"], languageOptions: { ecmaVersion: 2023, globals: globals.node } },
 ];

@@ -20,6 +20,7 @@ from runner.voice import MICROPHONE, VoicePlan
 
 if TYPE_CHECKING:
     from runner.gst.secure import StreamLogin
+    from runner.security.keyring import Keyring
 
 RATE, SAMPLE_BYTES = 48_000, 2  # of what the page sends, one channel
 LATE_S = 0.3  # what has come from the page so much later than usual is not sent: the key may have been released
@@ -32,13 +33,24 @@ class VoiceSender:
 
     on_report  called with what happened to it
     operator   id of the operator on the control link
-    login      credentials for the vehicle; None: the vehicle does not authenticate
+    keyring    of this operator; None: no authentication
+    vehicle    its name, which its certificate must state
     """
 
     def __init__(
-        self, plan: VoicePlan, on_report: Callable[[str, str], None], operator: str, login: StreamLogin | None
+        self,
+        plan: VoicePlan,
+        on_report: Callable[[str, str], None],
+        operator: str,
+        keyring: Keyring | None = None,
+        vehicle: str = "",
     ) -> None:
-        self._plan, self._operator, self._login = plan, operator, login
+        self._plan, self._operator = plan, operator
+        self._login: StreamLogin | None = None
+        if keyring:
+            from runner.gst.secure import StreamLogin
+
+            self._login = StreamLogin(keyring, vehicle, lambda what: on_report("keys", what))
         self._on_report = partial(on_report, VOICE)
         self._supervised = SupervisedPipeline(plan.sender, self._on_built, self._on_report)
         self._wanted = self._connected = False
@@ -71,10 +83,6 @@ class VoiceSender:
         late_s = self._lateness.add(sent, now)
         if late_s < LATE_S and self._connected:
             self._source.emit("push-buffer", _buffer(samples, now - late_s - self._began))
-
-    def stop(self) -> None:
-        """In GLib's thread; also a pipeline that hangs is given up."""
-        self._follow(may_speak=False)
 
     def _on_built(self, pipeline: Gst.Pipeline) -> None:
         self._connected, self._steps, self._began = False, 0, time.monotonic()

@@ -30,7 +30,7 @@ from runner.errors import RunError
 from runner.metrics.side import SideMetrics
 from runner.operator.log import DriveLog
 from runner.operator.station import Listener, Station, holds_control
-from runner.plans import compile_plans, sound_plan
+from runner.plans import compile_plans, sound_plan, voice_plan
 from runner.records.operator import Sample
 from runner.records.vehicle import Outcome, VehicleState
 from runner.security.exposure import viewer_keyring
@@ -39,11 +39,12 @@ from runner.system.held_up import LateCheck
 from runner.system.service import notify
 
 if TYPE_CHECKING:
-    from runner.apply import OnSound, OnUnit, OperatorSide, SoundPacket
+    from runner.apply import OnSound, OnUnit, OperatorSide, SoundPacket, VoiceSender
     from runner.configuration.experiment import TimedRequest
     from runner.operator.demand import Demand
     from runner.operator.recorded_sound import RecordedSound
     from runner.ros.pictures import DecodedPictures
+    from runner.security.keyring import Keyring
 
 SAMPLE_S = 0.25
 START_S = 20.0  # how long a given duration waits for the vehicle
@@ -61,6 +62,7 @@ class LiveOperator:
 
     requests  in order of time; each is sent at its time since the vehicle came online
     demand    what to receive, see `show`; None: every camera, all the time
+    voice     of this operator; None: it cannot speak
     """
 
     def __init__(
@@ -71,8 +73,9 @@ class LiveOperator:
         build: Callable[[OnUnit | None, OnSound | None], OperatorSide],
         requests: Sequence[TimedRequest] = (),
         demand: Demand | None = None,
+        voice: VoiceSender | None = None,
     ) -> None:
-        self.setup, self.station = setup, station
+        self.setup, self.station, self._voice = setup, station, voice
         self._demand, self._following = demand, threading.Lock()
         self._received = frozenset[str]()  # as the demand was last followed
         self._holds = False  # whether this operator held control when the vehicle was last heard
@@ -152,6 +155,21 @@ class LiveOperator:
         """
         self.station.seen.state(view, for_s)
 
+    def speak(self, samples: bytes, spoken: float) -> None:
+        """Speak at the vehicle's loudspeaker, while this operator is in control. From any thread.
+
+        samples  S16LE at 48 kHz of one channel
+        spoken   when, s, by any clock that runs steadily
+        """
+        if self._voice:
+            self._voice.push(samples, spoken)
+
+    def _follow_voice(self, voice: VoiceSender, state: VehicleState | None) -> None:
+        """Be connected to the vehicle's loudspeaker whenever the vehicle would let this operator speak."""
+        is_open = state is not None and state.voice is not UNSET and state.voice.fault is None
+        driving = state.driving if state else UNSET
+        voice.follow(may_speak=is_open and driving is not UNSET and driving.in_control == self.station.identity)
+
     def _follow(self, demand: Demand) -> None:
         with self._following:
             now = time.monotonic()
@@ -187,6 +205,8 @@ class LiveOperator:
         for thread in (self._thread, self._reporting):
             if thread.ident:
                 thread.join(END_S)
+        if self._voice:
+            self._voice.follow(may_speak=False)
         self.station.close()
         try:
             if self._side:
@@ -244,6 +264,8 @@ class LiveOperator:
             side.admit(addresses)
         state = self.station.state  # another thread may replace it
         driving = state.driving if state else UNSET
+        if self._voice:
+            self._follow_voice(self._voice, state)
         before, self._drivers = self._drivers, () if driving is UNSET else driving.drivers
         samples = side.sample(self.station.sending(), anew=self._drivers != before)
         self.station.take(samples, side.received(), side.sound)
@@ -302,6 +324,19 @@ def _demand() -> Demand:
     from runner.operator.demand import Demand
 
     return Demand()
+
+
+def _voice(setup: Setup, station: Station, keyring: Keyring | None) -> VoiceSender | None:
+    """What sends this operator's voice; None: the configuration has none."""
+    plan = voice_plan(setup)
+    if plan is None:
+        return None
+    from runner import apply
+
+    def report(stream: str, what: str) -> None:
+        station.note(f"{stream}: {what}")
+
+    return apply.VoiceSender(plan, report, station.identity, keyring, setup.vehicle.name)
 
 
 def _ros_pictures(setup: Setup, station: Station) -> DecodedPictures | None:
@@ -373,7 +408,8 @@ def live_operator(
             on_sound=_all_of(on_sound, recorded.add if recorded else None),
         )
 
-    operator = LiveOperator(setup, station, drive, build, requests, _demand() if on_demand else None)
+    demand, voice = _demand() if on_demand else None, _voice(setup, station, keyring)
+    operator = LiveOperator(setup, station, drive, build, requests, demand, voice)
     with ExitStack() as ending:  # in reverse order
         ending.callback(drive.close)
         if setup.control.embedded:

@@ -7,8 +7,10 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict
+from math import isfinite
 from pathlib import Path
 from socket import SO_SNDBUF, SOL_SOCKET
+from struct import Struct
 from typing import TYPE_CHECKING, Any
 
 from aiohttp import WSMsgType, web
@@ -48,6 +50,7 @@ if TYPE_CHECKING:
 FROZEN_MS = 120  # a picture that is frozen for this long is marked within 150 ms
 NOTES = 50  # kept for pages that open later
 REPORTED = tuple(attention.value for attention in Attention if attention is not Attention.ABSENT)  # by pages
+SPOKEN, MAX_SPOKEN_BYTES = Struct("<d"), 4096  # s by the page's clock; of a piece of voice: 40 ms
 SEND_BUFFER_BYTES = 131_072  # small: a viewer that does not read is noticed here, not megabytes later
 PING_S = 0.5
 WRITE_BUFFER_BYTES = 65_536  # likewise, in front of it
@@ -73,6 +76,7 @@ class PageServer(Listener):
     layouts     of the operator; None: layouts cannot be saved
     socket      Unix socket, at which the program serves this page that starts one process for each of several vehicles;
                 None: it is served to browsers
+    on_voice    called in the page's thread with what its holder speaks, as `LiveOperator.speak`; None: dropped
     on_shown    called in the page's thread with the cameras that all windows show, and whether one of them is a page
     raises      RunError if the port is in use or plotly is not installed
     """
@@ -86,9 +90,10 @@ class PageServer(Listener):
         layouts: Layouts | None = None,
         socket: Path | None = None,
         on_shown: Callable[[Collection[str], bool], None] = lambda cameras, is_open: None,
+        on_voice: Callable[[bytes, float], None] | None = None,
     ) -> None:
         self._setup, self._station, self._on_counter = setup, station, on_counter
-        self._socket = socket
+        self._socket, self._on_voice = socket, on_voice
         self._vehicle = vehicle = setup.vehicle
         self._loop = PageLoop()
         self._call_soon = self._loop.call_soon
@@ -252,7 +257,10 @@ class PageServer(Listener):
             if message.type is WSMsgType.PING:
                 await asyncio.wait_for(ws.pong(message.data), limit_s)
             elif message.type in (WSMsgType.TEXT, WSMsgType.BINARY) and self._front.access.visitor(request):
-                self._on_message(viewer, message.data)
+                if message.type is WSMsgType.TEXT:
+                    self._on_message(viewer, message.data)
+                elif self._on_voice and (spoken := _spoken(viewer, message.data, self._windows.holder_for(viewer))):
+                    self._on_voice(*spoken)
                 if not may_drive:
                     await asyncio.sleep(WATCHER_MESSAGE_S)
 
@@ -268,10 +276,10 @@ class PageServer(Listener):
         for note in self._notes:
             viewer.post("note", note)
 
-    def _on_message(self, viewer: PageViewer, text: str | bytes) -> None:
+    def _on_message(self, viewer: PageViewer, text: str) -> None:
         """Handle one message of a page. Even an invalid one is answered and disturbs nothing else."""
         try:
-            document = read_message(text.encode() if isinstance(text, str) else text)
+            document = read_message(text.encode())
         except ValueError as problem:
             viewer.post("reply", {"id": None, "result": "refused", "reason": str(problem)})
             return
@@ -336,6 +344,19 @@ def _refusal(holder: str, request_id: object, event: object) -> str | None:
     if event != STOP_REQUESTED and holder != "you":
         return "this page does not hold control; take it first"
     return None
+
+
+def _spoken(viewer: PageViewer, piece: bytes, holder: str) -> tuple[bytes, float] | None:
+    """A piece of what a page's microphone hears: samples, and when they were spoken; None: not of who may speak.
+
+    holder  of control, as that viewer sees it
+    """
+    samples = piece[SPOKEN.size :]
+    is_meant = viewer.visitor.may_drive and not viewer.monitor and holder == "you"
+    if not is_meant or not samples or len(samples) % 2 or len(piece) > MAX_SPOKEN_BYTES:
+        return None
+    (at,) = SPOKEN.unpack_from(piece)
+    return (samples, at) if isfinite(at) else None
 
 
 def _stated(state: VehicleState | None, station: Station) -> dict[str, Any]:
@@ -431,7 +452,8 @@ def _introduction(setup: Setup, shown: Sequence[int]) -> dict[str, Any]:
     limits = {"late_ms": setup.page.late_ms, "frozen_ms": FROZEN_MS}
     inputs = asdict(setup.inputs)
     described = {"vehicle": setup.vehicle.name, "cameras": cameras, "dimensions": dimensions, "inputs": inputs}
-    return described | limits | ({"sound": True} if setup.sound else {})
+    chosen = {"sound": setup.sound, "voice": setup.voice}
+    return described | limits | {name: True for name, its in chosen.items() if its}
 
 
 def _native(camera: Camera) -> dict[str, int]:

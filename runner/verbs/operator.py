@@ -123,9 +123,11 @@ def _served(
 
     layouts = Layouts(conf, station.identity if setup.keys else WITHOUT_KEYS)
     if socket:
-        page = PageServer(setup, station, layouts=layouts, socket=socket, on_shown=operator.show)
+        page = PageServer(
+            setup, station, layouts=layouts, socket=socket, on_shown=operator.show, on_voice=operator.speak
+        )
     else:
-        page = PageServer(setup, station, keyring=page_keyring(setup), layouts=layouts)
+        page = PageServer(setup, station, keyring=page_keyring(setup), layouts=layouts, on_voice=operator.speak)
     station.listeners.append(page)
     page.start()
     if socket is None:

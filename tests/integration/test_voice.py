@@ -53,7 +53,6 @@ def loudspeaker(heard, *words, keyring=None, lost=None):
 def operator(setup, name, keyring=None, reports=None):
     """An operator's side that may speak. Yields its sender."""
     from runner.apply import VoiceSender
-    from runner.gst.secure import StreamLogin
     from runner.plans import voice_plan
 
     said = [] if reports is None else reports
@@ -61,8 +60,7 @@ def operator(setup, name, keyring=None, reports=None):
     def report(*what):
         said.append(": ".join(what))
 
-    login = StreamLogin(keyring, setup.vehicle.name, lambda what: report("keys", what)) if keyring else None
-    sender = VoiceSender(voice_plan(setup), report, name, login)
+    sender = VoiceSender(voice_plan(setup), report, name, keyring, setup.vehicle.name)
     sender.follow(may_speak=True)
     try:
         yield sender

@@ -13,6 +13,7 @@ import { toggleGuides } from "./drive.js";
 import { toggleStraight } from "./straighten.js";
 import { toggleSound } from "./sound.js";
 import { toggleHearing } from "./hearing_page.js";
+import { hold } from "./talking_page.js";
 import { toggleDrawer, toggleFullScreen, toggleTab, toggleView } from "./views.js";
 import { listMonitors } from "./monitors.js";
 import { request, showProblem, whyNoControl } from "./requests.js";
@@ -61,6 +62,7 @@ export const ACTIONS = {
   map: { description: "the map; in the Drive view opens or closes the drawer with it", run: () => toggleTab("map") },
   sound: { description: "alarm tones on or off", run: toggleSound },
   hear: { description: "the vehicle's sound on or off", run: toggleHearing },
+  talk: { description: "speak at the vehicle while it is held", run: () => hold("key") },
   full_screen: { description: "full screen", run: toggleFullScreen },
   monitors: { description: "pictures in additional windows, for other monitors", run: listMonitors },
   switch: { description: "switch the selected camera on or off", run: () => store.selected && switchCamera(store.selected) },

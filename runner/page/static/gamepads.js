@@ -5,6 +5,7 @@ import { ACTIONS } from "./actions.js";
 import { withKey } from "./hints.js";
 import { actionOf, Presses } from "./presses.js";
 import { reportProblem } from "./requests.js";
+import { hold, letGo } from "./talking_page.js";
 
 const POLL_MS = 15;
 /** @type {Record<string, string[]>} by dialog, the actions whose buttons close it; the list of keys shows which button is pressed */
@@ -28,10 +29,12 @@ function poll() {
   if (!document.hasFocus()) return presses.reset(); // browsers report no change meanwhile
   const pressed = presses.poll(pads());
   if (pressed.length) publish("pressed", pressed);
+  const talk = store.hello?.inputs.buttons.talk;
+  if (![...presses.held.values()].some((held) => held.has(talk ?? ""))) letGo("pad");
   for (const button of pressed) {
     const name = actionOf(store.hello?.inputs.buttons ?? {}, button) ?? "";
     const dialog = document.querySelector("dialog[open]");
-    if (!dialog) ACTIONS[name]?.run();
+    if (!dialog) name === "talk" ? hold("pad") : ACTIONS[name]?.run();
     else if ((CLOSING[dialog.id] ?? ["back"]).includes(name)) /** @type {HTMLDialogElement} */ (dialog).close();
   }
 }

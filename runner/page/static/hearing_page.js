@@ -17,6 +17,7 @@ let context = null;
 /** @type {GainNode|null} */
 let volume = null;
 let failure = "";
+let isDucked = false; // while somebody speaks at this page
 let wasBlocked = true; // whether the browser blocked it when the last press began
 /** @type {{age_ms: number|null, ahead_ms: number|null, level_db: number|null, target_ms: number, counts: any}|null} */
 let heard = null;
@@ -72,7 +73,7 @@ function fault() {
 }
 
 function refresh() {
-  if (context && volume) volume.gain.setTargetAtTime(isMuted() ? 0 : 1, context.currentTime, FADE_S);
+  if (context && volume) volume.gain.setTargetAtTime(isMuted() || isDucked ? 0 : 1, context.currentTime, FADE_S);
   const why = fault();
   const short = why === "muted" ? why : why === BLOCKED ? "blocked" : why ? "none" : `${whole(heard?.age_ms)} ms`;
   setText(words, `${why ? "✕ " : ""}Sound ${short}${store.sample?.sound?.recorded ? " · recorded" : ""}`);
@@ -90,12 +91,14 @@ function step(ahead_ms) {
 
 const lost = (counts) => `${whole(counts?.concealed ?? 0)} packets concealed, ${whole(counts?.dry ?? 0)} gaps`;
 
-/** Beside the alarm tones, in either view. */
-function place() {
-  const isDrive = store.view === "drive";
-  if (isDrive) byId("sound").after(button);
-  else byId("sound-configure").after(button);
+/** Silence while somebody speaks at this page: the vehicle's microphone hears its loudspeaker. @param {boolean} on */
+export function duck(on) {
+  isDucked = on;
+  refresh();
 }
+
+/** Beside the alarm tones, in either view. @param {HTMLElement} element */
+export const placeBeside = (element) => byId(store.view === "drive" ? "sound" : "sound-configure").after(element);
 
 function onHello() {
   button.hidden = !store.hello?.sound;
@@ -108,14 +111,14 @@ export function startHearing() {
   button.addEventListener("click", () => (!wasBlocked || isMuted()) && toggleHearing()); // allowed since the press began
   for (const kind of ["pointerup", "keydown"]) addEventListener(kind, unlock, true);
   listen("hello", onHello);
-  listen("view", place);
+  listen("view", () => placeBeside(button));
   listen("sample", refresh);
   listen("hearing", (report) => {
     heard = report;
     refresh();
   });
   addEventListener("storage", refresh); // muted in another window
-  place();
+  placeBeside(button);
 }
 
 /** For the line of the Drive view. */

@@ -17,6 +17,7 @@ import { startBirdseye } from "./birdseye.js";
 import { startStraight } from "./straighten.js";
 import { startSound } from "./sound.js";
 import { hearing, startHearing } from "./hearing_page.js";
+import { startTalking, talking } from "./talking_page.js";
 import { startTotal } from "./total.js";
 import { startPanel } from "./panel.js";
 import { startTabs } from "./tabs.js";
@@ -51,6 +52,7 @@ startKeys();
 startGamepads();
 startSound();
 startHearing();
+startTalking();
 if (store.view !== "monitor") for (const part of [startTotal, startPanel, startTabs, startCharts, startOthers]) part();
 start();
 
@@ -64,6 +66,7 @@ globalThis.tod = {
   measure: () => ask("measure"),
   stages: () => ask("stages"),
   hearing,
+  talking,
   picture: (name) => ask("picture", name),
   first: (name) => ask("first", name),
   guides: (name) => ask("guides", name),

@@ -38,7 +38,7 @@ let sampledAt = -Infinity; // page time of the last sample
  * @property {number} b_full_kbps
  * @typedef {{vehicle: string, cameras: Camera[], layout: Layout, selected: string|null,
  *   dimensions: import("./guides.js").Dimensions|null, inputs: Inputs, operator: string, answer_s: number,
- *   late_ms: number, sound?: boolean, visitor: {name: string, may_drive: boolean}}} Hello
+ *   late_ms: number, sound?: boolean, voice?: boolean, visitor: {name: string, may_drive: boolean}}} Hello
  * visitor: who has logged in, "" on the station's own machine; selected: in another window of this page; operator: this
  *   station's; answer_s: the station answers a request within this time; late_ms: a picture older than this is late
  * @typedef {{keys: Record<string, string|null>, buttons: Record<string, number|string|null>}} Inputs by action

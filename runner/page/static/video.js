@@ -69,6 +69,7 @@ const station = {
   wake,
 };
 let settings = null; // of the page: {url, origin, video}
+const MOST_VOICE_BYTES = 20_000; // that wait to be sent: 0.2 s
 let socket = null; // null between two attempts
 let receivedAt = 0; // when it last received anything
 let attempts = 0; // to reconnect
@@ -160,6 +161,11 @@ function send(message) {
   if (socket?.readyState !== WebSocket.OPEN) return false;
   socket.send(JSON.stringify(message));
   return true;
+}
+
+/** What the microphone hears; what the connection does not take at once would be heard too late. @param {ArrayBuffer} data */
+function sendVoice(data) {
+  if (socket?.readyState === WebSocket.OPEN && socket.bufferedAmount < MOST_VOICE_BYTES) socket.send(data);
 }
 
 function onText(message) {
@@ -327,6 +333,7 @@ const orders = {
     reportAttention();
   },
   hearing: ({ port, running, latency_ms }) => hearing.attach(port, running, latency_ms),
+  talking: ({ port }) => (port.onmessage = ({ data }) => sendVoice(data)),
   attention({ state, focused }) {
     attention = { attention: state, focused };
     reportAttention();
