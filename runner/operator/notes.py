@@ -12,7 +12,7 @@ from msgspec import UNSET
 from runner.core.driving import Control, Driving
 from runner.core.events import EVENTS
 from runner.core.model import Mode
-from runner.operator.sound import sound_notes
+from runner.operator.sound import sound_notes, voice_notes
 from runner.records.vehicle import CameraState, VehicleState
 
 if TYPE_CHECKING:
@@ -42,13 +42,14 @@ NAMED_SIZES = {Fraction(1): "full", Fraction(1, 2): "half", Fraction(1, 4): "qua
 
 
 def change_notes(before: VehicleState, state: VehicleState) -> Iterator[str]:
-    """Who drives, that the rules fail or decide again, uplinks stall, cameras move, sound is lost; a decision."""
+    """Who drives or speaks, that rules fail or decide again, uplinks stall, cameras move, sound is lost; a decision."""
     if state.driving is not UNSET and (before.driving is UNSET or state.driving.why != before.driving.why):
         yield state.driving.why
     if state.fault != before.fault:
         yield f"{state.fault}; the previous decision stays in force" if state.fault else "the rules decide again"
     yield from _uplink_notes(before, state)
     yield from sound_notes(before, state)
+    yield from voice_notes(before, state)
     if text := decision_note(before, state):
         yield text
 

@@ -9,7 +9,7 @@ from msgspec import UNSET, UnsetType
 
 from runner.operator.latency import corrected
 from runner.records.operator import SoundSample
-from runner.records.vehicle import VehicleState
+from runner.records.vehicle import VehicleState, VoiceState
 from runner.system.clocks import ClockDifference
 
 if TYPE_CHECKING:
@@ -61,6 +61,17 @@ def sound_words(sound: SoundSample) -> str:
     age = "age unknown" if sound.latency_ms is None else f"{sound.latency_ms:.0f} ms old"
     recorded = ", recorded" if sound.recorded else ""
     return f"sound: {age}, {sound.level_db:.0f} dB, {sound.lost} packets lost{recorded}"
+
+
+def voice_notes(before: VehicleState, state: VehicleState) -> Iterator[str]:
+    """Who begins or ends to speak; that the vehicle's loudspeaker does not open any more, and why, or does again."""
+    was, now = (VoiceState() if each.voice is UNSET else each.voice for each in (before, state))
+    if now.speaking != was.speaking:
+        yield f"{now.operator} speaks" if now.speaking else f"{was.operator} has spoken"
+    if now.fault and now.fault != was.fault:
+        yield f"loudspeaker lost: {now.fault}"
+    elif was.fault and not now.fault:
+        yield "loudspeaker found again"
 
 
 def sound_notes(before: VehicleState, state: VehicleState) -> Iterator[str]:

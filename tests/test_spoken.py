@@ -1,8 +1,12 @@
-"""How much later than usual something arrives."""
+"""How much later than usual voice arrives, and who is told that somebody speaks."""
 
 from __future__ import annotations
 
-from runner.records.vehicle import VoiceReading
+from itertools import pairwise
+
+from runner.core.model import Mode
+from runner.operator.sound import voice_notes
+from runner.records.vehicle import VehicleState, VoiceReading, VoiceState
 from runner.system.lateness import Lateness
 from runner.vehicle.spoken import Spoken
 
@@ -40,3 +44,17 @@ def test_a_level_may_be_unknown() -> None:
     spoken = Spoken()
     spoken.look(VoiceReading("alice", speaking=True, packets=3), 0.0)
     assert "level unknown" in str(spoken.look(VoiceReading("alice", packets=3), 1.0))
+
+
+def test_operators_are_told_who_speaks() -> None:
+    def state(voice: VoiceState) -> VehicleState:
+        return VehicleState(0.0, "", Mode.AUTOMATIC, 0, 0, {}, None, voice=voice)
+
+    heard = [VoiceState("alice"), VoiceState("alice", speaking=True), VoiceState(None), VoiceState(fault="unplugged")]
+    told = [list(voice_notes(state(before), state(after))) for before, after in pairwise([*heard, VoiceState()])]
+    assert told == [
+        ["alice speaks"],
+        ["alice has spoken"],
+        ["loudspeaker lost: unplugged"],
+        ["loudspeaker found again"],
+    ]
