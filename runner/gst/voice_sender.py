@@ -57,7 +57,7 @@ class VoiceSender:
         self._steps = 0  # of the client, towards sending
         self._began = 0.0  # this pipeline, time.monotonic
         self._source: Any = None
-        self._lateness = Lateness()
+        self._clock, self._lateness = 0.0, Lateness()
 
     def follow(self, *, may_speak: bool) -> None:
         """Be connected, or not, from now on. To be called a few times a second: it notices revoked keys."""
@@ -73,13 +73,15 @@ class VoiceSender:
         elif may_speak and self._login and (withdrawn := self._login.withdrawn()):
             self._supervised.restart(withdrawn)
 
-    def push(self, samples: bytes, sent: float) -> None:
+    def push(self, samples: bytes, sent: float, clock: float = 0.0) -> None:
         """Send what was spoken; dropped while the vehicle is not connected, and if it is old.
 
-        samples  S16LE at 48 kHz of one channel
-        sent     when it was, s, by any clock that runs steadily
+        samples, clock  as of `runner.operator.live.LiveOperator.speak`
+        sent            when it was spoken
         """
         now = time.monotonic()
+        if clock != self._clock:
+            self._clock, self._lateness = clock, Lateness()
         late_s = self._lateness.add(sent, now)
         if late_s < LATE_S and self._connected:
             self._source.emit("push-buffer", _buffer(samples, now - late_s - self._began))

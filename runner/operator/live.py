@@ -155,14 +155,15 @@ class LiveOperator:
         """
         self.station.seen.state(view, for_s)
 
-    def speak(self, samples: bytes, spoken: float) -> None:
-        """Speak at the vehicle's loudspeaker, while this operator is in control. From any thread.
+    def speak(self, samples: bytes, spoken: float, clock: float = 0.0) -> None:
+        """Speak at the vehicle's loudspeaker, while this operator is in control. From any one thread.
 
         samples  S16LE at 48 kHz of one channel
         spoken   when, s, by any clock that runs steadily
+        clock    which one: a number
         """
         if self._voice:
-            self._voice.push(samples, spoken)
+            self._voice.push(samples, spoken, clock)
 
     def _follow_voice(self, voice: VoiceSender, state: VehicleState | None) -> None:
         """Be connected to the vehicle's loudspeaker whenever the vehicle would let this operator speak."""

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 FROZEN_MS = 120  # a picture that is frozen for this long is marked within 150 ms
 NOTES = 50  # kept for pages that open later
 REPORTED = tuple(attention.value for attention in Attention if attention is not Attention.ABSENT)  # by pages
-SPOKEN, MAX_SPOKEN_BYTES = Struct("<d"), 4096  # s by the page's clock; of a piece of voice: 40 ms
+SPOKEN, MAX_SPOKEN_BYTES = Struct("<dd"), 4096  # s by a page's clock, and which clock; of a piece of voice: 40 ms
 SEND_BUFFER_BYTES = 131_072  # small: a viewer that does not read is noticed here, not megabytes later
 PING_S = 0.5
 WRITE_BUFFER_BYTES = 65_536  # likewise, in front of it
@@ -90,7 +90,7 @@ class PageServer(Listener):
         layouts: Layouts | None = None,
         socket: Path | None = None,
         on_shown: Callable[[Collection[str], bool], None] = lambda cameras, is_open: None,
-        on_voice: Callable[[bytes, float], None] | None = None,
+        on_voice: Callable[[bytes, float, float], None] | None = None,
     ) -> None:
         self._setup, self._station, self._on_counter = setup, station, on_counter
         self._socket, self._on_voice = socket, on_voice
@@ -346,8 +346,8 @@ def _refusal(holder: str, request_id: object, event: object) -> str | None:
     return None
 
 
-def _spoken(viewer: PageViewer, piece: bytes, holder: str) -> tuple[bytes, float] | None:
-    """A piece of what a page's microphone hears: samples, and when they were spoken; None: not of who may speak.
+def _spoken(viewer: PageViewer, piece: bytes, holder: str) -> tuple[bytes, float, float] | None:
+    """A piece of what a page's microphone hears, as of `LiveOperator.speak`; None: not of who may speak.
 
     holder  of control, as that viewer sees it
     """
@@ -355,8 +355,8 @@ def _spoken(viewer: PageViewer, piece: bytes, holder: str) -> tuple[bytes, float
     is_meant = viewer.visitor.may_drive and not viewer.monitor and holder == "you"
     if not is_meant or not samples or len(samples) % 2 or len(piece) > MAX_SPOKEN_BYTES:
         return None
-    (at,) = SPOKEN.unpack_from(piece)
-    return (samples, at) if isfinite(at) else None
+    at, clock = SPOKEN.unpack_from(piece)
+    return (samples, at, clock) if isfinite(at) else None
 
 
 def _stated(state: VehicleState | None, station: Station) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 const RATE = 48_000;
 const COUNT = RATE / 100; // samples of a piece
-const HEAD_BYTES = 8; // when it was spoken, s, by the clock of the audio thread
+const HEAD_BYTES = 16; // when it was spoken, s, by the clock of this audio thread, and which one that is: a random number
 const FULL = 32_767;
 
 class Talking extends AudioWorkletProcessor {
@@ -14,6 +14,7 @@ class Talking extends AudioWorkletProcessor {
 
   constructor() {
     super();
+    this.#piece.setFloat64(8, Math.random(), true);
     this.port.onmessage = ({ data: { worker, held } }) => {
       this.#worker = worker ?? this.#worker;
       this.#isHeld = held ?? this.#isHeld;
