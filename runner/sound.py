@@ -23,6 +23,7 @@ class SoundPlan:
     wire_*     what `print` adds in place of RTSP server and client
     packet_ms  of sound in a packet
     wire_kbps  of one copy, with headers
+    repeats    whether its source is a clip that begins again when it has ended
     needs      by element that only the vehicle may have, the package that provides it
     """
 
@@ -34,6 +35,7 @@ class SoundPlan:
     wire_operator: tuple[Element, ...]
     packet_ms: int
     wire_kbps: Kbps
+    repeats: bool = False
     needs: Mapping[str, str] = field(default_factory=dict)
     name: str = SOUND
 
@@ -105,6 +107,7 @@ def compile_sound(sound: Sound, media: Media) -> SoundPlan:
         wire_operator=fill(sound.wire_operator, "wire.operator"),
         packet_ms=sound.packet_ms,
         wire_kbps=sound.wire_kbps,
+        repeats=sound.needs_clip,
         needs=sound.needs,
     )
 

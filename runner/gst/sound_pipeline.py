@@ -10,8 +10,10 @@ from gi.repository import Gst
 
 from runner.core.model import Element
 from runner.graph import launch
+from runner.gst.probes import EventProbe
 from runner.gst.requests import RequestLimit
 from runner.gst.streams import NOT_SEEKABLE, add_capture_time, drop_queued_packet, passed_counts
+from runner.gst.timers import later
 from runner.records.vehicle import NOTHING_ENCODED, EncoderCounts
 from runner.sound import SoundPlan
 
@@ -42,6 +44,9 @@ class SoundPipeline:
         last = payloader.get_static_pad("src")
         self.requests = RequestLimit(last, on_report)
         NOT_SEEKABLE.add_to(last)
+        if plan.repeats:
+            end = pipeline.get_by_name(plan.source[-1].name)
+            self._repeating = _Repeating(end.get_static_pad("sink"))
 
     def catch_up(self) -> None:
         """It has no knobs."""
@@ -59,6 +64,33 @@ class SoundPipeline:
 
     def send_key_frame(self) -> None:
         """Each packet can be decoded by itself."""
+
+
+class _Repeating:
+    """Makes a clip begin again at its end. What is behind this pad neither sees the end nor is flushed.
+
+    pad  in front of the element that paces the clip
+    """
+
+    def __init__(self, pad: Gst.Pad) -> None:
+        self._pad = pad
+        kinds = Gst.PadProbeType.EVENT_DOWNSTREAM | Gst.PadProbeType.EVENT_FLUSH
+        self._probe = EventProbe(kinds, self._is_dropped)
+        self._probe.add_to(pad)
+
+    def _is_dropped(self, kind: Gst.EventType) -> bool:
+        """From the clip's streaming thread, which must return before it can be started again."""
+        if kind == Gst.EventType.EOS:
+            later(0, self._begin)
+        return kind in (Gst.EventType.EOS, Gst.EventType.FLUSH_START, Gst.EventType.FLUSH_STOP)
+
+    def _begin(self) -> None:
+        element = self._pad.get_parent_element()
+        if element is None or element.get_clock() is None:  # it has been stopped
+            return
+        self._pad.set_offset(element.get_clock().get_time() - element.get_base_time())  # its time goes on
+        flags, kinds = Gst.SeekFlags.FLUSH, Gst.SeekType
+        self._pad.push_event(Gst.Event.new_seek(1.0, Gst.Format.TIME, flags, kinds.SET, 0, kinds.NONE, 0))
 
 
 def sound_problem(plan: SoundPlan) -> str | None:
