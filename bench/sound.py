@@ -5,9 +5,9 @@
   sudo .venv/bin/python bench/sound.py --only pairs --pairs 6
 
 A round trip of 60 ms: 15 ms with 0 to 30 ms of jitter to the operator, 30 ms back. A tone is played by the page of a
-browser, which states its age when it is heard, and its level, losses concealed. The source states a time 20 ms too
-late: a microphone's sound is that much older. Then drives with and without sound in turn, of a camera whose pictures
-fill the link. Needs chromium, and root, as `link=netns` does. Run it on an otherwise idle machine.
+browser, which states its age when it is heard, and its level, losses concealed. Then drives with and without sound in
+turn, of a camera whose pictures fill the link. Needs chromium, and root, as `link=netns` does. Run it on an otherwise
+idle machine.
 """
 
 from __future__ import annotations

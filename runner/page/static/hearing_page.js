@@ -7,6 +7,7 @@ import { byId, make, setAttribute, setText, whole } from "./format.js";
 const { worker } = globalThis.boot;
 const MUTED = "tod-vehicle-muted"; // in the browser's storage
 const FADE_S = 0.02;
+const SAME_MS = 2; // latencies of the output that differ by less
 const QUIET_DB = -60; // the lower end of the level meter
 
 const button = make("button", { id: "hearing", hidden: "" });
@@ -16,6 +17,7 @@ const level = make("meter", { min: String(QUIET_DB), max: "0", high: "-6", "aria
 let context = null;
 /** @type {GainNode|null} */
 let volume = null;
+let latency_ms = 0; // as the worker knows it
 let failure = "";
 let isDucked = false; // while somebody speaks at this page
 let wasBlocked = true; // whether the browser blocked it when the last press began
@@ -27,7 +29,7 @@ const isBlocked = () => context?.state !== "running";
 
 async function build() {
   if (typeof AudioDecoder === "undefined") return void (failure = "this browser cannot decode it");
-  const own = (context = new AudioContext({ sampleRate: 48_000, latencyHint: "interactive" }));
+  const own = (context = new AudioContext({ sampleRate: 48_000, latencyHint: 0 })); // the least
   await own.audioWorklet.addModule("/static/hearing_worklet.js");
   const node = new AudioWorkletNode(own, "hearing", { numberOfInputs: 0, outputChannelCount: [1] });
   const { port1, port2 } = new MessageChannel();
@@ -38,9 +40,12 @@ async function build() {
   attach(port2);
 }
 
+/** From the audio thread to the ear, ms; known some time after it has begun. */
+const outputLatency = () => 1000 * ((context?.baseLatency ?? 0) + (context?.outputLatency ?? 0));
+
 /** @param {MessagePort} [port] */
 function attach(port) {
-  const latency_ms = 1000 * ((context?.baseLatency ?? 0) + (context?.outputLatency ?? 0));
+  latency_ms = outputLatency();
   worker.postMessage({ order: "hearing", port, running: !isBlocked(), latency_ms }, port ? [port] : []);
   refresh();
 }
@@ -115,7 +120,8 @@ export function startHearing() {
   listen("sample", refresh);
   listen("hearing", (report) => {
     heard = report;
-    refresh();
+    if (Math.abs(outputLatency() - latency_ms) > SAME_MS) attach();
+    else refresh();
   });
   addEventListener("storage", refresh); // muted in another window
   placeBeside(button);

@@ -4,7 +4,8 @@
  */
 
 export const RATE = 48_000;
-export const TARGET_MS = 60;
+export const TARGET_MS = 20;
+const START_MS = 40; // buffered before it begins
 const STEP = RATE / 100; // samples concealed at once where nothing is known of the lost packet: 10 ms
 const DRY_STEPS = 6; // concealed so before there is silence
 const DECAY = 0.75; // of what is concealed, each 10 ms
@@ -12,7 +13,7 @@ const FADE = RATE / 400; // samples of a cross-fade: 2.5 ms
 const SHORTEST = RATE / 400, LONGEST = RATE / 60; // period that is looked for: of 400 to 60 Hz
 const COARSE = 4; // samples between two that are compared, in a first look
 const KEPT = 2 * LONGEST + FADE;
-const WINDOW = RATE; // samples in which the least buffer counts
+const WINDOW = 3 * RATE; // samples in which the least buffer counts
 const SLACK_MS = 10; // by which a buffer may exceed its target
 const EXCESS_MS = 200; // and beyond that all of it is dropped at once
 const JUMP = 100; // packets: a larger gap is a new beginning
@@ -48,7 +49,7 @@ export class Playout {
     this.#queue.push(chunk);
   }
 
-  /** Sound is played so long after it has come; a longer time begins with silence. */
+  /** Sound that comes latest is played so long after it has come; a longer time begins with silence. */
   set target_ms(value) {
     if (value > this.#target_ms + SLACK_MS) this.#isPlaying = false;
     this.#target_ms = value;
@@ -95,7 +96,7 @@ export class Playout {
     this.#remember(this.#block);
     this.#block = null;
     this.#at = 0;
-    if (!this.#isPlaying && this.buffered_ms < this.#target_ms) return;
+    if (!this.#isPlaying && this.buffered_ms < Math.max(START_MS, this.#target_ms)) return;
     const isFirst = !this.#isPlaying;
     this.#isPlaying = true;
     const head = this.#queue[0];
@@ -164,13 +165,16 @@ export class Playout {
     return joined;
   }
 
-  /** Shorten a buffer that was too long for a whole second. */
+  /** Shorten a buffer that was too long for a whole window. One too short grows by what is concealed meanwhile. */
   #look(passed) {
     this.#least = Math.min(this.#least, this.#buffered());
     this.#left -= passed;
     if (this.#left > 0) return;
     const excess_ms = this.#isPlaying ? ms(this.#least) - this.#target_ms : 0;
-    if (excess_ms > SLACK_MS) this.#skip(excess_ms > EXCESS_MS ? Math.floor(excess_ms / ms(this.#queue[0].samples.length)) : 1);
+    if (excess_ms > SLACK_MS) {
+      const packets = excess_ms / ms(this.#queue[0].samples.length);
+      this.#skip(Math.max(1, Math.floor(excess_ms > EXCESS_MS ? packets : packets / 2)));
+    }
     this.#least = Infinity;
     this.#left = WINDOW;
   }
