@@ -200,8 +200,7 @@ class VehicleSide:
                 self.carry({name: [str(each) for each in uplinks]})
             with self._lock:
                 self._wanted[name] |= values
-            pipeline = self._pipeline(name)
-            if pipeline:
+            if pipeline := self._pipeline(name):
                 pipeline.turn(values)
 
     def carry(self, placed: Mapping[str, Collection[str]]) -> None:
@@ -214,10 +213,7 @@ class VehicleSide:
         return self._uplinks.counts() if self._uplinks else {}
 
     def give_control(self, drivers: Sequence[str], in_control: str = "") -> None:
-        """Set who drives, or is about to: their viewers are always admitted, see `runner.gst.viewers`.
-
-        in_control  who may speak, "": nobody
-        """
+        """Set who drives, or is about to, whose viewers are always admitted; and who may speak, "" for nobody."""
         if self._server:
             self._server.give_control(drivers, in_control)
 
@@ -290,11 +286,9 @@ class VehicleSide:
 
     def _read(self, name: str, lost: str | None, copies: int, refused: Mapping[str, str]) -> CameraReading:
         pipeline, refusal = self._pipeline(name), self._refusal(name)
-        if pipeline is None:
-            return CameraReading(fault=refusal, lost=lost, copies=copies, refused=refused)
-        rest = pipeline.source_fault or refusal, lost, pipeline.untimed, pipeline.slow_fps, copies, refused
-        applied = self._controls.applied(name, dict(pipeline.knobs.applied))
-        return CameraReading(applied, pipeline.counters(), *rest, placed=pipeline.knobs.placed is not None)
+        seen = pipeline.reading() if pipeline else CameraReading()
+        applied = self._controls.applied(name, seen.applied) if pipeline else NOTHING
+        return seen._replace(applied=applied, fault=seen.fault or refusal, lost=lost, copies=copies, refused=refused)
 
     def _on_found(self, name: str) -> None:
         """From the thread that tries again. A viewer makes the server open its camera."""

@@ -140,7 +140,7 @@ def test_cameras_that_are_lost_are_logged_and_stated_and_found_again() -> None:
 def test_an_operator_returns_though_control_cannot_be_given(monkeypatch: pytest.MonkeyPatch) -> None:
     watched = Watched("modes=safe")
 
-    def fail(drivers: list[str]) -> None:
+    def fail(drivers: list[str], in_control: str) -> None:
         raise OSError("broken pipe")
 
     monkeypatch.setattr(watched.side, "give_control", fail)

@@ -25,7 +25,7 @@ from runner.gst.sent_frames import SentFrames
 from runner.gst.source import loop_clip
 from runner.gst.streams import NOT_SEEKABLE, add_capture_time, drop_queued_packet, passed_counts
 from runner.gst.watched import WatchedSource
-from runner.records.vehicle import NOTHING_ENCODED, EncoderCounts, SenderStages
+from runner.records.vehicle import NOTHING_ENCODED, CameraReading, EncoderCounts, SenderStages
 
 if TYPE_CHECKING:
     from runner.gst.passed import PassedStream
@@ -240,6 +240,17 @@ class CameraPipeline:
         """The rate of its pictures, Hz, if that has been well below the camera's for a while; else None."""
         slow = self._rate.slow_fps
         return None if slow is None else max(1, round(slow))
+
+    def reading(self) -> CameraReading:
+        """What its elements say now."""
+        return CameraReading(
+            applied=dict(self.knobs.applied),
+            encoded=self.counters(),
+            fault=self.source_fault,
+            untimed=self.untimed,
+            slow_fps=self.slow_fps,
+            placed=self.knobs.placed is not None,
+        )
 
     def counters(self) -> EncoderCounts:
         """What the encoder has output so far, counted in C."""

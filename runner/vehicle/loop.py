@@ -117,8 +117,7 @@ class ControlLoop:
 
     def __post_init__(self) -> None:
         vehicle = self.vehicle = self.setup.vehicle
-        has = {"has_sound": self.setup.sound is not None, "has_voice": self.setup.voice is not None}
-        self._readings = Readings(self.applier, vehicle.cameras, self.on_report, **has)
+        self._readings = Readings(self.applier, self.setup, self.on_report)
         self._inbox = Inbox()
         self.refusals = Refusals(self._now, self._inbox.is_full, self.on_report)
         self._operators, self._attention, self._replies = Operators(self.setup.expires_s), StatedAttention(), Replies()

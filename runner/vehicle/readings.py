@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from typing import Protocol
 
 from runner.core.budget import SOUND, VOICE
 from runner.records.vehicle import CameraReading, SoundReading, VoiceReading
+from runner.settings import Setup
 from runner.vehicle.spoken import Spoken
 
 
@@ -26,19 +27,11 @@ class Readings:
     voice  None: it has no loudspeaker
     """
 
-    def __init__(
-        self,
-        reader: Reader,
-        cameras: Iterable[str],
-        on_report: Callable[[str], None],
-        *,
-        has_sound: bool,
-        has_voice: bool = False,
-    ) -> None:
+    def __init__(self, reader: Reader, setup: Setup, on_report: Callable[[str], None]) -> None:
         self._reader, self._on_report = reader, on_report
-        self.cameras: Mapping[str, CameraReading] = dict.fromkeys(cameras, CameraReading())
-        self.sound = SoundReading() if has_sound else None
-        self.voice = VoiceReading() if has_voice else None
+        self.cameras: Mapping[str, CameraReading] = dict.fromkeys(setup.vehicle.cameras, CameraReading())
+        self.sound = SoundReading() if setup.sound else None
+        self.voice = VoiceReading() if setup.voice else None
         self._spoken = Spoken()
 
     def read(self) -> None:
