@@ -86,10 +86,15 @@ class Tile(NamedTuple):
 
 TOPS = ("top_front", "top_left", "top_right", "top_rear")
 LAYOUTS: Mapping[str, Mapping[str, Tile]] = {  # at 1920x1080
-    "drive": {
-        "front_left": Tile(285, 732, fill=True),
+    "drive": {  # as the page states it
+        **dict.fromkeys(("front_left", "front_right"), Tile(511, 277)),
+        "front_center": Tile(1476, 799),
+        "rear_center": Tile(443, 277),
+        **dict.fromkeys(TOPS, Tile(217, 136)),
+    },
+    "narrow": {  # its form on small windows: the sides show 21 % of their images
+        **dict.fromkeys(("front_left", "front_right"), Tile(285, 732, fill=True)),
         "front_center": Tile(1350, 732),
-        "front_right": Tile(285, 732, fill=True),
         "rear_center": Tile(240, 150),
         **dict.fromkeys(TOPS, Tile(294, 183)),
     },

@@ -168,7 +168,7 @@ def bits(drive, t, kbps):
 
 
 def test_a_factor_stays_near_the_bounds_of_its_range_and_rises_after_a_while():
-    drive = Drive(*SEEN, *MEASURED)
+    drive = Drive(*SEEN, *MEASURED, "modes.collective.share_by_quality.kept=1")
     assert bits(drive, 0, 3000) == 1
     assert drive["front"].kbps == 1500, "half of it; from 900 on"
     assert bits(drive, 1, 1400) == 1, "700 are within 40 % of the bound"

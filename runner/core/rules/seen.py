@@ -164,7 +164,7 @@ def share_by_quality(
     draft: Draft,
     memory: Memory,
     *,
-    kept: Fraction = Fraction(1),
+    kept: Fraction = Fraction(17, 20),
     worst: Fraction = Fraction(0),
     least_kbps: Kbps = Fraction(30),
     detail: Fraction = Fraction(3, 2),
