@@ -42,6 +42,7 @@ def first_look(plan: Plan, limit_s: float) -> tuple[int, list[str]]:
                 found.append(message.parse_error()[0].message)
                 break
             stream.look()
+        stream.look()  # all of them may have come between two checks
         return count, found
     finally:
         pipeline.set_state(Gst.State.NULL)
