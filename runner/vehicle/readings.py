@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from runner.core.budget import SOUND, VOICE
 from runner.records.vehicle import CameraReading, SoundReading, VoiceReading
 from runner.settings import Setup
-from runner.vehicle.spoken import Spoken
+
+if TYPE_CHECKING:
+    from runner.vehicle.spoken import Spoken
 
 
 class Reader(Protocol):
@@ -32,7 +34,7 @@ class Readings:
         self.cameras: Mapping[str, CameraReading] = dict.fromkeys(setup.vehicle.cameras, CameraReading())
         self.sound = SoundReading() if setup.sound else None
         self.voice = VoiceReading() if setup.voice else None
-        self._spoken = Spoken()
+        self._spoken = _spoken() if setup.voice else None
 
     def read(self) -> None:
         self.cameras = self._reader.read()
@@ -42,8 +44,8 @@ class Readings:
         if self.voice is not None:
             before, self.voice = self.voice.lost, self._reader.read_voice()
             self._report_lost(VOICE, before, self.voice.lost)
-            if spoken := self._spoken.look(self.voice, time.monotonic()):
-                self._on_report(spoken)
+            if self._spoken and (said := self._spoken.look(self.voice, time.monotonic())):
+                self._on_report(said)
 
     def _report_lost(self, name: str, before: str | None, now: str | None) -> None:
         if now != before:
@@ -52,3 +54,9 @@ class Readings:
     @property
     def streams(self) -> Mapping[str, CameraReading | SoundReading]:
         return self.cameras if self.sound is None else {**self.cameras, SOUND: self.sound}
+
+
+def _spoken() -> Spoken:
+    from runner.vehicle.spoken import Spoken
+
+    return Spoken()

@@ -92,8 +92,11 @@ def test_a_held_key_is_heard_at_the_vehicle_and_mutes_its_sound_here(chromium, t
         until(lambda: page.evaluate("() => tod.hearing()")["gain"] > 0.9)
         samples = struct.unpack(f"<{RATE // 2}h", heard.read_bytes()[-RATE:])
         assert max(samples) > 1000  # the browser's own processing changes its level
+        page.keyboard.press("v")
+        until(lambda: page.evaluate("tod.view") == "drive")
         page.keyboard.down(KEY)
         until(lambda: page.inner_text("#talking") == "SPEAKING")
+        shot(page, "voice-drive")
         page.evaluate("() => dispatchEvent(new Event('blur'))")
         until(lambda: is_silent(page))
         page.keyboard.up(KEY)
