@@ -59,8 +59,12 @@ class PlacedPictures:
         while len(self._regions) > 1 and self._regions[1][0] <= pts:
             self._regions.popleft()
         region = self._regions[0][1]
-        if region == self._full or pts == self._stated_pts:  # a picture may pass in several buffers
+        if region == self._full:
+            return None
+        caps = structure(pad.get_current_caps())
+        # A picture may pass in several buffers, if these are not whole pictures. Different pictures may have one PTS.
+        if caps.get_string("alignment") == "nal" and pts == self._stated_pts:
             return None
         self._stated_pts = pts
-        prefixed = structure(pad.get_current_caps()).get_string("stream-format") in ("avc", "avc3")
+        prefixed = caps.get_string("stream-format") in ("avc", "avc3")
         return with_region(picture.extract(0, picture.size), region, prefixed=prefixed)
