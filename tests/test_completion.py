@@ -37,7 +37,7 @@ def van(conf: UserConf) -> UserConf:
     [
         ("pri", ["print"]),
         ("--v", ["--version"]),
-        ("print v", ["vehicle="]),
+        ("print v", ["vehicle=", "voice=", "voice."]),
         ("print vehicle=", ["vehicle=delivery_robot", "vehicle=one_camera", "vehicle=tum_q7"]),
         ("print +graph@cameras.front_left.graph=open", ["+graph@cameras.front_left.graph=openh264_rtsp"]),
         ("print -", ["-m"]),

@@ -27,7 +27,7 @@ SWEEP = "a,b,c is a sweep, which print, replay and demo run with -m; write [a,b,
 QUOTE = """; quote a value with special characters: 'key="value"'"""
 KNOB_VALUES = (
     "kbps, bps, vbv_ms, left, right, top, bottom, on, off (quote these two), or a template over {width} and"
-    " {height}, or over {kbps}, {bps}, {vbv_ms} and {key_interval_frames}"
+    " {height}, or over {kbps}, {bps}, {vbv_ms}, {key_interval_frames} and {controls}"
 )
 MINE = """# @package _global_
 defaults:
@@ -367,7 +367,7 @@ REAR, GRAPH, PAPER, ROBOT = (
         (
             GRAPH,
             {"value: kbps": "value: left"},
-            "knobs.bitrate: 'left': bitrate offers kbps, bps, key_interval_frames, vbv_ms",
+            "knobs.bitrate: 'left': bitrate offers kbps, bps, controls, key_interval_frames, vbv_ms",
         ),
         (GRAPH, {'value: "off"': "value: off"}, 'knobs.sending[0].value: false: must be text, quote it: "on" or "off"'),
         (

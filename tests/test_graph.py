@@ -305,7 +305,7 @@ def test_a_template_of_several_quantities() -> None:
     wrong = replace(camera, graph=replace(camera.graph, knobs={"bitrate": (replace(target, value="{bps}{width}"),)}))
     with pytest.raises(ModelError) as refused:
         assignments(wrong, "bitrate", 700)
-    rule = "bitrate offers kbps, bps, key_interval_frames, vbv_ms"
+    rule = "bitrate offers kbps, bps, controls, key_interval_frames, vbv_ms"
     assert str(refused.value) == f"graph.knobs.bitrate: '{{bps}}{{width}}': {rule}"
 
 
@@ -313,4 +313,4 @@ def test_a_knob_that_cannot_offer_the_requested_value() -> None:
     wrong = replace(graph(), knobs={"bitrate": (KnobTarget("pay0", "x", "left"),)})
     with pytest.raises(ModelError) as refused:
         assignments(replace(LEFT, graph=wrong), "bitrate", 1)
-    assert str(refused.value) == "graph.knobs.bitrate: 'left': bitrate offers kbps, bps"
+    assert str(refused.value) == "graph.knobs.bitrate: 'left': bitrate offers kbps, bps, controls"

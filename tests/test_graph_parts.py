@@ -10,7 +10,7 @@ from runner.configuration.config import configuration
 from runner.core.model import Graph
 
 BASED = sorted(path.stem for path in (CONF / "graph").glob("*.yaml") if path.stem != "h264_rtsp")
-BASES = {"pass_through_h265": "pass_through"}  # others build on h264_rtsp
+BASES = {"pass_through_h265": "pass_through", "pass_through_v4l2": "pass_through"}  # others build on h264_rtsp
 OPEN = "defaults: [h264_rtsp, _self_]\nencoder:\n"
 ENCODER = "  - {name: encoder, element: openh264enc, properties: {complexity: low}}\n"
 WHOLE = "[{name: gate, element: valve}, {name: crop, element: videocrop}, {name: size, element: capsfilter}, "
@@ -78,10 +78,10 @@ def test_an_effort_sets_properties_of_the_encoder(tod: Command, words: tuple[str
 @pytest.mark.parametrize(
     "words, problem",
     [
-        (("graph.effort=most",), "'most': must be one of lowest, low, medium, high, did you mean lowest?"),
+        (("graph.effort=most",), "'most': must be one of lowest, low, medium, high, exact, did you mean lowest?"),
         (
             ("graph.effort=high", "~graph.efforts.high"),
-            "high: must be one of lowest, low, medium, which this graph's encoder supports",
+            "high: must be one of lowest, low, medium, exact, which this graph's encoder supports",
         ),
         (("graph=openh264_rtsp", "graph.effort=low"), "low: must be medium, which this graph's encoder supports"),
     ],
