@@ -31,6 +31,13 @@ WORDS = (
 )
 
 
+class View(dict):
+    """By camera, what is seen; of one that is not named, more than any screen shows: a busy page states nothing."""
+
+    def __missing__(self, name):
+        return Seen(0, 0, *[2**16 - 1] * 4)
+
+
 class Log:
     """The drive log of the vehicle."""
 
@@ -42,15 +49,15 @@ class Log:
         """Each view that the vehicle has noticed."""
         (file,) = self._directory.glob("vehicle*/drive.jsonl") if not (own := self._own()) else [own]
         found = [json.loads(line) for line in file.read_text().splitlines() if '"view_reported"' in line]
-        return [{name: Seen(**seen) for name, seen in line["view"].items()} for line in found]
+        return [View({name: Seen(**seen) for name, seen in line["view"].items()}) for line in found]
 
     def _own(self):
         return next((path for path in self._directory.rglob("*.jsonl") if '"view_reported"' in path.read_text()), None)
 
     @property
     def view(self):
-        """The last one; {}: everything is seen in full."""
-        return self.views[-1] if self._own() else {}
+        """The last one; empty: everything is seen in full."""
+        return self.views[-1] if self._own() else View()
 
 
 @pytest.fixture(scope="module")
@@ -156,7 +163,7 @@ def test_a_monitor_is_united_with_its_page(page, demo):
     monitor = page.context.new_page()
     monitor.set_viewport_size({"width": 640, "height": 400})
     monitor.goto(f"{url}?show=front")
-    until(lambda: log.view and log.view["front"] != NOWHERE and log.view["mast"] == NOWHERE)
+    until(lambda: log.view["front"] != NOWHERE and log.view["mast"] == NOWHERE)
     assert (log.view["front"].x, log.view["front"].width) == (0, 320)
     monitor.close()
     page.bring_to_front()
