@@ -12,7 +12,7 @@ from runner.core import allocation
 from runner.core.decision import NOTHING, Draft, Shown
 from runner.core.events import Attention
 from runner.core.hull import Contender, best_shares
-from runner.core.model import SMALLEST_SIDE_PX, Camera, Kbps, Roi, Vehicle, exact, least_float
+from runner.core.model import SMALLEST_SIDE_PX, Camera, Kbps, Roi, Vehicle, least_float
 from runner.core.rules.paper import demands
 from runner.core.rules.registry import Last, Memory, Step, rule
 from runner.core.rules.safe import lowest_of_all_copies, share_above_floors, shared_above_floors
@@ -185,7 +185,7 @@ def share_by_quality(
     if lacking:
         draft = draft.noted(f"{', '.join(lacking)} without measured quality: shared by demand")
         return share_above_floors(vehicle, state, draft, memory)
-    how = _How(float(kept), float(worst), float(least_kbps), float(detail))
+    how = _How(float(kept), float(worst), least_kbps, float(detail))
     floors, slopes = lowest_of_all_copies(vehicle, state), list[float]()
 
     def share(wanted: Mapping[str, Kbps], total: Kbps) -> Mapping[str, Kbps]:
@@ -204,7 +204,7 @@ class _How(NamedTuple):
 
     kept: float
     worst: float
-    least_kbps: float
+    least_kbps: Kbps
     detail: float
 
 
@@ -222,7 +222,7 @@ def _best(
     """kbit/s by camera, of all copies, in tenths; and the gain of quality for another kbit/s."""
     names = [name for name, own in wanted.items() if own]
     glance = GLANCE * sum((shown[name].area for name in names), 1)
-    hard = {name: floors.get(name) or exact(how.least_kbps) * copies.get(name, 1) for name in names}
+    hard = {name: floors.get(name) or how.least_kbps * copies.get(name, 1) for name in names}
     full = {name: vehicle.cameras[name].rate_quality.b_full * copies.get(name, 1) for name in names}
     equal = allocation.allocate_above_floors(full, total, weights, hard)
     contenders: dict[str, Contender] = {}
