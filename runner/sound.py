@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from runner.core.budget import SOUND
 from runner.core.graph_settings import GraphSettings
-from runner.core.model import Element, Kbps, ModelError, Value
-from runner.graph import check_free, filled, launch, names_of, rtsp_url, shell
-from runner.settings import Endpoint, Media, Sound
+from runner.core.model import Element, Kbps, ModelError
+from runner.graph import check_free, launch, names_of, shell
+from runner.placeholders import filling
+from runner.settings import Media, Sound
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,21 +81,7 @@ def compile_sound(sound: Sound, media: Media) -> SoundPlan:
 
     raises  ModelError for an unknown placeholder, a name that two elements have, or a last element that is not pay0
     """
-    values: dict[str, Value | None] = {
-        "device": sound.device,
-        "clip": sound.clip,
-        "bps": 1000 * sound.kbps,
-        "packet_ms": sound.packet_ms,
-        "jitter_buffer_ms": sound.jitter_buffer_ms,
-        "host": media.host,
-        "url": rtsp_url(media, SOUND),
-        "port": sound.port,
-        "endpoint": str(Endpoint(media.host, sound.port)),
-    }
-
-    def fill(elements: Iterable[Element], where: str) -> tuple[Element, ...]:
-        return tuple(filled(element, values, f"{where}[{i}]") for i, element in enumerate(elements))
-
+    fill = filling(sound, media, SOUND, clip=sound.clip)
     _check_names(sound)
     return SoundPlan(
         settings=GraphSettings(

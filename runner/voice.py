@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from runner.core.budget import VOICE, sound_kbps
-from runner.core.model import Element, Kbps, ModelError, Value
-from runner.graph import check_free, filled, launch, names_of, rtsp_url, shell
-from runner.settings import Endpoint, Media, Voice
+from runner.core.model import Element, Kbps, ModelError
+from runner.graph import check_free, launch, names_of, shell
+from runner.placeholders import filling
+from runner.settings import Media, Voice
 
 MICROPHONE, DEPAY = "microphone", "depay0"  # names by which elements are found
 
@@ -84,21 +85,7 @@ def compile_voice(voice: Voice, media: Media) -> VoicePlan:
 
     raises  ModelError for an unknown placeholder, a name that two elements have, or one by which none is found
     """
-    values: dict[str, Value | None] = {
-        "device": voice.device,
-        "file": voice.file,
-        "bps": 1000 * voice.kbps,
-        "packet_ms": voice.packet_ms,
-        "jitter_buffer_ms": voice.jitter_buffer_ms,
-        "host": media.host,
-        "url": rtsp_url(media, VOICE),
-        "port": voice.port,
-        "endpoint": str(Endpoint(media.host, voice.port)),
-    }
-
-    def fill(elements: Iterable[Element], where: str) -> tuple[Element, ...]:
-        return tuple(filled(element, values, f"{where}[{i}]") for i, element in enumerate(elements))
-
+    fill = filling(voice, media, VOICE, file=voice.file)
     _check_names(voice)
     return VoicePlan(
         operator=fill(voice.operator, "operator"),
