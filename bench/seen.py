@@ -2,6 +2,7 @@
 
   tod-runner model vehicle=tum_q7 source=synthetic fps_max=20 output=MODELS
   python bench/seen.py MODELS OUT [--totals 1000 2000 3000 5000 8000] [--layouts drive half configure]
+  python bench/seen.py MODELS OUT --clips CLIPS       recorded clips, as bench/clips.py makes them
 
 Columns: total, MSSIM mean, of the worst and of the front camera; kbit/s sent; bits for the mean that the paper's rules
 reach with that total, as a share of theirs; and by how much a camera looks worse than by them at most.
@@ -120,6 +121,7 @@ def main() -> None:
     parser.add_argument("--layouts", nargs="+", choices=LAYOUTS, default=list(LAYOUTS))
     parser.add_argument("--policies", nargs="+", choices=POLICIES, default=list(POLICIES))
     parser.add_argument("--fps", type=int, default=20)
+    parser.add_argument("--clips", type=Path, help="a directory with a clip for each camera; else the synthetic drive")
     parser.add_argument("--set", nargs="*", default=[], help="further overrides of the policies that know the screen")
     parser.add_argument("--each", action="store_true", help="a line for each camera, too")
     options = parser.parse_args()
@@ -132,7 +134,7 @@ def main() -> None:
         for layout in options.layouts
         for total in options.totals
     }
-    scores = Scores(options.output / "scores.json", words)
+    scores = Scores(options.output / "scores.json", words, options.clips)
     scores.add(decided)
     found = {key: on_the_screen(*key[:2], settings, scores) for key, settings in decided.items()}
     for line in table(found, decided, options):
@@ -192,8 +194,8 @@ Decided = Mapping[tuple[str, str, int], Mapping[str, Setting]]
 class Scores:
     """MSSIM on the screen and kbit/s of encodings, kept in a file."""
 
-    def __init__(self, path: Path, words: Sequence[str]) -> None:
-        self._path = path
+    def __init__(self, path: Path, words: Sequence[str], clips: Path | None) -> None:
+        self._path, self._clips = path, clips
         self._setups = {graph: setup(*words, *graph) for graph in {policy.graph for policy in POLICIES.values()}}
         self._known: dict[str, tuple[float, float]] = json.loads(path.read_text()) if path.exists() else {}
 
@@ -258,6 +260,8 @@ class Scores:
     def _clip(self, setup: Setup, name: str) -> Path:
         from runner.plans import compile_plans, render_missing
 
+        if self._clips:
+            return self._clips / f"{name}.mkv"
         only = setup.with_cameras({name: setup.vehicle.cameras[name]})
         render_missing(only.vehicle, lambda what, share: None)
         (plan,) = compile_plans(only)
