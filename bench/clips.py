@@ -18,10 +18,10 @@ from pathlib import Path
 from subprocess import run
 
 from helpers import setup
+from shared_data import SHARED
 
 from runner.graph import shell
 from runner.plans import compile_plans
-from shared_data import SHARED
 
 LOSSLESS = "x264enc pass=quant quantizer=0 speed-preset=ultrafast"
 FILMED = {

@@ -10,6 +10,7 @@ from runner.core.driving import Control, Driving
 from runner.core.events import ViewReported
 from runner.core.state import State
 from runner.core.view import NOWHERE, Seen, united
+from runner.operator.seen import StatedView
 from runner.records.reception import ReceptionReport
 from runner.vehicle.views import MAX_RUNS, VALID_S, StatedViews
 
@@ -93,3 +94,15 @@ def test_regions_that_two_windows_show():
     assert united(HALF, NOWHERE) == united(NOWHERE, HALF) == HALF
     assert united(HALF, replace(HALF, screen_width=64, screen_height=36)) == HALF
     assert united(NOWHERE, NOWHERE) == NOWHERE
+
+
+def test_all_who_show_pictures_in_one_process_are_united():
+    seen = StatedView()
+    seen.state({"front": HALF, "rear": NOWHERE}, by="page")
+    assert seen.view == {"front": HALF, "rear": NOWHERE}
+    seen.state(None, by="ros")
+    assert seen.view == {}
+    seen.state({"front": QUARTER}, by="ros")
+    assert seen.view == {"front": united(HALF, QUARTER)}
+    seen.state({"front": QUARTER}, for_s=0, by="ros")
+    assert seen.view == {}

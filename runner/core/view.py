@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from math import ceil
 from typing import Annotated
 
 from runner.core.limits import Limits
-from runner.core.model import Roi
+from runner.core.model import Camera, Roi
 
-Px = Annotated[int, Limits(0, 65535)]
+MAX_PX = 65535
+Px = Annotated[int, Limits(0, MAX_PX)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +46,17 @@ class Seen:
             return Fraction(0)
         return max(Fraction(self.screen_width, self.width), Fraction(self.screen_height, self.height))
 
+    def problem(self, camera: Camera) -> str | None:
+        """What a camera's image cannot show of it; None: nothing."""
+        lengths = (self.width, self.height, self.screen_width, self.screen_height)
+        if self.x + self.width > camera.width or self.y + self.height > camera.height:
+            return f"must lie inside the image of {camera.width}x{camera.height} px"
+        if len({length > 0 for length in lengths}) > 1:
+            return "width, height and both sides on the screen: all or none must be 0"
+        if max(lengths) > MAX_PX:
+            return f"no length may be above {MAX_PX} px"
+        return None
+
 
 View = Mapping[str, Seen]  # by camera; those not named are seen in full, as large as they are
 NOWHERE = Seen(0, 0, 0, 0, 0, 0)
@@ -56,6 +68,17 @@ def united(one: Seen, other: Seen) -> Seen:
         return other if one.is_empty else one
     both, scale = enclosing(one.roi, other.roi), max(one.scale, other.scale)
     return Seen(both.x, both.y, both.width, both.height, ceil(both.width * scale), ceil(both.height * scale))
+
+
+def together(views: Iterable[View]) -> View:
+    """What several show; without any: everything in full."""
+    shown: dict[str, Seen] | None = None
+    for view in views:
+        if shown is None:
+            shown = dict(view)
+        else:
+            shown = {name: united(seen, view[name]) for name, seen in shown.items() if name in view}
+    return shown or {}
 
 
 def enclosing(one: Roi, other: Roi) -> Roi:

@@ -349,7 +349,8 @@ def _ros_pictures(setup: Setup, station: Station) -> DecodedPictures | None:
         return None
     from runner.ros.pictures import DecodedPictures
 
-    return DecodedPictures(setup, station.note)
+    station.seen.state(None, by="ros")
+    return DecodedPictures(setup, station.note, partial(station.seen.state, by="ros"))
 
 
 @contextmanager

@@ -10,14 +10,13 @@ from typing import Any, NamedTuple
 
 from runner.core.events import Attention
 from runner.core.model import Camera
-from runner.core.view import NOWHERE, Seen, View, united
+from runner.core.view import MAX_PX, NOWHERE, Seen, View, united
 from runner.operator.seen import StatedView
 from runner.page.viewer import PageViewer
 from runner.page.windows import Windows
 
 VALID_S = 2.0  # what a window has stated holds for so long; it states it again every 0.5 s
 LOOK_S = 0.1  # between two looks at what has expired
-MAX_PX = 65535
 KEYS = tuple(field.name for field in fields(Seen))
 
 
@@ -59,7 +58,7 @@ class PageViews:
     def state(self) -> None:
         """State what the driver sees; while nobody is known to watch, nothing: all counts as seen."""
         watches = self._windows.attention is Attention.WATCHING
-        self._seen.state(self._together(time.monotonic()) if watches else None, VALID_S)
+        self._seen.state(self._together(time.monotonic()) if watches else None, VALID_S, by="page")
 
     def _together(self, now: float) -> View:
         """What the windows of the page in control show, by camera; those not named: in full."""
@@ -94,9 +93,4 @@ def _problem_of(camera: Camera, seen: object) -> str | None:
     for key in KEYS:
         if type(seen[key]) is not int or not 0 <= seen[key] <= MAX_PX:
             return f"{key}: must be an integer from 0 to {MAX_PX}"
-    x, y, width, height, *screen = (seen[key] for key in KEYS)
-    if x + width > camera.width or y + height > camera.height:
-        return f"must lie inside the image of {camera.width}x{camera.height} px"
-    if len({width > 0, height > 0, *(length > 0 for length in screen)}) > 1:
-        return "width, height and both sides on the screen: all or none must be 0"
-    return None
+    return Seen(**seen).problem(camera)

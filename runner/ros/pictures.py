@@ -1,32 +1,47 @@
-"""Decoded pictures of the operator's side as ROS topics, with the intrinsics of the delivered pictures."""
+"""Decoded pictures of the operator's side as ROS topics, and what their subscribers show of them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import fields, replace
+from typing import Any
 
 from runner.core.intrinsics import Intrinsics, delivered_intrinsics
 from runner.core.model import Camera, Roi
+from runner.core.view import NOWHERE, Seen, View
 from runner.records.vehicle import CameraState
 from runner.ros.inputs import check_names, ros_name
 from runner.ros.process import NodeProcess, check_discovery
 from runner.settings import Setup
+
+SEEN_KEYS = tuple(field.name for field in fields(Seen))
+SEEN_S = 2.0  # what a message says is shown holds for so long
 
 
 class DecodedPictures:
     """A node that publishes pictures, from `start` until `close`.
 
     on_report  called with one line on what is wrong, from any thread
+    on_seen    called with what subscribers state that they show, and for how long that holds, s, from another thread;
+               cameras that are not named are shown in full
     raises     UserError
     """
 
-    def __init__(self, setup: Setup, on_report: Callable[[str], None]) -> None:
+    def __init__(self, setup: Setup, on_report: Callable[[str], None], on_seen: Callable[[View, float], None]) -> None:
         check_discovery(setup.ros, setup.insecure)
         check_names(setup.vehicle)
         settings = replace(setup.ros, node=f"{setup.ros.node}_operator")
-        self._cameras = setup.vehicle.cameras
+        self._cameras, self._report, self._on_seen = setup.vehicle.cameras, on_report, on_seen
+        self._topics = {f"~/camera/{ros_name(name)}/seen": name for name in self._cameras}
+        self._shown: dict[str, tuple[Seen, float]] = {}  # by camera, and until when: time.monotonic
         self._node = NodeProcess(
-            settings, lambda *_: None, lambda _, what: on_report(what), publishes=True, insecure=setup.insecure
+            settings,
+            self._on_message,
+            lambda _, what: on_report(what),
+            inputs=dict.fromkeys(self._topics, "seen"),
+            publishes=True,
+            insecure=setup.insecure,
         )
 
     def start(self) -> None:
@@ -65,6 +80,28 @@ class DecodedPictures:
             step=len(data) // height,
             intrinsics=lens._asdict() if lens else None,
         )
+
+    def _on_message(self, message: Mapping[str, Any], memory: int) -> None:
+        """What a camera's subscribers show."""
+        camera = self._cameras[self._topics[message["topic"]]]
+        shown, now = seen_of(message, camera), time.monotonic()
+        if problem := shown.problem(camera):
+            self._report(f"{camera.name}: {message['topic']}: {problem}; it counts as seen in full")
+            self._shown.pop(camera.name, None)
+        else:
+            self._shown[camera.name] = shown, now + SEEN_S
+        self._shown = {name: (each, until) for name, (each, until) in self._shown.items() if now < until}
+        view: View = {name: each for name, (each, _) in self._shown.items()}
+        first = min((until for _, until in self._shown.values()), default=now)
+        self._on_seen(view, first - now)
+
+
+def seen_of(message: Mapping[str, Any], camera: Camera) -> Seen:
+    """What a sensor_msgs/CameraInfo states: `roi` of the full image, all zeros for the whole, on width x height px."""
+    x, y, width, height, *screen = (message[key] for key in SEEN_KEYS)
+    if not any(screen):
+        return NOWHERE
+    return Seen(x, y, width, height, *screen) if width or height else Seen(0, 0, camera.width, camera.height, *screen)
 
 
 def intrinsics_of(

@@ -11,7 +11,7 @@ from msgspec import UNSET, UnsetType
 from runner.core.events import Event, ViewReported
 from runner.core.model import Vehicle
 from runner.core.state import State
-from runner.core.view import Seen, View, united
+from runner.core.view import View, together
 from runner.records.reception import ReceptionReport
 from runner.vehicle.operators import PRESENT_S
 
@@ -58,11 +58,7 @@ class StatedViews:
 
     def _together(self, t: float) -> View:
         self._runs = {run: stated for run, stated in self._runs.items() if t - stated.reported < PRESENT_S}
-        views = [stated.view if t - stated.at < VALID_S else {} for stated in self._runs.values()]
-        together: dict[str, Seen] = dict(views[0]) if views else {}
-        for view in views[1:]:
-            together = {name: united(seen, view[name]) for name, seen in together.items() if name in view}
-        return together
+        return together(stated.view if t - stated.at < VALID_S else {} for stated in self._runs.values())
 
     def _possible(self, view: View) -> View:
         """Without what this vehicle's cameras cannot show: another configuration may have been drawn."""

@@ -3,7 +3,8 @@
 Run by a Python that has rclpy or rospy: a node that subscribes to topics of type std_msgs/String. Each line on standard
 input is JSON with topic and one of these:
 
-    text, number, fix ([latitude, longitude, status]), region ([x, y, width, height]), empty
+    text, number, fix ([latitude, longitude, status]), region ([x, y, width, height]),
+    seen (the same, and width and height on the screen), empty
             to be published once somebody has subscribed to the topic
     call    the argument of std_srvs/SetBool, or null for std_srvs/Trigger: a call of that service, once it is offered
 
@@ -25,13 +26,20 @@ from std_msgs.msg import Empty, Float64, String
 from std_srvs.srv import SetBool, Trigger
 
 
+def region_of(values: list[int]) -> RegionOfInterest:
+    return RegionOfInterest(**dict(zip(("x_offset", "y_offset", "width", "height"), values, strict=True)))
+
+
 def message_of(order: dict) -> object:
     if "empty" in order:
         return Empty()
     if "region" in order:
-        return RegionOfInterest(**dict(zip(("x_offset", "y_offset", "width", "height"), order["region"], strict=True)))
+        return region_of(order["region"])
     if "text" in order:
         return String(data=order["text"])
+    if "seen" in order:
+        *region, width, height = order["seen"]
+        return CameraInfo(roi=region_of(region), width=width, height=height)
     if "number" in order:
         return Float64(data=order["number"])
     fix = NavSatFix(latitude=order["fix"][0], longitude=order["fix"][1])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from math import radians, tan
 
@@ -28,6 +29,7 @@ ELEMENTS = ", ".join(
         "{name: raw, element: capsfilter, properties: {caps: '{raw_caps}'}}",
     )
 )
+WHOLE = {"x": 0, "y": 0, "width": 320, "height": 180, "screen_width": 160, "screen_height": 90}
 FOCAL = {"pinhole": 640 / tan(radians(50)), "fisheye": 640 / radians(50)}  # of 100 degrees
 WORDS = (
     *("vehicle=delivery_robot", "~cameras.rear", "~cameras.mast", "cameras.front.width_px=320"),
@@ -87,3 +89,35 @@ def close(viewer, lens):
     if not found or max(abs(found[0] - fx * across - cx), abs(found[1] - fy * down - cy)) >= 1:
         return None
     return image["width"], image["height"]
+
+
+def test_subscribers_state_what_they_show(ros, tmp_path):
+    """It holds for 2 s; what is impossible counts as seen in full."""
+    broker, seen = Endpoint("127.0.0.1", free_port()), f"{NODE}/camera/front/seen"
+    words = [*WORDS, f"control.port={broker.port}", f"media.port={free_port()}"]
+
+    def stated():
+        lines = (json.loads(line) for line in (tmp_path / "log" / "drive.jsonl").read_text().splitlines())
+        return [line["view"].get("front") for line in lines if line.get("event") == "view_reported"]
+
+    with (
+        private_broker(broker),
+        process("vehicle", *words, f"log={tmp_path / 'log'}"),
+        process("operator", *words, "ros.pictures=true", *ros.words) as operator,
+        ros.client("viewer", IMAGE) as viewer,
+    ):
+        until(lambda: viewer.texts(IMAGE), every_s=0.2)
+
+        def shows(*values):
+            viewer.publish(seen, seen=values)
+            return stated()[-1:]
+
+        part = {"x": 32, "y": 18, "width": 160, "height": 90, "screen_width": 320, "screen_height": 180}
+        until(lambda: shows(*part.values()) == [part], every_s=0.3)
+        until(lambda: shows(0, 0, 0, 0, 160, 90) == [{**part, **WHOLE}], every_s=0.3)
+        until(lambda: shows(0, 0, 0, 0, 0, 0) == [dict.fromkeys(part, 0)], every_s=0.3)
+        until(lambda: shows(300, 0, 160, 90, 160, 90) == [None], every_s=0.3)
+        until(lambda: shows(*part.values()) == [part], every_s=0.3)
+        until(lambda: stated()[-1] is None, every_s=0.3)
+        operator.terminate()
+        assert "must lie inside the image of 320x180 px; it counts as seen in full" in operator.communicate()[0]

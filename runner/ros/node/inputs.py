@@ -12,7 +12,12 @@ MAX_TEXT = 20_000  # characters, which JSON may write as six bytes each
 # By kind of input, package and name of its type. Every message of EACH is passed on, of NEWEST only the newest.
 REGION = ("sensor_msgs", "RegionOfInterest")
 EACH = {"text": ("std_msgs", "String"), "number": ("std_msgs", "Float64"), "region": REGION}
-NEWEST = {"fix": ("sensor_msgs", "NavSatFix"), "newest_number": ("std_msgs", "Float64"), "sign": ("std_msgs", "Empty")}
+NEWEST = {
+    "fix": ("sensor_msgs", "NavSatFix"),
+    "newest_number": ("std_msgs", "Float64"),
+    "sign": ("std_msgs", "Empty"),
+    "seen": ("sensor_msgs", "CameraInfo"),
+}
 TYPES = {**EACH, **NEWEST}
 SERVICES = {"trigger": ("std_srvs", "Trigger"), "switch": ("std_srvs", "SetBool")}  # by kind of their calls
 
@@ -47,8 +52,9 @@ class InputTopic:
             case "number":
                 self._pass_on(number=message.data)
             case "region":
-                corner = {"x": message.x_offset, "y": message.y_offset}
-                self._pass_on(**corner, width=message.width, height=message.height)
+                self._pass_on(**_region(message))
+            case "seen":
+                self._pass_on(**_region(message.roi), screen_width=message.width, screen_height=message.height)
             case "sign":
                 self._pass_on()
             case _ if len(message.data) <= MAX_TEXT:
@@ -58,3 +64,8 @@ class InputTopic:
 
     def _pass_on(self, **values: Any) -> None:
         self._port.send(self.kind, topic=self.name, **values)
+
+
+def _region(message: Any) -> dict[str, int]:
+    """Of sensor_msgs/RegionOfInterest."""
+    return {"x": message.x_offset, "y": message.y_offset, "width": message.width, "height": message.height}
