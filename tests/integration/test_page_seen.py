@@ -170,11 +170,16 @@ def test_a_monitor_is_united_with_its_page(page, demo):
     until(lambda: shows(page, log) and log.view["front"] == NOWHERE)
 
 
-@contextmanager
-def stopped():
-    """All pages of the browser are stopped."""
+def renderers():
+    """Processes of the browsers' pages."""
     found = subprocess.run(["pgrep", "-f", "type=renderer"], capture_output=True, text=True, check=False).stdout.split()
-    pids = [int(pid) for pid in found if _is_ours(int(pid))]
+    return {int(pid) for pid in found if _is_ours(int(pid))}
+
+
+@contextmanager
+def stopped(others=frozenset()):
+    """All pages of the browsers are stopped, but those of other processes."""
+    pids = renderers() - others
     assert pids
     try:
         for pid in pids:
