@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from fractions import Fraction
 
 import pytest
-from helpers import Drive
+from helpers import Drive, source_for, vehicle
 
 from runner.core.model import Roi
+from runner.core.step import start
 
 SEEN = ("modes=seen", "vehicle=delivery_robot", "mode=collective")
 QUALITY = (
@@ -180,3 +182,24 @@ def test_a_factor_stays_near_the_bounds_of_its_range_and_rises_after_a_while():
     assert drive["front"].scaling == Fraction(1, 2)
     drive.accept("clock_advanced", t=25)
     assert drive["front"].scaling == 1
+
+
+def test_pictures_that_do_not_say_what_they_show_are_never_cropped_by_a_view():
+    drive = Drive(*SEEN, *MEASURED)
+    front = drive.vehicle.cameras["front"]
+    silent = replace(front, graph=replace(front.graph, places=False))
+    drive.vehicle = replace(drive.vehicle, cameras={**drive.vehicle.cameras, "front": silent})
+    drive.run = start(drive.vehicle)
+    drive.accept("attention_changed", attention="watching")
+    look(drive, 0.1, front=view(0, 0, 64, 64, 64, 64), rear=view(0, 0, 64, 64, 64, 64))
+    drive.accept("clock_advanced", t=2)
+    cropped = {name for name in drive.vehicle.cameras if drive[name].roi != drive.vehicle.cameras[name].full_roi}
+    assert cropped == {"rear"}
+
+
+@pytest.mark.parametrize(
+    ("graph", "places"), [("h264_rtsp", True), ("openh264_rtsp", True), ("h264_srt", True), ("pass_through", False)]
+)
+def test_graphs_of_h264_say_what_their_pictures_show(graph, places):
+    cameras = vehicle("vehicle=delivery_robot", f"graph={graph}", f"source={source_for(graph)}").cameras
+    assert {camera.graph.places for camera in cameras.values()} == {places}

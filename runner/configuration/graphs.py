@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 from runner.configuration.origin import GRAPH_PARTS
 from runner.core.graph_settings import GraphSettings, KnobCommand, KnobTarget
 from runner.core.model import Element, Graph, ModelError, Source
+from runner.graph import places_pictures
 from runner.settings import Recording
 
 MOUNT_KEYS = ("device", "address", "clip", "bag", "topic")
@@ -44,7 +45,7 @@ def read_graph(data: Mapping[str, Any]) -> Graph:
             raise ModelError(key, None, f"is unused; include it in {side} as ${{..{key}}}")
     wire, knobs = data.get("wire") or {}, data["knobs"]
     named = {key: value for key, value in data.items() if key not in GRAPH_STRUCTURE} | _effort(data)
-    return Graph(
+    graph = Graph(
         transport=data["transport"],
         vehicle=elements(data["vehicle"]),
         operator=elements(data["operator"]),
@@ -59,6 +60,7 @@ def read_graph(data: Mapping[str, Any]) -> Graph:
         mutable=tuple((entry["element"], entry["property"]) for entry in data.get("mutable") or ()),
         **given(data, ("verified", "passes", "key_frame", "needs")),
     )
+    return replace(graph, places=places_pictures(graph))
 
 
 def _command(targets: Sequence[Mapping[str, Any]]) -> KnobCommand | None:

@@ -196,6 +196,7 @@ class Graph:
     key_frame     how to request a key frame after unrecovered packet loss: "event", GStreamer's own; "caps", a pixel
                   aspect ratio that differs imperceptibly, for an encoder that ignores the event; None: not at all
     needs         by element that only the vehicle may have, the Debian package that provides it
+    places        whether each encoded picture says which part of the full image it shows, see `runner.h264.region`
     """
 
     transport: str
@@ -212,6 +213,7 @@ class Graph:
     command: KnobCommand | None = None
     key_frame: str | None = None
     needs: Mapping[str, str] = field(default_factory=dict)
+    places: bool = False
 
     def __post_init__(self) -> None:
         names = [element.name for element in (*self.vehicle, *self.wire_vehicle)]

@@ -9,7 +9,7 @@ from gi.repository import Gst
 
 from runner.core.commands import KnobValue
 from runner.core.model import Camera, Roi
-from runner.graph import assignments, places_pictures
+from runner.graph import assignments
 from runner.gst.caps import structure
 from runner.gst.probes import BufferProbe, PassingBuffer, RewritingProbe
 from runner.h264.region import with_region
@@ -36,7 +36,7 @@ class PlacedPictures:
     @classmethod
     def of(cls, pipeline: Gst.Bin, camera: Camera, sent: Gst.Element | None) -> PlacedPictures | None:
         """None: of such a graph no picture can say what it shows."""
-        if sent is None or not places_pictures(camera.graph):
+        if sent is None or not camera.graph.places:
             return None
         return cls(pipeline, camera, sent.get_static_pad("sink"))
 

@@ -99,7 +99,9 @@ def _wanted(camera: Camera, own: Roi, seen: Seen, margin: Fraction) -> tuple[Roi
         left, top = max(0, seen.x - across), max(0, seen.y - down)
         width, height = seen.x + seen.width + across - left, seen.y + seen.height + down - top
         region = enclosing(region, Roi(left, top, width, height))
-    return _within(own, region), min(Fraction(1), Fraction(max(1, ceil(seen.scale * STEPS)), STEPS))
+    # Where pictures do not say what they show, a page would draw them in the wrong place until it knew of a new region.
+    needed = _within(own, region) if camera.graph.places else own
+    return needed, min(Fraction(1), Fraction(max(1, ceil(seen.scale * STEPS)), STEPS))
 
 
 def _largest(camera: Camera, scale: Fraction) -> Fraction:
