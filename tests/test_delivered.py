@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from runner.drive.captures import SAME_NS, RecordedVideo, UnitTimes, arrivals, matched, unfiled
 from runner.drive.delivered import displayed_units, measure
 from runner.drive.read import read_drive
+from runner.drive.videos import Videos
 from runner.h264.access_unit import coded_picture
 
 MS = 1_000_000
@@ -92,7 +93,8 @@ def test_a_video_without_pictures_of_the_vehicle_is_reported(tmp_path: Path) -> 
     drive = read_drive(write_drive(tmp_path, ["vehicle", "operator"], seconds=5, change=recorded))
     warnings: list[str] = []
     cameras = {"front_left": vehicle().cameras["front_left"]}
-    measure(drive, cameras, {}, lambda _: iter(()), lambda *_: iter(()), on_warning=warnings.append)
+    videos = Videos(tmp_path, lambda _: iter(()), lambda *_: iter(()))
+    measure(drive, videos, cameras, {}, on_warning=warnings.append)
     ends = "the vehicle's video ends at 0.0 s, what arrived at 5.0 s"
     assert warnings == [f"front_left: {ends}: scored up to its end"]
 

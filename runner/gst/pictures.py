@@ -29,16 +29,19 @@ def luma_of(buffer: Gst.Buffer, caps: Gst.Caps) -> LumaPlane:
     return rows[:, :width]
 
 
-def decode_video(path: Path, width: int, height: int) -> Iterator[tuple[int, LumaPlane]]:
-    """Decode a file, whatever sizes its pictures change to: ns since its first access unit, luma scaled to one size.
+def decode_video(path: Path, size: tuple[int, int] | None) -> Iterator[tuple[int, LumaPlane]]:
+    """Decode a file, whatever sizes its pictures change to: ns since its first access unit, and luma.
 
+    size    to which pictures are scaled; None: as they were coded
     raises  RunError if the path names no file or nothing can be decoded. Damaged pictures come as they were decoded
     """
     if why := file_problem(path):
         raise RunError(f"{path}: {why}")
-    form = f"video/x-raw,format=I420,width={width},height={height},pixel-aspect-ratio=1/1"
+    form = "video/x-raw,format=I420"
+    if size:
+        form = f"videoscale add-borders=false ! {form},width={size[0]},height={size[1]},pixel-aspect-ratio=1/1"
     pipeline = Gst.parse_launch(
-        "filesrc name=file ! parsebin ! identity name=units ! decodebin ! videoconvert ! videoscale add-borders=false"
+        "filesrc name=file ! parsebin ! identity name=units ! decodebin ! videoconvert"
         f" ! {form} ! appsink name=out sync=false max-buffers=4"
     )
     pipeline.get_by_name("file").set_property("location", str(path))

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from runner.drive.read import Drive
 
 SIDES = ("vehicle", "operator")
+SEEN = "view={} scores what was seen"
 
 
 def run(arguments: Arguments) -> int:
@@ -37,9 +38,10 @@ def run(arguments: Arguments) -> int:
 
 
 def _measure_drive(path: Path) -> None:
-    from runner.drive.delivered import measure
+    from runner.drive.delivered import cropped_by_view, measure
     from runner.drive.quality_file import DOCUMENT, to_json
     from runner.drive.read import read_drive
+    from runner.drive.videos import Videos
     from runner.rate_quality.artefact import dumps
     from runner.system.files import write_whole
 
@@ -54,14 +56,21 @@ def _measure_drive(path: Path) -> None:
             signals.check()
             progress(str(path), share)
 
-        found = measure(drive, cameras, clips, apply.read_video, apply.decode_video, on_progress, _warn)
+        videos = Videos(path, apply.read_video, apply.decode_video)
+        found = measure(drive, videos, cameras, clips, on_progress, _warn)
+    cropped = ", ".join(cropped_by_view(drive))
     if not found:
         raise UserError(str(path), "", None, "no camera's video was kept on both sides: drive with log.video=true")
+    if cropped and not any(quality.mssim for quality in found.values()):
+        rule = f"only what the driver saw was sent of {cropped}, and whole pictures are needed: {SEEN.format(path)}"
+        raise UserError(str(path), "", None, rule)
     if not any(quality.mssim for quality in found.values()):
         rule = "no capture times were logged, so nothing can be compared"
         raise UserError(str(path), "", None, rule)
     if clips and len({quality.clip for quality in found.values()}) > 1:
         _warn(f"{path}: the clips of some cameras are missing: these are compared with the stream as sent")
+    if cropped:
+        _warn(f"{path}: pictures cropped to what the driver saw are left out ({cropped}): {SEEN.format(path)}")
     write_whole(path / DOCUMENT, dumps(to_json(found)))
     _show(path, found)
 
