@@ -127,6 +127,10 @@ class Uplink:
     address: str | None = None
 
 
+FROZEN_MS = 120  # a picture that stands for this long is marked within 150 ms
+FROZEN_INTERVALS = 1.3  # and for so many frame intervals, see `frozenAfter` in page/static/status.js
+
+
 @dataclass(frozen=True, slots=True)
 class PageSettings:
     """The operator's page.

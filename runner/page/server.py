@@ -41,13 +41,12 @@ from runner.records.lines import Note
 from runner.records.operator import Sample
 from runner.records.vehicle import Outcome, VehicleState, state_to_json
 from runner.security.keyring import Keyring
-from runner.settings import Setup
+from runner.settings import FROZEN_MS, Setup
 from runner.system.ports import check_port_free
 
 if TYPE_CHECKING:
     from runner.apply import SoundPacket
 
-FROZEN_MS = 120  # a picture that is frozen for this long is marked within 150 ms
 NOTES = 50  # kept for pages that open later
 REPORTED = tuple(attention.value for attention in Attention if attention is not Attention.ABSENT)  # by pages
 SPOKEN, MAX_SPOKEN_BYTES = Struct("<dd"), 4096  # s by a page's clock, and which clock; of a piece of voice: 40 ms

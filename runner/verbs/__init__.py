@@ -123,7 +123,9 @@ VERBS = {
         DRIVE,
         composes=False,
     ),
-    "quality": Verb("measure the quality of what the operator saw", "runner.verbs.quality", (), DRIVE, composes=False),
+    "quality": Verb(
+        "measure the quality of what the operator saw", "runner.verbs.quality", ("view",), DRIVE, composes=False
+    ),
     "map": Verb(
         "a bandwidth map from drives",
         "runner.verbs.map",

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from runner.core import allocation
 from runner.core.decision import NOTHING, Draft, Shown
 from runner.core.events import Attention
-from runner.core.hull import Contender, best_shares
+from runner.core.hull import Contender, Curve, best_shares
 from runner.core.model import SMALLEST_SIDE_PX, Camera, Kbps, Roi, Vehicle, least_float
 from runner.core.rules.paper import demands
 from runner.core.rules.registry import Last, Memory, Step, rule
@@ -24,6 +24,7 @@ STEPS = 32  # of the scale at which screens show an image
 OVERSAMPLED = 2  # px of a picture for each of the screen; with more, nothing more is seen
 SLOW_MPS = 1.0
 DENSER = 0.75  # of a part of an image: what a camera is aimed at needs more than its share of the bits
+DETAIL = Fraction(3, 2)
 GLANCE = Fraction(1, 100)  # least weight of a camera, as a share of what all screens show
 
 
@@ -169,7 +170,7 @@ def share_by_quality(
     kept: Fraction = Fraction(17, 20),
     worst: Fraction = Fraction(0),
     least_kbps: Kbps = Fraction(30),
-    detail: Fraction = Fraction(3, 2),
+    detail: Fraction = DETAIL,
 ) -> Step:
     """The total is shared so that what screens show looks best; see `runner.core.hull`.
 
@@ -201,6 +202,22 @@ def share_by_quality(
     return draft.noted(f"shared by quality: 100 kbit/s more would add {gain:.1g}") if 0 < gain < inf else draft, memory
 
 
+def displayed_curve(camera: Camera, region: Roi, scale: Fraction, detail: float) -> Curve | None:
+    """Quality of a region as screens show it over its bitrate, by the camera's model; None: not measured.
+
+    scale   px of the screen for each px of the region, at most 1
+    detail  see `share_by_quality`
+    """
+    measured, model = camera.rate_quality.at(scale)
+    times = _part(camera, region) * float(scale / measured) ** detail
+    return model.quality.stretched(times) if model.quality else None
+
+
+def _part(camera: Camera, region: Roi) -> float:
+    """The bits that a region needs, as a share of the full image's."""
+    return float((region.pixels / camera.full_roi.pixels) ** DENSER)
+
+
 class _How(NamedTuple):
     """The parameters of `share_by_quality`."""
 
@@ -230,10 +247,10 @@ def _best(
     contenders: dict[str, Contender] = {}
     for name in names:
         camera, own, times = vehicle.cameras[name], shown[name], copies.get(name, 1)
-        part = (own.roi.pixels / camera.full_roi.pixels) ** DENSER
-        measured, model = camera.rate_quality.at(own.scale)
-        assert model.quality
-        curve = model.quality.stretched(part * float(own.scale / measured) ** how.detail * times)
+        part = _part(camera, own.roi)
+        curve = displayed_curve(camera, own.roi, own.scale, how.detail)
+        assert curve
+        curve = curve.stretched(times)
         weight = float(weights[name] * max(glance, Fraction(own.area)))
         floor = max(float(hard[name]), how.kept * part * float(equal[name]))
         most = max(floor, float(wanted[name])) if weight else floor
