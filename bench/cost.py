@@ -34,10 +34,11 @@ from runner.configuration.config import configuration
 from runner.core.commands import wanted
 from runner.core.model import exact
 from runner.core.scaling import output_size
-from runner.graph import assignments, launch, turn_elements
+from runner.graph import launch
 from runner.mqtt.broker import private_broker
 from runner.plans import compile_plans
 from runner.settings import Endpoint, Setup
+from runner.turning import assignments, turn_elements
 from runner.verbs.print import decide
 
 WORDS = ("vehicle=delivery_robot", "source=test", "mode=single", "modes=open_loop", "pqos=constant", "pqos.kbps=3000")

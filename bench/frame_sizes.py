@@ -19,9 +19,10 @@ from statistics import fmean, pstdev
 import gi
 
 from runner.configuration.config import configuration
-from runner.graph import assignments, launch, text
+from runner.graph import launch
 from runner.lanes import cut
 from runner.plans import compile_plans
+from runner.turning import assignments, text
 
 gi.require_version("Gst", "1.0")
 from gi.repository import Gst  # noqa: E402

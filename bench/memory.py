@@ -28,10 +28,11 @@ from rig import free_port
 from runner.apply import check_plan
 from runner.configuration.config import configuration
 from runner.core.commands import wanted
-from runner.graph import launch, turn_elements
+from runner.graph import launch
 from runner.mqtt.broker import private_broker
 from runner.plans import compile_plans
 from runner.settings import Endpoint
+from runner.turning import turn_elements
 from runner.verbs.print import decide
 
 RUNS = 3

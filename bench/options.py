@@ -32,7 +32,8 @@ from runner.configuration.config import configuration
 from runner.core.commands import KnobValue
 from runner.core.model import Camera, Element, Roi
 from runner.core.scaling import output_size
-from runner.graph import compile_graph, launch, turn_elements
+from runner.graph import compile_graph, launch
+from runner.turning import turn_elements
 
 CAMERA = "front_center"
 SCALER, ENCODER = "graph.vehicle.2.properties", "graph.encoder.0.properties"

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import math
 import re
 import shlex
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from fractions import Fraction
-from functools import lru_cache
 
 from runner.core.commands import KnobValue
 from runner.core.graph_settings import GraphSettings, KnobCommand
@@ -19,23 +16,18 @@ from runner.core.model import (
     Element,
     Graph,
     ModelError,
-    Roi,
     Source,
     Value,
 )
 from runner.errors import suggest
 from runner.settings import Endpoint, Media, Recording
+from runner.turning import per_frame_rate, text, turn_elements
 
 _PLAIN_VALUE = re.compile(r"[\w./:,+=@%-]+")
 # Without colorimetry, decoders derive it from the picture size: colours would change when a picture is scaled.
 COLORIMETRY = "colorimetry=bt709"
 _PICTURE = f"pixel-aspect-ratio=1/1,{COLORIMETRY}"
 SRT_MOST_BYTES = 1316  # of a packet; srtsink cuts longer ones unless its URI states a `payloadsize`
-# Encoders whose rate control goes by the frame rate of their caps, not by the time between pictures: see `assignments`.
-_COUNT_FRAMES = ("x264enc", "x265enc")
-# Encoders whose rate control makes up for time without pictures, by pictures that are too large.
-_SAVE_UP = ("openh264enc",)
-Assignment = tuple[str, str, Value]  # element, property, value
 # Before the encoder of a recording. Frames that find the queue full are dropped and counted, so that a slow encoder or
 # disk never blocks the camera: 128 MB are 42 frames of 1920x1040. `recorded` counts the frames kept.
 _QUEUE: dict[str, Value] = {
@@ -255,47 +247,6 @@ def check_video(graph: Graph) -> None:
         raise ModelError("graph.vehicle", None, f"log.video needs one of {', '.join(CODECS)}", "log.video")
 
 
-def assignments(camera: Camera, knob: str, value: KnobValue, pace: float = 1.0) -> list[Assignment]:
-    """The element properties that turning a knob to a value sets, in the order of the graph.
-
-    pace    the camera's frame rate as a multiple of the one that arrives: so much more is asked of an encoder that
-            counts frames. The length of its buffer stays, since it counts that in frames too
-    raises  ModelError if the type of the value does not fit the knob
-    """
-    if knob == "uplinks":  # which carry the camera is no element's property
-        return []
-    of_time, of_frames = _quantities(camera, value), _quantities(camera, value, pace)
-    count_frames = {element.name for element in camera.graph.vehicle if element.factory in _COUNT_FRAMES}
-    turned: list[Assignment] = []
-    for target in camera.graph.knobs[knob]:
-        quantities = of_frames if target.element in count_frames else of_time
-        turned.append((target.element, target.property, _turned(knob, target.value, quantities)))
-    return turned
-
-
-def _turned(knob: str, wanted: str, quantities: Mapping[str, Value]) -> Value:
-    """What a knob sets: the quantity of that name, or a text with quantities in place of {placeholders}."""
-    names = PLACEHOLDER.findall(wanted)
-    if not quantities.keys() >= set(names or [wanted]):
-        raise ModelError(f"graph.knobs.{knob}", repr(wanted), f"{knob} offers {', '.join(quantities)}")
-    return PLACEHOLDER.sub(lambda match: text(quantities[match[1]]), wanted) if names else quantities[wanted]
-
-
-def is_restarted_after_gaps(graph: Graph) -> bool:
-    """Whether the encoder must begin anew after a time without pictures, and does so with new caps."""
-    saves_up = any(element.factory in _SAVE_UP for element in graph.vehicle)
-    return saves_up and {target.property for target in graph.knobs["size"]} == {"caps"}
-
-
-def turn_elements(camera: Camera, elements: Iterable[Element], knobs: Mapping[str, KnobValue]) -> tuple[Element, ...]:
-    """Elements of a camera with these knobs turned; settings of other elements are ignored."""
-    by_element: dict[str, dict[str, Value]] = {}
-    for knob, value in knobs.items():
-        for name, key, filled in assignments(camera, knob, value):
-            by_element.setdefault(name, {})[key] = filled
-    return tuple(replace(e, properties={**e.properties, **by_element.get(e.name, {})}) for e in elements)
-
-
 def launch(elements: Iterable[Element]) -> str:
     """Text for gst_parse_launch."""
     return " ! ".join(" ".join(_tokens(element, _quoted)) for element in elements)
@@ -331,42 +282,6 @@ def may_lack_parameter_sets(plan: Plan) -> bool:
     places = ("rtph264pay", "h264parse", "h265parse")
     repeats = any(e.properties.get("config-interval") == -1 for e in plan.vehicle if e.factory in places)
     return payloader is not None and not repeats
-
-
-def _quantities(camera: Camera, value: KnobValue, pace: float = 1.0) -> dict[str, Value]:
-    """The quantities that a knob's value offers to its targets, by their names in the YAML."""
-    if isinstance(value, bool):
-        return {"on": value, "off": not value}
-    if isinstance(value, int):
-        bps = round(1000 * value * pace)
-        of_frames = _per_frame_rate(camera.graph.settings, camera.fps)
-        rate: dict[str, Value] = {"kbps": max(1, round(bps / 1000)), "bps": bps}
-        return {**rate, "controls": camera.capture.controls_text, **of_frames, **_buffer(of_frames, value)}
-    if isinstance(value, Roi):
-        # The crop element sees the native picture; an ROI is relative to the full image inside it.
-        native_width, native_height = camera.source_size
-        full = camera.in_source
-        left, top = full.x + value.x, full.y + value.y
-        right, bottom = native_width - left - value.width, native_height - top - value.height
-        return {"left": left, "right": right, "top": top, "bottom": bottom}
-    return dict(zip(("width", "height"), value, strict=True))
-
-
-def _buffer(of_frames: Mapping[str, int], kbps: int) -> dict[str, Value]:
-    """Length of the rate control's buffer, ms, if the graph states it in frames.
-
-    At least 1 kbit: x264 rounds down to whole kbit, and treats 0 as unlimited.
-    """
-    return {"vbv_ms": max(of_frames["vbv_ms"], math.ceil(1000 / kbps))} if "vbv_ms" in of_frames else {}
-
-
-@lru_cache  # needed several times for each new bitrate
-def _per_frame_rate(settings: GraphSettings, fps: Fraction) -> Mapping[str, int]:
-    """The placeholders that settings of a graph fill at a frame rate."""
-    seconds, frames = settings.key_interval_s, settings.vbv_frames
-    values = {} if seconds is None else {"key_interval_frames": seconds * fps}
-    values |= {} if frames is None else {"vbv_ms": 1000 * frames / fps}
-    return {name: max(1, round(value)) for name, value in values.items()}
 
 
 def _check_names(graph: Graph, source: Source, recorder: Iterable[Element]) -> None:
@@ -446,7 +361,7 @@ def _values(camera: Camera, media: Media, index: int, clip: str | None) -> dict[
         "port": port,
         "endpoint": str(Endpoint(media.host, port)),
         "iptos": 4 * settings.dscp if settings.dscp >= 0 else -1,  # the byte of the IP header
-        **_per_frame_rate(settings, camera.fps),
+        **per_frame_rate(settings, camera.fps),
     }
     return values if clip is None else values | {"clip": clip}
 
@@ -479,17 +394,6 @@ def _tokens(element: Element, quote: Callable[[str], str]) -> list[str]:
     pairs = (f"{key}={quote(text(value))}" for key, value in element.properties.items())
     sink, src = ([f"{element.name}.{pad}"] if pad else [] for pad in (element.sink, element.src))
     return [*sink, element.factory, f"name={element.name}", *pairs, *src]
-
-
-def text(value: Value) -> str:
-    """A property's value as GStreamer reads it."""
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, float):
-        # 0.1 stays 0.1, 90000.0 becomes 90000
-        exact = Fraction(str(value))
-        return str(exact.numerator) if exact.denominator == 1 else str(value)
-    return str(value)
 
 
 def _quoted(value: str) -> str:

@@ -13,7 +13,8 @@ from fractions import Fraction
 from runner.core.commands import KnobValue
 from runner.core.model import BagTopic, Element, ModelError, Roi
 from runner.core.scaling import output_size
-from runner.graph import Plan, launch, turn_elements
+from runner.graph import Plan, launch
+from runner.turning import turn_elements
 
 BAG = "bag"  # the appsrc of a sequence that is a topic of a bag
 FRAMES = "frames"  # the tee that passes every frame of the sequence

@@ -13,8 +13,9 @@ from helpers import CONF, setup, source_for, vehicle
 from runner.core.commands import KnobValue
 from runner.core.graph_settings import GraphSettings, KnobTarget
 from runner.core.model import Camera, Element, Graph, ModelError, Roi, Source
-from runner.graph import Plan, assignments, compile_graph, launch, rtsp_url, shell, text
+from runner.graph import Plan, compile_graph, launch, rtsp_url, shell
 from runner.settings import Media
+from runner.turning import assignments, text
 
 MEDIA = Media("127.0.0.1", 8554, rtp_ports=(20000, 20999), session_timeout_s=10, max_viewers=1)
 LEFT = vehicle("modes=paper").cameras["front_left"]

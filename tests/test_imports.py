@@ -40,9 +40,9 @@ def loaded(*words: str) -> tuple[int, set[str]]:
 
 
 RUNNING = {  # modules of the project and heavy packages; `validate` reads maps and queries GStreamer's registry
-    "print": (62, COMPOSING),
-    "replay": (69, COMPOSING),
-    "validate": (146, COMPOSING | {"numpy", "gi", "asyncio"}),  # asyncio: by PyGObject from 3.50 on
+    "print": (63, COMPOSING),
+    "replay": (70, COMPOSING),
+    "validate": (147, COMPOSING | {"numpy", "gi", "asyncio"}),  # asyncio: by PyGObject from 3.50 on
 }
 HELP = {
     "vehicle": {"paho"},

@@ -36,7 +36,7 @@ from runner.core.model import (
 from runner.core.mounting import Place, Pose, overlapping
 from runner.core.rules import RuleCall
 from runner.errors import ConfigError, Problem, suggest
-from runner.graph import Plan, assignments, check_video, compile_graph
+from runner.graph import Plan, check_video, compile_graph
 from runner.redact import redacted
 from runner.settings import (
     Control,
@@ -56,6 +56,7 @@ from runner.settings import (
     Voice,
     address_rule,
 )
+from runner.turning import assignments
 
 if TYPE_CHECKING:
     from runner.configuration.experiment import LinkSettings, TimedRequest

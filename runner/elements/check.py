@@ -15,7 +15,8 @@ from runner.elements.description import SINK, SRC, Registry
 from runner.elements.packages import PACKAGE_OF, missing_plugins, missing_recorders
 from runner.elements.values import value_problem
 from runner.errors import suggest
-from runner.graph import Plan, assignments, text
+from runner.graph import Plan
+from runner.turning import assignments, text
 
 if TYPE_CHECKING:
     from runner.sound import SoundPlan

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 
 from runner.core.model import Value
 from runner.elements.description import EnumValue, Property
-from runner.graph import text
+from runner.turning import text
 
 _WHOLE = re.compile(r"[+-]?(?:0x(?P<hexadecimal>[0-9a-f]+)|0(?P<octal>[0-7]+)|[0-9]+)", re.IGNORECASE)
 _REAL = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?|[+-]?(nan|inf|infinity)", re.IGNORECASE)

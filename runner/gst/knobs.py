@@ -10,10 +10,10 @@ from gi.repository import Gst
 
 from runner.core.commands import KnobValue
 from runner.core.model import Camera, Value
-from runner.graph import Assignment, assignments, text
 from runner.gst.caps import structure
 from runner.gst.placed import PlacedPictures
 from runner.gst.probes import IdleProbe
+from runner.turning import Assignment, assignments, text
 
 _PARSERS = {"GstCaps": Gst.Caps.from_string, "GstStructure": Gst.Structure.new_from_string}
 ANOTHER_RATIO = (60001, 60000)  # of 16 bits each; below 30000 px no player rounds it to another pixel
@@ -75,7 +75,7 @@ class KnobPanel:
 
     @property
     def pace(self) -> float:
-        """As in `runner.graph.assignments`."""
+        """As in `runner.turning.assignments`."""
         return self._pace
 
     @pace.setter

@@ -10,7 +10,7 @@ from gi.repository import Gst, GstRtp, GstVideo
 
 from runner.core.commands import KnobValue
 from runner.errors import RunError
-from runner.graph import Plan, is_restarted_after_gaps
+from runner.graph import Plan
 from runner.gst.held_up import HeldUp
 from runner.gst.knobs import KnobPanel
 from runner.gst.lost import LostCameras
@@ -26,6 +26,7 @@ from runner.gst.source import loop_clip
 from runner.gst.streams import NOT_SEEKABLE, add_capture_time, drop_queued_packet, passed_counts
 from runner.gst.watched import WatchedSource
 from runner.records.vehicle import NOTHING_ENCODED, CameraReading, EncoderCounts, SenderStages
+from runner.turning import is_restarted_after_gaps
 
 if TYPE_CHECKING:
     from runner.gst.passed import PassedStream

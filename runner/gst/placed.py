@@ -9,10 +9,10 @@ from gi.repository import Gst
 
 from runner.core.commands import KnobValue
 from runner.core.model import Camera, Roi
-from runner.graph import assignments
 from runner.gst.caps import structure
 from runner.gst.probes import BufferProbe, PassingBuffer, RewritingProbe
 from runner.h264.region import with_region
+from runner.turning import assignments
 
 
 class PlacedPictures:
