@@ -20,13 +20,14 @@ from helpers import CONF, Command, Result
 
 from runner.configuration.compose import compose
 from runner.core.events import CameraSwitched
-from runner.drive import quality_file
+from runner.drive import quality_file, seen_file
 from runner.drive.charts import Figure
 from runner.drive.checks import ClaimCheck
 from runner.drive.colours import DAY, NIGHT
 from runner.drive.figures import bitrates, figures
 from runner.drive.quality_file import DeliveredQuality
 from runner.drive.read import read_drive
+from runner.drive.seen_file import Ages, Optimum, SeenCamera, SeenDrive
 from runner.drive.series import series
 from runner.drive.statistics import statistics
 from runner.schema import findings
@@ -181,6 +182,49 @@ def test_without_measured_quality_the_figure_is_left_out(tod: Command, drive: Pa
     content = document(tmp_path)
     assert content["drives"][0]["delivered"] is None
     assert any(each.startswith("delivered: left out, quality of delivered pictures") for each in content["left_out"])
+
+
+@pytest.mark.usefixtures("unprinted")
+def test_what_was_seen_on_the_screen_is_shown_beside_the_optimum(tod: Command, drive: Path, tmp_path: Path) -> None:
+    path = shutil.copytree(drive, tmp_path / "measured")
+    moments = tuple(float(t) for t in np.arange(0.5, 19, 0.5))
+    falling = {"mssim": tuple(0.95 - 0.005 * t for t in moments), "vmaf": tuple(90 - t for t in moments)}
+    lacking: dict[str, tuple[float | None, ...]] = {
+        "mssim": (None, *[0.7] * (len(moments) - 1)),
+        "vmaf": (None, *[50.0] * (len(moments) - 1)),
+    }
+    ages = Ages(45.0, 80.0, 0.01, 0.02)
+    cameras = {
+        "front_center": SeenCamera(moments, (300,) * len(moments), falling, ages, scene=True),
+        "rear_center": SeenCamera(moments, (100,) * len(moments), lacking, None, scene=False),
+    }
+    metrics = {"mssim": "MSSIM of luma", "vmaf": "VMAF"}
+    found = SeenDrive("view.jsonl", metrics, cameras, Optimum(2500.0, 0.931, {"front_center": 0.95}))
+    (path / "seen.json").write_text(json.dumps(seen_file.to_json(found)))
+    status, out, _ = tod("report", str(path), f"output={tmp_path / 'out'}")
+    assert status == 0
+    content = document(tmp_path / "out")
+    described = content["drives"][0]["seen"]
+    screen = [0.75 * (0.95 - 0.005 * t) + 0.25 * 0.7 for t in moments[1:]]
+    assert described["screen"]["mssim"]["mean"] == pytest.approx(np.mean(screen), abs=1e-5)
+    assert described["screen"]["mssim"]["worst"] == pytest.approx(min(screen), abs=1e-5)
+    assert described["cameras"]["front_center"]["age"]["late_share"] == 0.02
+    assert described["cameras"]["rear_center"]["scores"]["mssim"]["p5"] == pytest.approx(0.7)
+    assert described["optimum"] == {"kbps": 2500, "mssim": 0.931}
+    assert "seen" in content["figures"]
+    assert "on the screen" in out
+    assert "0.931" in out
+    assert "0.931" in (tmp_path / "out" / "index.html").read_text()
+
+
+@pytest.mark.parametrize("text", ["{", '{"cameras": {"front_left": {"t": 1}}}'])
+def test_what_was_seen_that_cannot_be_read(tod: Command, drive: Path, tmp_path: Path, text: str) -> None:
+    path = shutil.copytree(drive, tmp_path / "measured")
+    (path / "seen.json").write_text(text)
+    status, _, err = tod("report", str(path), f"output={tmp_path / 'out'}")
+    assert status == 2
+    rule = "must be as `tod-runner quality DRIVE view=LOG` writes it: run it again, or delete the file"
+    assert err.splitlines()[-1] == f"{path / 'seen.json'}: {rule}"
 
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"cameras": {"front_left": {"t": 1}}}', '{"cameras": 1}'])

@@ -14,6 +14,7 @@ from runner.core.limits import Count, Limits, NonNegative, Share
 from runner.drive.checks import ClaimCheck
 from runner.drive.latency import Latency
 from runner.drive.predictions import Worth
+from runner.drive.seen_document import SeenDocument, seen_document
 from runner.drive.series import LinkSeries, Series
 from runner.drive.statistics import CameraStatistics, DriveStatistics
 from runner.drive.uplink_statistics import UplinkDocument, UplinkStatistics
@@ -252,6 +253,7 @@ class DriveDocument(TypedDict):
     uplinks       of the vehicle, by name; absent where it has one
     quality       mean of the cameras; None where there is no model, or models are of different metrics
     delivered     None where it was not measured
+    seen          absent where it was not measured
     warnings      notes on the logs
     notes         on the figures
     checks        claims compared with the drive
@@ -288,6 +290,7 @@ class DriveDocument(TypedDict):
     uplinks: NotRequired[Mapping[str, UplinkDocument]]
     quality: Quality | None
     delivered: Delivered | None
+    seen: NotRequired[SeenDocument]
     warnings: list[str]
     notes: list[str]
     checks: list[Claim]
@@ -397,6 +400,8 @@ def _drive(drive: DriveStatistics, checks: Sequence[ClaimCheck]) -> DriveDocumen
         "checks": [{"claim": check.claim, "outcome": check.outcome, "holds": check.holds} for check in checks],
         "cameras": [_camera(camera) for camera in drive.cameras.values()],
     }
+    if drive.seen:
+        document["seen"] = seen_document(drive.seen)
     if lanes:
         document["lanes"] = lanes
     if drive.uplinks:

@@ -18,6 +18,7 @@ from runner.drive.latency import SECOND_S, latencies, per_second, to_arrival
 from runner.drive.over_time import KBPS, Drives, Rows, drive_label, link_rates, over_time, steps, top
 from runner.drive.panels import Panel
 from runner.drive.predictions import EVERY_S, Compared, compared
+from runner.drive.seen_figure import seen
 from runner.drive.series import Positions, Series
 from runner.drive.statistics import DriveStatistics
 from runner.drive.time_series import FloatSeries, TimeSeries, held
@@ -258,6 +259,7 @@ FIGURES: dict[str, tuple[str, Callable[[Drives], Rows | str | None]]] = {
     "latency": ("Latency and freezes", latency),
     "quality": ("Estimated quality over time", quality),
     "delivered": ("Measured quality of delivered pictures", delivered),
+    "seen": ("Measured quality on the screen", seen),
 }
 
 

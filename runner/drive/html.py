@@ -18,7 +18,17 @@ from runner.drive.colours import DAY, NIGHT
 from runner.drive.document import number, rules, when
 from runner.drive.series import Series
 from runner.drive.statistics import DriveStatistics
-from runner.drive.tables import LEGEND, UPLINKS, VERDICTS, camera_rows, drive_rows, shown, uplink_rows
+from runner.drive.tables import (
+    LEGEND,
+    SEEN,
+    UPLINKS,
+    VERDICTS,
+    camera_rows,
+    drive_rows,
+    seen_rows,
+    shown,
+    uplink_rows,
+)
 from runner.drive.time_series import FloatSeries
 from runner.system.files import plotly_script
 
@@ -96,6 +106,9 @@ def _body(
         if drive.uplinks:
             table = _table("Statistics by uplink", uplink_rows(drive))
             yield _section(f"Uplinks{_suffix(drive, several)}", f'{table}<p class="muted">{escape(UPLINKS)}</p>')
+        if drive.seen:
+            table = _table("What the driver saw", seen_rows(drive.seen))
+            yield _section(f"On the screen{_suffix(drive, several)}", f'{table}<p class="muted">{escape(SEEN)}</p>')
     yield f'<p class="muted">{escape(LEGEND)}</p>'
     yield from (_reasons(drive, _suffix(drive, several)) for drive in drives)
     named = ((each, f"{side}{_suffix(drive, several)}") for drive in drives for side, each in _versions(drive))

@@ -17,6 +17,7 @@ from runner.drive.camera_series import CameraSeries, ReceivedSeries, sending_spa
 from runner.drive.latency import NAN, UNKNOWN, Freeze, Latency, concatenated, freezes, latency
 from runner.drive.predictions import Worth, compared, worth
 from runner.drive.quality_file import DeliveredQuality
+from runner.drive.seen_file import SeenDrive
 from runner.drive.series import Series
 from runner.drive.time_series import RATE_WINDOW_S, Flags, FloatSeries, TimeSeries, held, mean, mean_held, ratio, spans
 from runner.drive.uplink_statistics import UplinkStatistics, uplink_statistics
@@ -109,6 +110,7 @@ class DriveStatistics:
 
     predictions  what they were worth; None: nothing was predicted, or believed of the link, for long enough
     uplinks      by name; none if there is one
+    seen         what the driver saw; None if it was not measured
     """
 
     series: Series
@@ -134,25 +136,28 @@ class DriveStatistics:
     predictions: Worth | None
     uplinks: Mapping[str, UplinkStatistics]
     notes: tuple[str, ...]
+    seen: SeenDrive | None = None
 
 
 def statistics(
     drive: Series,
     models: Mapping[str, Model] | None = None,
     delivered: Mapping[str, DeliveredQuality] | None = None,
+    seen: SeenDrive | None = None,
 ) -> DriveStatistics:
     """All figures of a drive.
 
     models     by camera, if there is one
     delivered  by camera, quality measured on its pictures, if it was
+    seen       what the driver saw, if it was measured
     """
     models, delivered = models or {}, delivered or {}
     cameras = {
         name: camera_statistics(c, drive.end, models.get(name), delivered.get(name))
         for name, c in drive.cameras.items()
     }
-    seen = [camera.delivered.mean for camera in cameras.values() if camera.delivered]
-    means = np.array([value for value in seen if value is not None])
+    delivered_means = [camera.delivered.mean for camera in cameras.values() if camera.delivered]
+    means = np.array([value for value in delivered_means if value is not None])
     each = list(cameras.values())
     received = [c.received for c in drive.cameras.values() if c.received]
     clock_bound = received[0].bound_ms if received else UNKNOWN  # of all: they share the vehicle's clock
@@ -188,6 +193,7 @@ def statistics(
         predictions=known_worth,
         uplinks=uplink_statistics(drive.uplinks, drive.end),
         notes=tuple(_notes(drive, cameras, known_worth)),
+        seen=seen,
     )
 
 

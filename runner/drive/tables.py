@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 from runner.drive.latency import Latency
+from runner.drive.seen_file import SeenCamera, SeenDrive
 from runner.drive.statistics import CameraStatistics, DriveStatistics
 from runner.drive.uplink_statistics import UplinkStatistics
 
@@ -24,6 +25,12 @@ UPLINKS = (
     "Share: of the packets that arrived, copies included. Lost alone: what this uplink without the others would have"
     " lost. Copies: packets that had already arrived by another. Received is counted with packet headers."
 )
+SEEN = (
+    "The picture on the screen against the scene at its capture, twice a second, at px of the screen, black where"
+    " nothing was sent; the screen: cameras by area. Age: since capture. Frozen: none came although one was due. Late:"
+    " too old when it came. Optimum: MSSIM of the best static allocation of the same bits, by the cameras' own models."
+)
+METRICS = {"mssim": ("MSSIM", 3), "vmaf": ("VMAF", 0)}  # label, digits
 SIZES = 3  # number of picture sizes listed, those received longest
 
 
@@ -61,6 +68,34 @@ def uplink_rows(drive: DriveStatistics) -> tuple[TableRow, list[TableRow]]:
     headings: TableRow = ("uplink", "allowed kbit/s", "received kbit/s", "share", "lost alone", "copies")
     headings += ("queue ms, p95", "stalls", "stalled s", "longest s", "cameras\ncame", "cameras\nleft")
     return headings, [_uplink(name, each) for name, each in drive.uplinks.items()]
+
+
+def seen_rows(seen: SeenDrive) -> tuple[TableRow, list[TableRow]]:
+    """Headings, a row for each camera, and one for the whole screen."""
+    headings: TableRow = ("camera", *(f"{METRICS[name][0]}\nmean / 5 % / worst" for name in seen.metrics))
+    headings += ("age ms\nmean / 95 %", "frozen", "late", "optimum")
+    best = seen.optimum
+    rows = [
+        (name, *_seen(camera, seen.metrics), *_age(camera), shown(best.cameras.get(name) if best else None, 3))
+        for name, camera in seen.cameras.items()
+    ]
+    screen: TableRow = ("screen", *_seen(seen, seen.metrics), *[""] * 3, shown(best.mssim if best else None, 3))
+    return headings, [*rows, screen]
+
+
+def _seen(of: SeenCamera | SeenDrive, metrics: Mapping[str, str]) -> TableRow:
+    found = ((of.summary(name), METRICS[name][1]) for name in metrics)
+    return tuple(
+        " / ".join(shown(each, digits) for each in (its.mean, its.p5, its.worst)) if its else NOTHING
+        for its, digits in found
+    )
+
+
+def _age(camera: SeenCamera) -> TableRow:
+    age = camera.age
+    if age is None:
+        return (NOTHING,) * 3
+    return f"{age.mean_ms:.0f} / {age.p95_ms:.0f}", f"{age.frozen:.1%}", f"{age.late:.1%}"
 
 
 def _uplink(name: str, uplink: UplinkStatistics) -> TableRow:

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
@@ -215,30 +215,13 @@ def _show(path: Path, found: Mapping[str, DeliveredQuality]) -> None:
 
 
 def _show_seen(path: Path, seen: SeenDrive) -> None:
-    labels = {"mssim": "MSSIM", "vmaf": "VMAF"}
-    headings = ["camera", *(f"{labels[name]}\nmean / 5 % / worst" for name in seen.metrics)]
-    headings += ["age ms\nmean / 95 %", "frozen", "late"]
-    rows = [tuple(_seen_row(name, camera, seen)) for name, camera in seen.cameras.items()]
-    _print_table(path, headings, [*rows, ("screen", *(_summary(seen, name) for name in seen.metrics), "", "", "")])
-    if seen.optimum:
-        best = f"{seen.optimum.mssim:.3f} MSSIM by the cameras' models, with {seen.optimum.kbps:.0f} kbit/s"
-        print(f"best static allocation: {best}")
+    from runner.drive.tables import seen_rows
+
+    _print_table(path, *seen_rows(seen))
     if unknown := [name for name, camera in seen.cameras.items() if not camera.scene]:
         print(f"{', '.join(unknown)} compared with the stream as sent: what the encoder lost is not included")
-
-
-def _seen_row(name: str, camera: SeenCamera, seen: SeenDrive) -> Iterator[str]:
-    yield name
-    yield from (_summary(camera, metric) for metric in seen.metrics)
-    age = camera.age
-    yield f"{age.mean_ms:.0f} / {age.p95_ms:.0f}" if age else UNKNOWN
-    yield f"{100 * age.frozen:.1f} %" if age else UNKNOWN
-    yield f"{100 * age.late:.1f} %" if age else UNKNOWN
-
-
-def _summary(of: SeenDrive | SeenCamera, metric: str) -> str:
-    found, digits = of.summary(metric), 3 if metric == "mssim" else 0
-    return " / ".join(f"{each:.{digits}f}" for each in (found.mean, found.p5, found.worst)) if found else UNKNOWN
+    if seen.optimum:
+        print(f"optimum: the best static allocation of {seen.optimum.kbps:.0f} kbit/s by the cameras' own models")
 
 
 def _print_table(path: Path, headings: Sequence[str], rows: Sequence[tuple[str, ...]]) -> None:

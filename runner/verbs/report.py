@@ -8,7 +8,8 @@ and DIR/report.json with all statistics (schemas/report.schema.json), for CI.
 
 models= is a directory with CAMERA.model.json files, as `tod-runner model` writes them, from which quality is estimated.
 Without it, the models named by the drive's configuration are used if they are in conf/cameras/. Quality that the verb
-quality has measured on the pictures of a drive is shown, too.
+quality has measured on the pictures of a drive is shown, too, and what the driver saw of it (view=), beside the best
+that a static allocation of the same bits could have reached.
 
 positions= is a ROS bag with the vehicle's positions during the drives (sensor_msgs/NavSatFix), which replace those in
 their logs; topic= is needed if it has several such topics.
@@ -126,6 +127,7 @@ def _measured(
     from runner.drive.models import find_models
     from runner.drive.quality_file import read_quality
     from runner.drive.read import read_drive
+    from runner.drive.seen_file import read_seen
     from runner.drive.series import series
     from runner.drive.statistics import statistics
 
@@ -137,7 +139,7 @@ def _measured(
     for drive, label in zip(drives, labels(drives), strict=True):
         over_time = series(drive, label)
         curves, notes = find_models(over_time.config, models, [*bases, drive.path, Path.cwd()])
-        measured = statistics(over_time, curves, read_quality(drive.path))
+        measured = statistics(over_time, curves, read_quality(drive.path), read_seen(drive.path))
         found.append(replace(measured, notes=(*measured.notes, *notes)))
     on_progress(1.0)
     return found

@@ -12,7 +12,7 @@ from rich.text import Text
 
 from runner.drive.checks import ClaimCheck
 from runner.drive.statistics import DriveStatistics
-from runner.drive.tables import VERDICTS, camera_rows, drive_rows, uplink_rows
+from runner.drive.tables import VERDICTS, camera_rows, drive_rows, seen_rows, uplink_rows
 
 WIDE = 1000  # columns assumed for a pipe or a file: no table is wider, so nothing is cut off
 
@@ -26,6 +26,8 @@ def show(
         console.print(_table(drive.series.label, *camera_rows(drive)))
         if drive.uplinks:
             console.print(_table(f"{drive.series.label}: uplinks", *uplink_rows(drive)))
+        if drive.seen:
+            console.print(_table(f"{drive.series.label}: on the screen", *seen_rows(drive.seen)))
         for note in (*drive.series.warnings, *drive.notes):
             console.print(f"{drive.series.label}: {note}", markup=False, highlight=False)
     if len(drives) > 1:
