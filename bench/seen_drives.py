@@ -14,14 +14,16 @@ from __future__ import annotations
 import needs_tests  # noqa: F401 (first: makes parts of the tests importable)  # isort: skip
 
 import argparse
+import math
 import os
 import shutil
+import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from statistics import fmean, median
-from subprocess import DEVNULL
+from subprocess import DEVNULL, run
 from typing import NamedTuple
 
 from playwright.sync_api import Browser, sync_playwright
@@ -31,6 +33,7 @@ from usage import descendants, processor_of_tree_s
 
 from rig import CHROMIUM_FLAGS, answers, free_port, process, until
 from runner.configuration.config import configuration
+from runner.drive.seen_file import SeenDrive, read_seen
 from runner.mqtt.broker import private_broker
 from runner.settings import Endpoint
 
@@ -80,6 +83,42 @@ def rows(browser: Browser, options: argparse.Namespace) -> Iterator[Row]:
     for policy, drives in found.items():
         note = f"drawn of the slowest camera's pictures: {min(one.drawn for one in drives):.2f}"
         yield Row(f"received, {policy}", median(one.kbps for one in drives), "kbit/s", note=note)
+    if keeps_video(options):
+        yield from seen_rows(found)
+
+
+def keeps_video(options: argparse.Namespace) -> bool:
+    return "source=synthetic" in options.words
+
+
+def seen_rows(found: Mapping[str, Sequence[Measured]]) -> Iterator[Row]:
+    """What was on the screen, by `tod-runner quality view=`: MSSIM of both, and their difference in each pair."""
+    seen = {policy: [scored(one.log) for one in drives] for policy, drives in found.items()}
+    both = list(zip(seen[REFERENCE], seen[SEEN], strict=True))
+    for what in ("screen", *both[0][0].cameras):
+        pairs = [(mssim(paper, what), mssim(own, what)) for paper, own in both]
+        gains = sorted(own - paper for paper, own in pairs)
+        note = (
+            f"{median(paper for paper, _ in pairs):.4f} by the paper's rules; gains {gains[0]:.4f} to {gains[-1]:.4f}"
+        )
+        yield Row(f"on the screen, MSSIM: {what}", median(own for _, own in pairs), "", note=note)
+    for policy, drives in seen.items():
+        ages = [each for drive in drives for camera in drive.cameras.values() if (each := camera.age)]
+        note = f"the largest of a camera; frozen {max(age.frozen for age in ages):.3f} of its time"
+        yield Row(f"age on the screen, p95, {policy}", max(age.p95_ms for age in ages), "ms", note=note)
+
+
+def scored(log: Path) -> SeenDrive:
+    run([sys.executable, "-m", "runner", "quality", str(log), f"view={log}"], stdout=DEVNULL, check=True)
+    drive = read_seen(log)
+    assert drive
+    return drive
+
+
+def mssim(drive: SeenDrive, what: str) -> float:
+    """Mean over time, of the screen or of a camera."""
+    summary = (drive if what == "screen" else drive.cameras[what]).summary("mssim")
+    return summary.mean if summary else math.nan
 
 
 def drive(browser: Browser, policy: str, number: int, options: argparse.Namespace) -> Measured:
@@ -88,7 +127,7 @@ def drive(browser: Browser, policy: str, number: int, options: argparse.Namespac
     log = options.output / f"{policy.partition(',')[0]}-{number}"
     words = [*COMMON, *options.words, *rules.words, *rules.graph, f"pqos.kbps={options.total}", f"log={log}"]
     words += own_models(options.models, options.output, rules.own or ())
-    words += [f"log.video={'source=synthetic' in options.words}".lower()]
+    words += [f"log.video={keeps_video(options)}".lower()]
     with both_sides(words) as (url, pids), browser.new_context(viewport={"width": 1920, "height": 1080}) as context:
         page = context.new_page()
         page.goto(url)
