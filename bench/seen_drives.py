@@ -3,7 +3,7 @@
   python bench/seen_drives.py MODELS OUT                 five pairs of 40 s
   python bench/seen_drives.py MODELS OUT --pairs 8 source=test
 
-MODELS: what `tod-runner model vehicle=tum_q7 source=synthetic fps_max=10 output=MODELS` wrote. A browser of 1920x1080
+MODELS: what `tod-runner model vehicle=tum_q7 source=synthetic fps_max=5 output=MODELS` wrote. A browser of 1920x1080
 shows the Drive view; its view is stated to the vehicle, and logged, with either rules. With a rendered source the
 operator's video is kept in OUT and scored as the screen showed it (`tod-runner quality view=`). Needs chromium. Run it
 on an otherwise idle machine.
@@ -50,8 +50,8 @@ def main() -> None:
     parser.add_argument("output", type=Path)
     parser.add_argument("--pairs", type=int, default=5)
     parser.add_argument("--seconds", type=float, default=40)
-    parser.add_argument("--total", type=int, default=3000, help="kbit/s")
-    parser.add_argument("words", nargs="*", default=["source=synthetic", "fps_max=10"], help="further overrides")
+    parser.add_argument("--total", type=int, default=1000, help="kbit/s")
+    parser.add_argument("words", nargs="*", default=["source=synthetic", "fps_max=5"], help="further overrides")
     options = parser.parse_args()
     options.output.mkdir(parents=True, exist_ok=True)
     with sync_playwright() as playwright:
@@ -164,6 +164,9 @@ def both_sides(words: Sequence[str]) -> Iterator[tuple[str, Mapping[str, Sequenc
         until(lambda: answers(page), seconds=30)
         pids = {"vehicle": [vehicle.pid], "operator": [operator.pid], "browser": chromium()}
         yield f"http://127.0.0.1:{page}/", pids
+        for side in (operator, vehicle):  # whole logs
+            side.terminate()
+            side.wait(30)
 
 
 def chromium() -> list[int]:
