@@ -9,6 +9,7 @@ import pytest
 from helpers import Drive, source_for, vehicle
 
 from runner.core.model import Roi
+from runner.core.scaling import output_size
 from runner.core.step import start
 
 SEEN = ("modes=seen", "vehicle=delivery_robot", "mode=collective")
@@ -203,3 +204,87 @@ def test_pictures_that_do_not_say_what_they_show_are_never_cropped_by_a_view():
 def test_graphs_of_h264_say_what_their_pictures_show(graph, places):
     cameras = vehicle("vehicle=delivery_robot", f"graph={graph}", f"source={source_for(graph)}").cameras
     assert {camera.graph.places for camera in cameras.values()} == {places}
+
+
+def drawn(drive, name="front"):
+    setting = drive[name]
+    return setting.width, setting.height
+
+
+@pytest.fixture
+def small():
+    """A drive with a camera of which a small part is always sent."""
+    drive = Drive(*SEEN, *MEASURED, "cameras.front.always={x: 608, y: 328, width: 64, height: 64}")
+    drive.accept("total_set", kbps=1200)
+    drive.accept("attention_changed", attention="watching")
+    return drive
+
+
+def test_a_pan_ten_times_a_second_moves_the_region_behind_the_same_encoded_size(small):
+    seen = view(160, 200, 640, 320, 640, 320)
+    look(small, 0.1, front=seen)
+    small.accept("clock_advanced", t=10)
+    before, regions = drawn(small), set()
+    for tenth in range(100):
+        seen["x"] = 160 + abs((12 * tenth + 340) % 680 - 340)  # 120 px a second, to and fro
+        look(small, 10 + tenth / 10, front=seen)
+        sent = small["front"].roi
+        assert sent.x <= seen["x"] and seen["x"] + 640 <= sent.x + sent.width
+        assert drawn(small) == before
+        regions.add(sent)
+    assert len(regions) > 10
+    assert len({(roi.width, roi.height) for roi in regions}) <= 5, "each other length scales the picture anew"
+
+
+def test_a_region_zooms_behind_its_encoded_size_and_gets_the_best_one_once_it_rests(small):
+    look(small, 0.1, front=view(0, 0, 1280, 720, 1280, 720))
+    small.accept("clock_advanced", t=10)
+    before, t = drawn(small), 10.0
+    for step in range(1, 6):
+        t += 1.2
+        look(small, t - 0.1, front=view(64 * step, 36 * step, 1280 - 128 * step, 720 - 72 * step, 1280, 720))
+        small.accept("clock_advanced", t=t + 0.95)
+        assert drawn(small) == before, small["front"].reason
+    assert small["front"].roi.width < 800
+    for tenth in range(1, 80):
+        small.accept("clock_advanced", t=t + 1 + tenth / 10)
+    setting = small["front"]
+    assert (setting.width, setting.height) == output_size(setting.roi, setting.scaling)
+
+
+def test_a_size_does_not_stay_where_it_suits_the_region_badly(small):
+    look(small, 0.1, front=view(0, 0, 1280, 720, 1280, 720))
+    small.accept("clock_advanced", t=10)
+    look(small, 10.1, front=NOTHING)
+    for tenth in range(2, 15):
+        small.accept("clock_advanced", t=10 + tenth / 10)
+    setting = small["front"]
+    assert (setting.roi.width, setting.roi.height) == (64, 80)
+    assert setting.width <= 64 and setting.height <= 80, "no picture is larger than its region"
+
+
+def test_new_sizes_take_turns_the_front_and_the_largest_first():
+    drive = Drive("modes=seen", "vehicle=tum_q7", "mode=collective")
+    drive.accept("total_set", kbps=4000)
+    drive.accept("attention_changed", attention="watching")
+    cameras = drive.vehicle.cameras
+
+    def shown(name, share):
+        own = cameras[name]
+        return view(0, 0, own.width, own.height, own.width // share, own.height // share)
+
+    look(drive, 0.1, **{name: shown(name, 16) for name in cameras})
+    for tenth in range(1, 60):
+        drive.accept("clock_advanced", t=0.2 + tenth / 10)
+    before = {name: drawn(drive, name) for name in cameras}
+    look(drive, 10, **{name: shown(name, 1 if name == "top_rear" else 2) for name in cameras})
+    turns = [{name for name in cameras if drawn(drive, name) != before[name]}]
+    for fortieth in range(1, 20):
+        drive.accept("clock_advanced", t=10 + fortieth / 25)
+        changed = {name for name in cameras if drawn(drive, name) != before[name]}
+        if changed != turns[-1]:
+            turns.append(changed)
+            last = drive.run.state.t
+    assert turns[0] == {"front_center", "top_rear"}
+    assert [len(changed) for changed in turns] == [2, 4, 6, 8]
+    assert last <= 10.4

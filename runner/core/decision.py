@@ -117,6 +117,18 @@ class Shown(NamedTuple):
     area: int
 
 
+class Picture(NamedTuple):
+    """The pictures that a camera's encoder gets: a region of the full image, and the size to which it is scaled, px."""
+
+    roi: Roi
+    width: int
+    height: int
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.width, self.height
+
+
 class Draft(NamedTuple):
     """A decision in progress. A rule reads what earlier ones gave and returns a draft with its own part replaced.
 
@@ -135,6 +147,7 @@ class Draft(NamedTuple):
     placed_words  the same with the reason, for the operator
     notes      reasons that concern all cameras
     reasons    reason by camera
+    pictures   by camera that is on, what is encoded; empty: the regions in force, scaled by the factors
     """
 
     total: Kbps | None = None
@@ -152,6 +165,7 @@ class Draft(NamedTuple):
     notes: tuple[str, ...] = ()
     reasons: Mapping[str, str] = NOTHING
     shown: Mapping[str, Shown] = NOTHING
+    pictures: Mapping[str, Picture] = NOTHING
 
     def replaced(self, **changes: Any) -> Draft:
         """The draft with these parts replaced."""

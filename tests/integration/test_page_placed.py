@@ -45,10 +45,10 @@ def part_of(whole, roi, size):
     return cv2.resize(whole[roi.y : roi.y + roi.height, roi.x : roi.x + roi.width], size, interpolation=cv2.INTER_AREA)
 
 
-def encoded(whole, roi):
+def encoded(whole, roi, size=SIZE):
     """A region as an H.264 key picture that says so."""
-    width, height = SIZE
-    grey = part_of(whole, roi, SIZE).tobytes() + bytes([128]) * (width * height // 2)
+    width, height = size
+    grey = part_of(whole, roi, size).tobytes() + bytes([128]) * (width * height // 2)
     stream = "video/x-h264,stream-format=byte-stream,alignment=au,profile=constrained-baseline"
     line = f"fdsrc fd=0 ! rawvideoparse format=i420 width={width} height={height} framerate=25/1 "
     line += f"! x264enc tune=zerolatency bitrate=8000 ! {stream} ! fdsink fd=1"
@@ -139,6 +139,11 @@ def test_a_part_is_drawn_in_its_place_and_the_rest_is_marked_as_not_sent(chromiu
 
         until(is_placed)
         shot(page, "part-not-sent")
+        squeezed = encoded(whole, MIDDLE, (96, 128)), encoded(whole, FULL, (96, 128))  # pixels that are not square
+        until(lambda: shows(squeezed[0], MIDDLE.to_json(), "PART NOT SENT"))
+        until(is_placed)
+        until(lambda: shows(squeezed[1], None, ""))
+        until(lambda: fills(whole))
         decided(station, MIDDLE, chosen=MIDDLE)  # the operator has chosen this part: it fills the tile
         until(lambda: shows(part, MIDDLE.to_json(), ""))
         until(lambda: fills(part_of(whole, MIDDLE, (WIDTH, HEIGHT))))

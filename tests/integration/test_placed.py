@@ -6,13 +6,16 @@ import os
 import random
 import threading
 import time
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from rig import streaming, until
 from runner.core.commands import Command
+from runner.core.events import parse
 from runner.core.model import Roi
+from runner.core.step import start, step
 from runner.h264.access_unit import nal_units
 
 pytestmark = pytest.mark.gst
@@ -122,3 +125,71 @@ def test_each_picture_says_what_it_shows_through_changes_of_region():
     kinds = [[header & 0x1F for header, _ in nal_units(unit.data)] for unit, _ in compared if unit.region is None]
     waves = [unit.recovery is not None for unit, _ in compared if unit.region is None]
     assert all(kind.count(6) <= 1 + wave for kind, wave in zip(kinds, waves, strict=True))
+
+
+def starts(received):
+    """How often the encoder has started: x264 gives its parameter sets another number each time."""
+    with received.lock:
+        units = [received.units[at] for at in sorted(received.units)]
+    sets = [unit.data[at : at + 5] for unit in units for header, at in nal_units(unit.data) if header & 0x1F == 7]
+    return 1 + sum(one != other for one, other in pairwise(sets))
+
+
+def test_a_pan_and_a_zoom_restart_no_encoder():
+    from runner.apply import OperatorSide
+
+    always = f"cameras.{CAMERA}.always={{x: 300, y: 160, width: 32, height: 32}}"
+    size = (f"cameras.{CAMERA}.width_px=640", f"cameras.{CAMERA}.height_px=360")
+    received = Received()
+    with streaming("source=test", "fps_max=15", "modes=seen", "mode=collective", *size, always) as (
+        side,
+        setup,
+        plans,
+        _,
+    ):
+        station = OperatorSide(plans, lambda camera, what: None, received.on_unit, received.on_picture)
+        run, keys = start(setup.vehicle), ("x", "y", "width", "height", "screen_width", "screen_height")
+
+        def feed(event, **more):
+            nonlocal run
+            run = step(setup.vehicle, run, parse({"t": run.state.t + 0.1, "event": event} | more))
+            side.turn(run.commands)
+
+        def look(*region):
+            feed("view_reported", view={CAMERA: dict(zip(keys, (*region, 640, 360), strict=True))})
+            time.sleep(0.1)
+
+        def sends(region, picture_size):
+            """The newest picture is of this region and size."""
+            with received.lock:
+                picture, stated = list(received.pictures.values())[-1]
+            return stated == region and picture.shape[1::-1] == picture_size
+
+        def rests(seconds):
+            for _ in range(round(10 * seconds)):
+                feed("clock_advanced")
+            setting = run.decision.settings[CAMERA]
+            until(lambda: received.pictures and sends(setting.roi, (setting.width, setting.height)))
+
+        try:
+            feed("total_set", kbps=8000)
+            feed("attention_changed", attention="watching")
+            look(64, 64, 320, 180)
+            rests(10)
+            before, regions = starts(received), set()
+            for tenth in range(30):
+                look(64 + 8 * tenth, 64, 320, 180)
+                regions.add(run.decision.settings[CAMERA].roi)
+            for tenth in range(10):
+                look(296 - 4 * tenth, 64, 320 + 4 * tenth, 180 + 2 * tenth)
+                regions.add(run.decision.settings[CAMERA].roi)
+            rests(2)
+            assert starts(received) == before
+            assert len(regions) > 8
+            look(300, 160, 32, 32)
+            rests(2)
+            assert starts(received) == before + 1, "this size suits it too badly"
+        finally:
+            station.stop()
+    stated = {unit.region for unit in received.units.values()}
+    assert len(stated & regions) > 5

@@ -17,7 +17,14 @@ test("a picture that says what it shows is believed, whatever has been decided s
   assert.deepEqual(region.of(shown(MIDDLE)), MIDDLE);
   region.update(decision(LEFT, { placed: true }));
   assert.deepEqual([region.of(shown(MIDDLE)), region.placeOf(shown(MIDDLE))], [MIDDLE, { region: MIDDLE, frame: LEFT }]);
-  assert.deepEqual([region.of(shown(LEFT)), region.placeOf(shown(LEFT))], [LEFT, null]);
+  region.update(decision(MIDDLE, { placed: true }));
+  assert.deepEqual([region.of(shown(MIDDLE)), region.placeOf(shown(MIDDLE))], [MIDDLE, null]);
+});
+
+test("a picture whose pixels are not square is laid out by what it shows, also if that is the whole frame", () => {
+  const region = new ShownRegion(station, FULL);
+  region.update(decision(LEFT, { placed: true }));
+  assert.deepEqual(region.placeOf(shown(LEFT)), { region: LEFT, frame: LEFT });
 });
 
 test("where pictures say what they show, one that says nothing shows the full image", () => {

@@ -10,7 +10,7 @@ from typing import Any
 
 from runner.core import allocation, scaling
 from runner.core.budget import beside_sound
-from runner.core.decision import NOTHING, Decision, Draft, Setting, Shown, short
+from runner.core.decision import NOTHING, Decision, Draft, Picture, Setting, Shown, short
 from runner.core.model import SMALLEST_SIDE_PX, Mode, Roi, Vehicle
 from runner.core.rules import seen, spread, steady  # noqa: F401  (register their rules, as the imports below do theirs)
 from runner.core.rules.paper import whole
@@ -39,6 +39,7 @@ FACTOR_RULE = "must be a Fraction in ]0, 1]"
 SHOWN_RULE = (
     f"must be Shown, its region at least {SMALLEST_SIDE_PX}x{SMALLEST_SIDE_PX}, its factor a Fraction in ]0, 1]"
 )
+PICTURE_RULE = f"must be a Picture, its region and its even sides at least {SMALLEST_SIDE_PX}"
 
 
 class RuleFailed(RunError):
@@ -131,12 +132,21 @@ def _is_shown(value: Any) -> bool:
     )
 
 
+def _is_picture(value: Any) -> bool:
+    return (
+        isinstance(value, Picture)
+        and min(value.width, value.height, value.roi.width, value.roi.height) >= SMALLEST_SIDE_PX
+        and value.width % 2 == value.height % 2 == 0
+    )
+
+
 # Parts of a draft by camera, the check of their values, and its description.
 PARTS = (
     ("demand", _is_bitrate, BITRATE_RULE),
     ("bitrate", _is_bitrate, BITRATE_RULE),
     ("scaling", _is_factor, FACTOR_RULE),
     ("shown", _is_shown, SHOWN_RULE),
+    ("pictures", _is_picture, PICTURE_RULE),
 )
 
 
@@ -160,11 +170,11 @@ def _setting(on: bool, lost: str | None, roi: Roi, draft: Draft, name: str) -> S
         return Setting(on, False, allocation.ZERO, 0, 0, None, roi, 0, 0, why)
     kbps, factor = whole(draft.bitrate[name]), draft.scaling[name]
     sending = draft.sending and kbps >= 1
-    width, height = scaling.output_size(roi, factor)
+    picture = draft.pictures.get(name) or Picture(roi, *scaling.output_size(roi, factor))
     reason = ", ".join(filter(None, (draft.reasons.get(name), draft.placed_words.get(name))))
     if draft.sending and not sending:
         reason += ", below 1 kbit/s: not sending"
     if draft.notes:
         reason = "; ".join((reason, *draft.notes))
-    video = (kbps if sending else 0, kbps, factor, roi, width, height)
+    video = (kbps if sending else 0, kbps, factor, *picture)
     return Setting(True, sending, draft.demand[name], *video, reason, draft.placed.get(name, ()))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import reduce
 from math import ceil, inf
 from typing import NamedTuple
 
@@ -20,6 +21,7 @@ from runner.core.state import State
 from runner.core.view import Seen, enclosing
 
 STEP_PX = 16  # of the edges of regions, so that small changes of a view are none
+MOVED_STEP_PX = 64  # of the sides of a region that moves: each other length scales the picture anew
 STEPS = 32  # of the scale at which screens show an image
 OVERSAMPLED = 2  # px of a picture for each of the screen; with more, nothing more is seen
 SLOW_MPS = 1.0
@@ -28,13 +30,20 @@ DETAIL = Fraction(3, 2)
 GLANCE = Fraction(1, 100)  # least weight of a camera, as a share of what all screens show
 
 
+class _Wanted(NamedTuple):
+    """What a view needs, from a time on: a region, and how large screens show it."""
+
+    since: float
+    roi: Roi
+    scale: Fraction
+
+
 class _Region(NamedTuple):
-    """A region and how large screens show it, and since when less is wanted; None: it is all wanted."""
+    """A region in force and how large screens show it; and what has been wanted of late, the newest last."""
 
     roi: Roi
     scale: Fraction
-    wanted: tuple[Roi, Fraction] | None = None
-    since: float = 0.0
+    recent: tuple[_Wanted, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,11 +66,12 @@ def roi_from_view(
 ) -> Step:
     """Of each camera, only what the operator in control sees is sent, with a margin, and what is always sent.
 
-    A region widens at once; it narrows once less has been wanted for `narrow_s`. It never leaves the operator's own
-    region. Everything is sent while no view is stated, or nobody can look at it.
+    A region widens at once; it narrows once less has been wanted for `narrow_s`, and follows a driver who pans. What
+    was wanted within that time is sent. It never leaves the operator's own region. Everything is sent while no view is
+    stated, or nobody can look at it.
 
     margin  on each side, as a share of what is seen, for a driver who pans
-    Memory: by camera, the region in force and since when less is wanted.
+    Memory: by camera, the region in force and what was wanted within `narrow_s`.
     """
     past: _Memory = memory.get("shown", _Memory(NOTHING, NOTHING))
     is_seen, may_narrow = _is_stated(state), _may_narrow(state)
@@ -129,15 +139,36 @@ def _side(begin: int, length: int, wanted: int, wide: int) -> tuple[int, int]:
 def _followed(
     past: _Region | None, wanted: tuple[Roi, Fraction], own: Roi, t: float, narrow_s: float, may_narrow: bool
 ) -> _Region:
-    roi, scale = wanted
+    newest = _Wanted(t, *wanted)
     if past is None or not _contains(own, past.roi):
-        return _Region(roi, scale)
-    needed = _Region(roi if past.roi == roi else enclosing(past.roi, roi), max(past.scale, scale))
-    if (needed.roi, needed.scale) == wanted:
-        return needed
-    if past.wanted != wanted or not may_narrow:
-        return needed._replace(wanted=wanted, since=t)
-    return _Region(roi, scale) if t - past.since >= narrow_s else needed._replace(wanted=wanted, since=past.since)
+        return _Region(*wanted, (newest,))
+    recent = past.recent if past.recent[-1][1:] == wanted else (*past.recent, newest)
+    if not may_narrow and len(recent) > 1:
+        recent = (_Wanted(t, past.roi, past.scale), newest)
+    while len(recent) > 1 and t - recent[1].since >= narrow_s:
+        recent = recent[1:]
+    if len(recent) == 1:
+        return _Region(*wanted, recent)
+    needed = reduce(enclosing, (each.roi for each in recent))
+    roi = past.roi if _contains(past.roi, needed) else _moved(past.roi, needed, own)
+    return _Region(roi, max(each.scale for each in recent), recent)
+
+
+def _moved(region: Roi, needed: Roi, own: Roi) -> Roi:
+    """The region as little moved as it must be to include what is needed, and no smaller."""
+    across = _shifted(region.x, region.width, needed.x, needed.width, own.x, own.width)
+    down = _shifted(region.y, region.height, needed.y, needed.height, own.y, own.height)
+    return Roi(across[0], down[0], across[1], down[1])
+
+
+def _shifted(begin: int, length: int, needed: int, needed_length: int, low: int, most: int) -> tuple[int, int]:
+    """Begin and length along one axis, within `most` px from `low`."""
+    if needed_length > length:
+        length = -(-needed_length // MOVED_STEP_PX) * MOVED_STEP_PX
+    end = needed + needed_length
+    start = min(max(begin, end - length), needed, low + most - length) // STEP_PX * STEP_PX
+    start = max(low, start)
+    return start, min(max(end, start + length), low + most) - start
 
 
 def _contains(outer: Roi, inner: Roi) -> bool:

@@ -1,17 +1,22 @@
-"""Calmer pictures: modes=steady, and modes=safe while the link is measured."""
+"""Calmer pictures: modes=steady, modes=safe while the link is measured, and modes=seen."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from fractions import Fraction
+from math import cos, inf, radians
 from typing import NamedTuple
 
 from runner.core import scaling
-from runner.core.decision import Draft
-from runner.core.model import Roi, Vehicle, least_float, plain
+from runner.core.decision import NOTHING, Draft, Picture
+from runner.core.model import Camera, Roi, Vehicle, least_float, plain
 from runner.core.rules.paper import lasting_share
 from runner.core.rules.registry import Memory, Step, rule
 from runner.core.state import State
+from runner.core.view import Seen
+
+NEAR = Fraction(9, 8)  # sides that differ by less look the same
 
 
 @rule(needs=["scaling"], gives=["scaling"], reads=["t"])
@@ -54,7 +59,7 @@ def calm_scaling(
     now: dict[str, _Calm] = {}
     for name, requested in draft.scaling.items():
         camera, roi, shown = vehicle.cameras[name], state.rois[name], draft.shown.get(name)
-        view = (roi, shown and shown.scale)
+        view = (roi.width, roi.height, shown and shown.scale)
         before = past.get(name)
         if before is None or before.view != view or before.factor == requested:
             now[name] = _Calm(requested, None, view)
@@ -75,7 +80,7 @@ class _Calm(NamedTuple):
 
     factor: Fraction
     since: float | None
-    view: tuple[Roi, Fraction | None]
+    view: tuple[int, int, Fraction | None]
 
     def followed(self, requested: Fraction, lower: Fraction, upper: Fraction, t: float, enough_s: float) -> _Calm:
         """lower, upper: the factors of somewhat lower and higher bitrates."""
@@ -87,6 +92,125 @@ class _Calm(NamedTuple):
         if t - since < enough_s:
             return self._replace(since=since)
         return self._replace(factor=requested, since=None)
+
+
+class _Wanted(NamedTuple):
+    """What a picture is decided for: a region, a factor, and what is seen of the region, which may move inside."""
+
+    roi: Roi
+    factor: Fraction
+    seen: Seen | None
+
+    @property
+    def best(self) -> Picture:
+        return Picture(self.roi, *scaling.output_size(self.roi, self.factor))
+
+
+class _Now(NamedTuple):
+    """A picture in force, and what it was last decided for, since a time."""
+
+    picture: Picture
+    wanted: _Wanted
+    since: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Pictures:
+    """By camera, its picture; and when new sizes last had their turn."""
+
+    cameras: Mapping[str, _Now]
+    turn: float = -inf
+
+
+@rule(needs=["scaling"], gives=["pictures"], reads=["rois", "t", "view"], uses=["shown"])
+def calm_pictures(
+    vehicle: Vehicle,
+    state: State,
+    draft: Draft,
+    memory: Memory,
+    *,
+    within: Fraction = Fraction(2),
+    for_s: Fraction = Fraction(5),
+    at_once: Fraction = Fraction(2),
+    turn_s: Fraction = Fraction(2, 25),
+) -> Step:
+    """A region moves and zooms behind its encoded size; cameras that need another one get it in turn.
+
+    A new size restarts the encoder: it begins with a key picture, and looks worse for a second. So the size stays as
+    long as it suits the region to within a factor, and no longer than the region is unchanged for a while. Key pictures
+    of many cameras together would fill the link: first come the front camera and the one that fills most of the screen.
+    Until its turn, a camera is sent as before.
+
+    within   how much larger or smaller a side may be than by the camera's factor, and than its aspect ratio
+    for_s    after which an unchanged region gets the size by its factor
+    at_once  cameras whose sizes change together
+    turn_s   from one turn to the next
+    Memory: by camera, its picture, what it is for, and since when; and the time of the last turn.
+    """
+    past: _Pictures = memory.get("pictures", _Pictures(NOTHING))
+    still = state.t - least_float(for_s)
+    now: dict[str, _Now] = {}
+    waiting: dict[str, _Now] = {}
+    for name, factor in draft.scaling.items():
+        before, wanted = past.cameras.get(name), _Wanted(state.rois[name], factor, state.view.get(name))
+        following = _following(vehicle.cameras[name], before, wanted, state.t, still, within)
+        if before is None or before.picture.size == following.picture.size:
+            now[name] = following
+        else:
+            now[name], waiting[name] = before, following
+    turn = past.turn
+    if waiting and state.t - turn >= least_float(turn_s):
+        turn = state.t
+        for name in _by_rank(vehicle, draft, waiting)[: max(1, int(at_once))]:
+            now[name] = waiting.pop(name)
+    draft = _with(draft, now, waiting)
+    return draft, memory if now == past.cameras and turn == past.turn else {"pictures": _Pictures(now, turn)}
+
+
+def _following(camera: Camera, before: _Now | None, wanted: _Wanted, t: float, still: float, within: Fraction) -> _Now:
+    """What a camera should send next; a new size may have to wait."""
+    if before and before.wanted == wanted:
+        if before.since > still:
+            return before
+        return before if _suits(before.picture, wanted.best, NEAR) else before._replace(picture=wanted.best)
+    if before and before.wanted.roi == wanted.roi and before.wanted.factor == wanted.factor:
+        return _Now(before.picture, wanted, t)
+    if before and before.wanted.roi != wanted.roi and camera.graph.places:
+        moved = before.picture._replace(roi=wanted.roi)
+        if moved.width <= moved.roi.width and moved.height <= moved.roi.height and _suits(moved, wanted.best, within):
+            return _Now(moved, wanted, t)
+    return _Now(wanted.best, wanted, t)
+
+
+def _suits(picture: Picture, best: Picture, within: Fraction) -> bool:
+    """Whether both sides, and the aspect ratio, are those of another picture to within a factor."""
+    across, down = Fraction(picture.width, best.width), Fraction(picture.height, best.height)
+    return all(within * ratio >= 1 and ratio <= within for ratio in (across, down, across / down))
+
+
+def _by_rank(vehicle: Vehicle, draft: Draft, names: Mapping[str, _Now]) -> list[str]:
+    """The front camera and the largest picture on the screen first, the others by their size there."""
+
+    def area(name: str) -> int:
+        return draft.shown[name].area if name in draft.shown else 0
+
+    first = {max(vehicle.cameras.values(), key=_ahead).name, max(draft.scaling, key=area)}
+    return sorted(names, key=lambda name: (name not in first, -area(name)))
+
+
+def _ahead(camera: Camera) -> float:
+    """How far a camera looks straight ahead, 1 to -1; -1 if its pose is unknown."""
+    return cos(radians(camera.pose.yaw_deg)) * cos(radians(camera.pose.pitch_deg)) if camera.pose else -1.0
+
+
+def _with(draft: Draft, now: Mapping[str, _Now], waiting: Mapping[str, _Now]) -> Draft:
+    reasons = dict(draft.reasons)
+    for name, own in now.items():
+        if name in waiting:
+            reasons[name] = f"{reasons.get(name, '')}, a new size waits for its turn"
+        elif own.picture != own.wanted.best:
+            reasons[name] = f"{reasons.get(name, '')}, size kept at {own.picture.width}x{own.picture.height}"
+    return draft.replaced(pictures={name: own.picture for name, own in now.items()}, reasons=reasons)
 
 
 _Hold = tuple[Fraction, float | None]

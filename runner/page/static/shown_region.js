@@ -55,10 +55,14 @@ export class ShownRegion {
     return meta.region ?? (this.placed || this.crop ? this.full : null);
   }
 
-  /** Where a picture that says what it shows is in the frame; null: it shows the whole frame, or does not say. @param {Shown|null} one */
+  /**
+   * Where a picture that says what it shows is in the frame; null: it shows the whole frame, with square pixels, or does not say.
+   * @param {Shown|null} one
+   */
   placeOf(one) {
     const [region, { frame }] = [this.stated(one), this];
-    return region && !sameRegion(region, frame) ? { region, frame } : null;
+    const fills = one && region && sameRegion(region, frame) && hasAspectOf(one.picture, region);
+    return region && !fills ? { region, frame } : null;
   }
 
   /** The region that a picture is known to show. @param {Shown|null} one */

@@ -142,14 +142,14 @@ export class StreamCanvas {
 const textOf = (...texts) => texts.filter(Boolean).join("\n");
 
 /**
- * Size of a canvas in which a picture keeps its own; at most the camera's.
+ * Size of a canvas with the aspect ratio of the frame, in which no side of a picture is smaller than its own; at most the camera's.
  * @param {import("./framing.js").Size} painted  @param {Place} place  @param {import("./framing.js").Size} camera
  */
 function sizeWith(painted, { region, frame }, camera) {
-  const [across, down] = [painted.width / region.width, painted.height / region.height];
-  const times = Math.min(1, camera.width / (frame.width * across), camera.height / (frame.height * down));
+  const scale = Math.max(painted.width / region.width, painted.height / region.height);
+  const times = Math.min(scale, camera.width / frame.width, camera.height / frame.height);
   const sideOf = (length) => Math.max(1, Math.round(length * times));
-  return { width: sideOf(frame.width * across), height: sideOf(frame.height * down) };
+  return { width: sideOf(frame.width), height: sideOf(frame.height) };
 }
 
 /**
