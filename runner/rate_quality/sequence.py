@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from fractions import Fraction
 from pathlib import Path
@@ -13,12 +14,14 @@ from runner.colour_range import to_limited_range
 from runner.core.model import DEPTH_M, BagTopic, Camera, ModelError
 from runner.errors import ArgumentError, RunError
 from runner.graph import COLORIMETRY, launch
+from runner.h264.access_unit import stated_region
 from runner.lanes import BAG, FRAMES, LaneSet
 from runner.rate_quality.cache import Cache, digest, file_digest
 from runner.rate_quality.recordings import INDEX
 
 SURVEY_VERSION = 2
 FEWEST_FRAMES = 25
+VIDEO = ".ts"  # suffix of the video that a drive keeps
 LOSSY = ("jpeg", "h264", "h265")  # formats of pictures in bags
 ARGUMENT = "sequence"  # of the command line, for messages
 Footage = Path | BagTopic  # a clip, or pictures of a bag
@@ -123,8 +126,20 @@ def _identity(sha256: str, form: Mapping[str, Any]) -> tuple[object, ...]:
 def _clip_form(path: Path) -> dict[str, Any]:
     from runner.apply import discover
 
+    if path.suffix == VIDEO and _is_cropped(path):
+        rule = "shows only what a driver saw at times: whole pictures are needed, as `tod-runner record` keeps them"
+        raise ArgumentError(ARGUMENT, path, rule)
     form = discover(path, ARGUMENT)
     return asdict(form) | {"lossless": form.lossless or _is_recording(path)}
+
+
+def _is_cropped(path: Path) -> bool:
+    """Whether a picture in a drive's video says that it shows a part of the image only."""
+    from runner.apply import read_video
+
+    with suppress(RunError):  # a file that cannot be read is reported by who decodes it
+        return any(unit.codec == "h264" and stated_region(unit.data) is not None for unit in read_video(path))
+    return False
 
 
 def _bag_form(footage: BagTopic) -> dict[str, Any]:

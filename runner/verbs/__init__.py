@@ -115,7 +115,12 @@ VERBS = {
         sweeps=True,
     ),
     "record": Verb("record each camera losslessly", "runner.verbs.record", ("output", "duration_s"), sited=True),
-    "model": Verb("rate-quality models from recordings", "runner.verbs.model", ("camera", "sequence", "output")),
+    "model": Verb(
+        "rate-quality models from recordings",
+        "runner.verbs.model",
+        ("camera", "sequence", "output", "mount"),
+        "[DRIVE]",
+    ),
     "report": Verb(
         "the paper's figures from real drives",
         "runner.verbs.report",

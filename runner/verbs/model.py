@@ -1,5 +1,7 @@
 """usage: tod-runner model [OVERRIDE ...] camera=NAME sequence=CLIP output=DIR
        tod-runner model [OVERRIDE ...] vehicle=NAME sequence=DIR output=DIR
+       tod-runner model [OVERRIDE ...] vehicle=NAME sequence=DIR mount=CONF
+       tod-runner model DRIVE [OVERRIDE ...] output=DIR
        tod-runner model compare A.model.json B.model.json
 
 Measures rate-quality models: each recorded sequence is scaled, encoded by the live graph's own encoder at constant
@@ -12,12 +14,23 @@ measured on its topic. Without sequence= the source's own clips are used.
 The method is defined in conf/study/paper.yaml; its keys may be given without study.: metric= plan= scalings=
 bitrates_kbps= b_full_quality= cpu_cores= pool= masks= metric_every= workers= and others.
 
+DRIVE is a directory that log= wrote: its cameras are measured, in its configuration, on what it has of their whole
+images: what `record` has kept in it, the clips that its sources played, or, as second best, the video as sent, if that
+was whole and of full size (log.video=true). Pictures that were cropped to what the driver saw are refused.
+
+mount= is a configuration directory of your own: cameras of one kind are measured together, and rate_quality of that
+kind is replaced in CONF/cameras/KIND.yaml, so that conf=CONF vehicle=NAME drives with it; a file of your own is kept as
+KIND.yaml.before. Shows what this changes in decisions at 1, 3 and 8 Mbit/s. The models are in output=, else in
+CONF/models.
+
 Measurements are cached by content in the user's cache directory: an interrupted run resumes where it stopped.
 
   tod-runner model camera=front_center sequence=drive.mp4 output=models
   tod-runner model camera=front_center sequence=drive.mp4 output=models 'metric=[mssim,psnr]' plan=full
   tod-runner model vehicle=tum_q7 sequence=recording/ output=models 'pool={front_side:[front_left,front_right]}'
   tod-runner model vehicle=tum_q7 source=synthetic output=models graph=openh264_rtsp
+  tod-runner model vehicle=tum_q7 source=synthetic mount=my_vehicles
+  tod-runner model drives/monday mount=my_vehicles
   tod-runner model camera=front_left sequence=drive.mcap cameras.front_left.topic=/left/image_raw output=models
   tod-runner model camera=top_left sequence=top.mkv output=models masks.top_left=mask.png cpu_cores=0.3
   tod-runner model compare models/front_center.model.json models_new/front_center.model.json
@@ -25,40 +38,67 @@ Measurements are cached by content in the user's cache directory: an interrupted
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from runner.bag import PICTURES, Bag, is_bag
-from runner.configuration.config import configuration
+from runner.configuration.config import Base, configuration
 from runner.configuration.files import conf_directories, options
-from runner.core.model import BagTopic, ModelError, Vehicle
-from runner.errors import COMMAND_LINE, ArgumentError, ConfigError, Problem, suggest
+from runner.core.model import ModelError
+from runner.errors import ArgumentError, suggest
 from runner.settings import Setup
 from runner.system import signals
 from runner.system.extras import require
 from runner.verbs import Arguments, study_word
+from runner.verbs.model_footage import given, of_drive
+from runner.verbs.model_mount import Mount, mount_of
 from runner.verbs.screen import progress_bar, say, streaming
 
 if TYPE_CHECKING:
-    from runner.rate_quality.sequence import Footage
+    from runner.drive.read import Drive
     from runner.rate_quality.study import Study
-
-NO_CLIPS = (".json", ".yaml", ".png", ".pdf")  # suffixes of other files named after a camera
 
 
 def run(arguments: Arguments) -> int:
     streaming()
     require("model")
-    output = arguments.given_path("output", "the directory to write models to")
-    setup, study, names = _targets(arguments)
-    paths = _sequences(arguments, setup, names)
+    drive = _drive(arguments)
+    mount = mount_of(arguments, drive)
+    output = arguments.path("output") or (mount.models if mount else None)
+    if output is None:
+        output = arguments.given_path("output", "the directory to write models to")
+    setup, study, names = _targets(arguments, drive, mount)
+    paths = of_drive(drive, setup, names) if drive else given(arguments, setup, names)
+    if mount:
+        study = replace(study, pool=mount.pool({name: setup.vehicle.cameras[name] for name in paths}))
     from runner.rate_quality.measure import measure
 
     with progress_bar() as progress, signals.interruptible():
-        for written in measure(setup, study, {name: paths[name] for name in names}, output, progress, say):
+        measured = measure(setup, study, dict(paths), output, progress, say)
+        for number, written in enumerate(measured):
             print(written)
+            if mount:
+                mount.put(list(study.pool)[number], output)
+    if mount:
+        mount.show()
     return 0
+
+
+def _drive(arguments: Arguments) -> Drive | None:
+    """The drive whose cameras are measured; None: none is given."""
+    if not arguments.words:
+        return None
+    if len(arguments.words) > 1:
+        raise ArgumentError("DRIVE", " ".join(arguments.words), "must be one directory that log= wrote")
+    if "sequence" in arguments.values:
+        raise ArgumentError("sequence", arguments.values["sequence"], "must not be given with a drive")
+    from runner.drive.read import read_drive
+
+    drive = read_drive(Path(arguments.words[0]))
+    for warning in drive.warnings:
+        say(warning)
+    return drive
 
 
 def compare(words: Sequence[str]) -> int:
@@ -73,22 +113,25 @@ def compare(words: Sequence[str]) -> int:
     return 0
 
 
-def _targets(arguments: Arguments) -> tuple[Setup, Study, list[str]]:
+def _targets(arguments: Arguments, drive: Drive | None, mount: Mount | None) -> tuple[Setup, Study, list[str]]:
     """The vehicle, the study, and the cameras to measure; a kind of camera that the vehicle lacks is mounted."""
     from runner.apply import check_plan
     from runner.rate_quality.study import check_cameras
 
-    words = [study_word(word) for word in arguments.overrides]
+    words, conf = [study_word(word) for word in arguments.overrides], mount.conf if mount else arguments.conf
+    base = _base(drive) if drive else None
+    if drive:  # vehicle= names the files of the vehicle that was driven
+        words = [word for word in words if not word.startswith("vehicle=")]
     requested = arguments.values.get("camera")
-    config = configuration(words, arguments.conf, runnable=False, check=check_plan)
+    config = configuration(words, conf, base=base, runnable=False, check=check_plan)
     study, setup = config.study(), config.setup()
     if requested and requested not in setup.vehicle.cameras:
-        kinds = options("cameras", conf_directories(arguments.conf))
+        kinds = [] if drive or mount else options("cameras", conf_directories(conf))
         if requested not in kinds:
             hint = suggest(requested, [*setup.vehicle.cameras, *kinds])
             raise ArgumentError("camera", repr(requested), f"is neither mounted nor a kind of camera{hint}")
         words.append(f"+cameras@cameras.{requested}={requested}")
-        config = configuration(words, arguments.conf, runnable=False, check=check_plan)
+        config = configuration(words, conf, runnable=False, check=check_plan)
         study, setup = config.study(), config.setup()
     names = [requested] if requested else list(setup.vehicle.cameras)
     for name in names:
@@ -102,66 +145,7 @@ def _targets(arguments: Arguments) -> tuple[Setup, Study, list[str]]:
     return setup, study, names
 
 
-def _sequences(arguments: Arguments, setup: Setup, names: Sequence[str]) -> Mapping[str, Footage]:
-    """By camera, its clip, or its topic in a bag."""
-    given = arguments.path("sequence")
-    if given is None:
-        return _clips_of_sources(setup, names)
-    if is_bag(given):
-        return _topics(given, setup.vehicle, names)
-    if "camera" in arguments.values and not given.is_dir():
-        return {names[0]: given}
-    if not given.is_dir():
-        rule = "must be a directory with one clip for each camera, named after it; or name one camera with camera="
-        raise ArgumentError("sequence", given, rule)
-    found: dict[str, Footage] = {}
-    problems = []
-    for name in names:
-        clips = sorted(path for path in given.glob(f"{name}.*") if path.suffix not in NO_CLIPS)
-        if len(clips) == 1:
-            found[name] = clips[0]
-        else:
-            rule = f"{len(clips)} files are named {name}.*, must be exactly one"
-            problems.append(Problem(COMMAND_LINE, "sequence", repr(str(given)), rule))
-    if problems:
-        raise ConfigError(problems)
-    return found
-
-
-def _topics(path: Path, vehicle: Vehicle, names: Sequence[str]) -> Mapping[str, Footage]:
-    """By camera, its topic in a bag: that of its mount, or the only one with pictures."""
-    found: dict[str, Footage] = {}
-    problems = []
-    for name in names:
-        camera = vehicle.cameras[name]
-        named = camera.mount.get("topic", camera.source.settings.get("topic"))
-        try:
-            with Bag(path) as bag:
-                topic = bag.find(PICTURES, None if named is None else str(named), "pictures")
-            found[name] = BagTopic(str(path), topic, camera.source.depth_m)
-        except ModelError as error:
-            at = f"cameras.{name}.topic" if error.key == "topic" else "sequence"
-            problems.append(Problem(COMMAND_LINE, at, str(error.found), error.rule))
-    if problems:
-        raise ConfigError(problems)
-    return found
-
-
-def _clips_of_sources(setup: Setup, names: Sequence[str]) -> Mapping[str, Footage]:
-    """By camera, the clip or the bag's pictures that its source plays; missing clips are rendered first."""
-    from runner.plans import compile_plans, render_missing
-
-    measured = setup.with_cameras({name: setup.vehicle.cameras[name] for name in names})
-    with progress_bar() as progress:
-        render_missing(measured.vehicle, progress)
-    found: dict[str, Footage] = {}
-    for plan in compile_plans(measured):
-        if plan.bag:
-            found[plan.camera.name] = plan.bag
-            continue
-        clip = next((e.properties["location"] for e in plan.source if "location" in e.properties), None)
-        if clip is None or not plan.loops:
-            rule = f"must be given, since the source of {plan.camera.name} plays no clip"
-            raise ArgumentError("sequence", None, rule)
-        found[plan.camera.name] = Path(str(clip))
-    return found
+def _base(drive: Drive) -> Base:
+    """The configuration that was driven."""
+    side = drive.sides.get("vehicle") or drive.sides["operator"]
+    return dict(side.began.config), f"{drive.path}: config"
