@@ -11,6 +11,7 @@ from functools import lru_cache
 from runner.core.commands import KnobValue
 from runner.core.graph_settings import GraphSettings
 from runner.core.model import PLACEHOLDER, Camera, Element, Graph, ModelError, Roi, Value
+from runner.dropping import EVERY
 
 # Encoders whose rate control goes by the frame rate of their caps, not by the time between pictures: see `assignments`.
 _COUNT_FRAMES = ("x264enc", "x265enc")
@@ -69,6 +70,8 @@ def _quantities(camera: Camera, value: KnobValue, pace: float = 1.0) -> dict[str
         of_frames = per_frame_rate(camera.graph.settings, camera.fps)
         rate: dict[str, Value] = {"kbps": max(1, round(bps / 1000)), "bps": bps}
         return {**rate, "controls": camera.capture.controls_text, **of_frames, **_buffer(of_frames, value)}
+    if isinstance(value, Fraction):
+        return {"fps": EVERY if value >= camera.fps else f"{value.numerator}/{value.denominator}"}
     if isinstance(value, Roi):
         # The crop element sees the native picture; an ROI is relative to the full image inside it.
         native_width, native_height = camera.source_size

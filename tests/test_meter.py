@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import pytest
+from msgspec import UNSET, UnsetType
 
 from runner.operator.meter import MOST_WINDOWS, ReceptionMeter, middle, percentile
 
@@ -29,6 +30,7 @@ class Decided:
     kbps: int = 800
     width: int = 480
     height: int = 260
+    fps: float | UnsetType = UNSET
 
 
 def feed(meter: ReceptionMeter, seconds: float, fps: int = 20, kbps: int = 800, decided: Decided | None = None) -> None:
@@ -62,6 +64,12 @@ def test_windows_that_fall_short_of_the_decision_are_counted() -> None:
     feed(meter, 5, decided=Decided(kbps=1600, width=960, height=520))
     assert list(meter.followed) == [pytest.approx(0.5)] * 4
     assert (meter.short, meter.sizes) == (4, {})
+
+
+def test_fewer_pictures_than_the_camera_has_are_none_too_few_if_no_more_are_sent() -> None:
+    meter = ReceptionMeter(fps=20)
+    feed(meter, 10, fps=8, decided=Decided(fps=8.0))
+    assert (meter.short, meter.windows > 5) == (0, True)
 
 
 def test_windows_are_not_compared_while_nothing_is_sent() -> None:

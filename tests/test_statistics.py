@@ -179,7 +179,9 @@ def camera(kbps: float, scaling: float, *, sending: bool = True, share: float = 
         return np.array([value], dtype=float)
 
     flag, t = np.array([sending]), np.array([1.0])
-    decided = DecidedSeries(column(0), flag, column(kbps), column(scaling), column(2), column(2), column(share), ("",))
+    decided = DecidedSeries(
+        column(0), flag, column(kbps), column(scaling), column(2), column(2), column(share), ("",), column(np.nan)
+    )
     return CameraSeries("one", decided, None, Sent(t, column(1), column(1), column(kbps)))
 
 

@@ -20,21 +20,12 @@ from runner.configuration.uplinks import Ways, built_uplinks, reserves_kbps, upl
 from runner.core.budget import SOUND, VOICE
 from runner.core.capture import Capture
 from runner.core.commands import KnobValue
+from runner.core.frame_rate import varies_rate
 from runner.core.hull import Curve, concave
-from runner.core.model import (
-    Camera,
-    Graph,
-    Kbps,
-    Mode,
-    ModelError,
-    RateQualityModel,
-    Roi,
-    Source,
-    Vehicle,
-    exact,
-)
+from runner.core.model import Camera, Graph, Kbps, Mode, ModelError, RateQualityModel, Roi, Source, Vehicle, exact
 from runner.core.mounting import Place, Pose, overlapping
 from runner.core.rules import RuleCall
+from runner.dropping import with_rate_knob
 from runner.errors import ConfigError, Problem, suggest
 from runner.graph import Plan, check_video, compile_graph
 from runner.redact import redacted
@@ -102,6 +93,7 @@ class Builder:
         self.problems += [self.composed.problem(f.path, f.found, f.rule) for f in wrong]
         self.bad = {f.path for f in wrong} | {f.meant for f in wrong}
         modes = {mode: self._rules(mode) for mode in Mode if self.is_valid("modes", mode)}
+        self.varies_rate = varies_rate(modes)
         mounted = document.get("cameras")
         cameras = {name: self._camera(name) for name in mounted} if isinstance(mounted, dict) else {}
         if not all(map(self.is_valid, SECTIONS)):
@@ -243,7 +235,7 @@ class Builder:
                 height=data["height_px"],
                 fps=fps if limit is None else min(fps, _rate(limit)),
                 rate_quality=model,
-                graph=graph,
+                graph=with_rate_knob(graph) if self.varies_rate else graph,
                 source=source,
                 native=(native["width_px"], native["height_px"]) if native else None,
                 crop=_crop(native, data["width_px"], data["height_px"]) if native else None,

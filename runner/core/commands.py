@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import Any
 
 from runner.core.decision import Decision, Setting
-from runner.core.model import Roi
+from runner.core.model import Roi, plain
 
 Size = tuple[int, int]
-KnobValue = bool | int | Roi | Size | tuple[str, ...]
+KnobValue = bool | int | Fraction | Roi | Size | tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,7 +19,7 @@ class Command:
     """Turn one knob of one camera. Commands of a camera that arrive together take effect between the same two frames.
 
     value  sending: bool; roi: Roi in px of the full image; size: (width, height) in px; bitrate: whole kbit/s, >= 1;
-           uplinks: names of those that carry it
+           uplinks: names of those that carry it; fps: Hz, each n-th picture of the camera
     """
 
     camera: str
@@ -31,6 +32,8 @@ class Command:
             value = value.to_json()
         elif self.knob == "size":
             value = {"width": value[0], "height": value[1]}
+        elif isinstance(value, Fraction):
+            value = plain(value)
         return {"camera": self.camera, "knob": self.knob, "value": value}
 
 
@@ -42,8 +45,12 @@ def wanted(setting: Setting) -> KnobValues:
     if not setting.sending:
         return {"sending": False}
     size = (setting.width, setting.height)
-    values: KnobValues = {"sending": True, "roi": setting.roi, "size": size, "bitrate": setting.kbps}
-    return {**values, "uplinks": setting.uplinks} if setting.uplinks else values
+    values: dict[str, KnobValue] = {"sending": True, "roi": setting.roi, "size": size, "bitrate": setting.kbps}
+    if setting.fps is not None:
+        values["fps"] = setting.fps
+    if setting.uplinks:
+        values["uplinks"] = setting.uplinks
+    return values
 
 
 def difference(decision: Decision, commanded: Mapping[str, KnobValues]) -> list[Command]:

@@ -25,6 +25,7 @@ class Setting:
     scaling        selected factor; None when off, or when its source cannot be opened
     width, height  px of the encoded picture, 0 when off
     uplinks        that carry it, its own first, if the vehicle's have names and a rule places cameras on them
+    fps            Hz at which pictures are sent, see `sent_rate`; None: no rule of the vehicle sets rates
     reason         for the operator; ignored in comparisons
     """
 
@@ -39,6 +40,7 @@ class Setting:
     height: int
     reason: str = field(compare=False)
     uplinks: tuple[str, ...] = ()
+    fps: Fraction | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,6 +135,8 @@ class Draft(NamedTuple):
     """A decision in progress. A rule reads what earlier ones gave and returns a draft with its own part replaced.
 
     shown      by camera that is on, what its operator sees; empty: everything
+    fps        Hz by camera, at most this is sent; empty: every picture
+    weights    by camera, what the operator's weight is multiplied by; empty: 1
     total      kbit/s of all cameras
     demand     kbit/s by camera, 0 when off
     bitrate    exact kbit/s by camera
@@ -166,6 +170,8 @@ class Draft(NamedTuple):
     reasons: Mapping[str, str] = NOTHING
     shown: Mapping[str, Shown] = NOTHING
     pictures: Mapping[str, Picture] = NOTHING
+    fps: Mapping[str, Fraction] = NOTHING
+    weights: Mapping[str, Fraction] = NOTHING
 
     def replaced(self, **changes: Any) -> Draft:
         """The draft with these parts replaced."""

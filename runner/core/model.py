@@ -75,6 +75,7 @@ class ModeRule(Protocol):
 
     key    of its memory: names of the rule and of its entry in the modes file
     reads  fields of the state whose change triggers a new decision
+    gives  parts of the draft that exist after it
     """
 
     @property
@@ -83,6 +84,8 @@ class ModeRule(Protocol):
     def key(self) -> tuple[str, str]: ...
     @property
     def reads(self) -> frozenset[str]: ...
+    @property
+    def gives(self) -> frozenset[str]: ...
     def __call__(self, vehicle: Vehicle, state: Any, draft: Any, memory: Mapping[str, Any], /) -> Any: ...
 
 

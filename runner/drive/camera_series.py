@@ -9,6 +9,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from msgspec import UNSET
 
 from runner.drive.time_series import EMPTY, Flags, FloatSeries, TimeSeries, counted, rate, settled
 from runner.records.decisions import CameraDecision
@@ -23,6 +24,7 @@ class DecidedSeries:
 
     roi_share  pixels of the region of interest over those of the full image
     scaling    nan while the camera is off
+    fps        Hz, nan where it is the camera's own
     """
 
     t: FloatSeries
@@ -33,6 +35,7 @@ class DecidedSeries:
     height: FloatSeries
     roi_share: FloatSeries
     reason: tuple[str, ...]
+    fps: FloatSeries
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +99,11 @@ class CameraSeries:
         """The bitrate as decided, a step function; nan while the camera should not send."""
         return TimeSeries(self.decided.t, np.where(self.decided.sending, self.decided.kbps, np.nan))
 
+    def sent_fps(self, t: FloatSeries) -> FloatSeries:
+        """Hz at which its pictures were to be sent at these times."""
+        stated = np.concatenate([[np.nan], self.decided.fps])[np.searchsorted(self.decided.t, t, "right")]
+        return np.where(np.isnan(stated), self.fps, stated)
+
 
 def sending_spans(decided: DecidedSeries, end: float) -> list[tuple[float, float]]:
     """When a camera should have been sending: [(from s, to s), ...]."""
@@ -150,6 +158,7 @@ def _decided(decided: Sequence[tuple[float, CameraDecision]], full: int) -> Deci
         height=column("height"),
         roi_share=np.array(shares, dtype=float),
         reason=tuple(camera.reason for _, camera in decided),
+        fps=np.array([np.nan if camera.fps is UNSET else camera.fps for _, camera in decided], dtype=float),
     )
 
 

@@ -283,7 +283,8 @@ def slow_time(camera: CameraSeries, end: float) -> tuple[float, float] | None:
     begin, until = np.array(sending_spans(camera.decided, end)).reshape(-1, 2).T[..., None]
     sending = ((t[before] >= begin) & (t <= until)).any(0)
     hz = (frames - frames[before]) / np.maximum(t - t[before], SLOW_S)
-    slow = sending & (t - t[before] >= SLOW_S) & (hz > 0) & (hz < SLOW * camera.fps)
+    fps = np.minimum(camera.sent_fps(t[before]), camera.sent_fps(t))
+    slow = sending & (t - t[before] >= SLOW_S) & (hz > 0) & (hz < SLOW * fps)
     seconds = float(np.diff(t, prepend=t[:1])[slow].sum())
     return (seconds, float(hz[slow].mean())) if seconds >= SLOW_S else None
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping
+from fractions import Fraction
 from typing import Any
 
 from gi.repository import Gst
@@ -13,6 +14,7 @@ from runner.core.model import Camera, Value
 from runner.gst.caps import structure
 from runner.gst.placed import PlacedPictures
 from runner.gst.probes import IdleProbe
+from runner.gst.rate_limit import RateLimit
 from runner.turning import Assignment, assignments, text
 
 _PARSERS = {"GstCaps": Gst.Caps.from_string, "GstStructure": Gst.Structure.new_from_string}
@@ -44,6 +46,7 @@ class KnobPanel:
         self.applied: dict[str, KnobValue] = {}
         self._pace = 1.0
         self.placed: PlacedPictures | None = None  # is told of each turn, between two frames
+        self.dropped: RateLimit | None = None  # of the pictures that the knob `fps` leaves out; likewise
         self._between_frames = IdleProbe(self._apply_pending)
 
     def set_now(self, values: Mapping[str, KnobValue]) -> None:
@@ -56,6 +59,9 @@ class KnobPanel:
         """Set knobs between the next two frames; returns immediately."""
         with self._lock:
             is_only_change = not self._pending
+            bitrate = {**self.applied, **self._pending}.get("bitrate")
+            if "fps" in values and bitrate is not None:
+                values = {"bitrate": bitrate, **values}  # an encoder that counts frames is told another one with it
             self._pending |= values
         requested = [each for knob, value in values.items() for each in self._assignments(knob, value)]
         changed = [each for each in requested if self._differs(each)] or requested[:1]
@@ -100,21 +106,31 @@ class KnobPanel:
                 caps.set_value("pixel-aspect-ratio", Gst.Fraction(*((1, 1) if above != below else ANOTHER_RATIO)))
                 self._by_name[name].set_property("caps", caps)
 
+    @property
+    def fps(self) -> Fraction:
+        """The rate in force, Hz, that of the camera or what is left of it."""
+        fps = {**self.applied, **self._pending}.get("fps")
+        return fps if isinstance(fps, Fraction) else self._camera.fps
+
     def _apply_pending(self) -> None:
         with self._lock:
-            values, self._pending = self._pending, {}
+            values, fps = self._pending, self.fps
+            turned = {knob: self._assignments(knob, value) for knob, value in values.items()}
+            self._pending = {}
             for knob, value in values.items():
-                faults = [fault for each in self._assignments(knob, value) if (fault := self._assign(each))]
+                faults = [fault for each in turned[knob] if (fault := self._assign(each))]
                 if not faults:
                     self.applied[knob] = value
                 for fault in faults:
                     self._on_report(fault)
             if self.placed:
                 self.placed.on_turned(values)
+            if self.dropped and "fps" in values:
+                self.dropped.turn(float(fps))
         self._on_turned()
 
     def _assignments(self, knob: str, value: KnobValue) -> list[Assignment]:
-        return assignments(self._camera, knob, value, self._pace)
+        return assignments(self._camera, knob, value, self._pace * float(self._camera.fps / self.fps))
 
     def _assign(self, assignment: Assignment) -> str | None:
         """Set one property and read it back; returns the fault, None if there is none."""

@@ -19,7 +19,7 @@ STEADY = 0.8  # share of the camera's rate from which it is not slow any more
 class PictureRate:
     """The rate of a camera's pictures, for encoders that count frames in place of time, and for the driver.
 
-    fps        the camera's rate in force, Hz
+    fps        the rate in force, Hz
     is_steady  whether it was last measured to be about that; False while nothing is known
 
     `pace` is the camera's rate as a multiple of the one that arrives: an encoder that counts frames holds its bitrate
@@ -28,7 +28,7 @@ class PictureRate:
     """
 
     def __init__(self, fps: float) -> None:
-        self._fps = fps
+        self.fps = fps
         self._counted, self._last, self._held = 0, 0.0, -WINDOW_S
         self._allowance = Allowance()
         self._forget()
@@ -55,10 +55,10 @@ class PictureRate:
         if is_held_up:
             self._held, self._slow_since = now, None
         new, self._counted = count - self._counted, count
-        limit_s = max(SILENT_S, SILENT_INTERVALS * self.pace / self._fps)
+        limit_s = max(SILENT_S, SILENT_INTERVALS * self.pace / self.fps)
         if new < 0 or (self._seen and now - self._seen[-1][0] > limit_s):
             self._forget()
-        if self._allowance.is_exceeded(now, new, self._fps / self.pace) and self.pace > 1:
+        if self._allowance.is_exceeded(now, new, self.fps / self.pace) and self.pace > 1:
             self.pace, self._risen = 1.0, now
         if new > 0:
             self._last = now
@@ -71,10 +71,10 @@ class PictureRate:
     def _measure(self, now: float) -> None:
         mean = _rate(self._seen[0], self._seen[-1])
         self._judge(now, mean)
-        if _differs(self._fps / mean, self.pace):
+        if _differs(self.fps / mean, self.pace):
             # Faster than the camera's rate counts only if it lasts: pictures may come late, then all together.
-            rate = min(self._fastest(), max(mean, self._fps))
-            pace = min(max(self._fps / rate, PACES[0]), PACES[1])
+            rate = min(self._fastest(), max(mean, self.fps))
+            pace = min(max(self.fps / rate, PACES[0]), PACES[1])
             if _differs(pace, self.pace):
                 self.pace = pace if _differs(pace, 1.0) else 1.0
 
@@ -87,10 +87,10 @@ class PictureRate:
                 begin += 1
             if seen[0] - recent[begin][0] >= SPAN_S:
                 rates.append(_rate(recent[begin], seen))
-        return max(rates, default=self._fps)
+        return max(rates, default=self.fps)
 
     def _judge(self, now: float, rate: float) -> None:
-        self.is_steady = rate >= self._fps * (STEADY if self.slow_fps else SLOW)
+        self.is_steady = rate >= self.fps * (STEADY if self.slow_fps else SLOW)
         if self.is_steady:
             self._slow_since = self.slow_fps = None
             return

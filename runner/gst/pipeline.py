@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from gi.repository import Gst, GstRtp, GstVideo
 
 from runner.core.commands import KnobValue
+from runner.dropping import DROPPING
 from runner.errors import RunError
 from runner.graph import Plan
 from runner.gst.held_up import HeldUp
@@ -17,7 +18,7 @@ from runner.gst.lost import LostCameras
 from runner.gst.picture_rate import PictureRate
 from runner.gst.placed import PlacedPictures
 from runner.gst.probes import BufferProbe, PassingBuffer, TypeProbe
-from runner.gst.rate_limit import RateLimits
+from runner.gst.rate_limit import RateLimit, RateLimits
 from runner.gst.repeats import RepeatDetector
 from runner.gst.requests import RequestLimit
 from runner.gst.sender_stages import EncoderWatch
@@ -118,6 +119,8 @@ class CameraPipeline:
         if payloader:
             add_capture_time(payloader)
         self.knobs.placed = PlacedPictures.of(pipeline, plan.camera, self._sent)
+        if dropping := pipeline.get_by_name(DROPPING):
+            self.knobs.dropped = RateLimit(dropping, float(plan.camera.fps))
         self.knobs.set_now(self._allowed(self._first))
         self._held_up = HeldUp(last)
         self.requests = RequestLimit(last, on_report)
@@ -213,6 +216,8 @@ class CameraPipeline:
 
     def _look(self, now: float) -> None:
         self._limits.look(now)
+        if self.knobs.dropped and self.knobs.fps < self._plan.camera.fps:
+            self.knobs.dropped.look(now)
         if self._entered:
             self._look_at_rate(now, passed_counts(self._entered)[0])
         if self.sent_frames:
@@ -222,6 +227,9 @@ class CameraPipeline:
 
     def _look_at_rate(self, now: float, entered: int) -> None:
         """entered: pictures before the encoder. Behind it, those that it leaves out would count as the camera's."""
+        fps = float(self.knobs.fps)
+        if self._rate.fps != fps:
+            self._rate = PictureRate(fps)
         was_slow, silent_s = self.slow_fps, self._rate.silent_s(now)
         is_held_up = self._held_up.look(silent_s > self.frame_s)
         self._rate.look(now, entered, is_held_up)
@@ -230,7 +238,7 @@ class CameraPipeline:
         was_gap, self._is_gap = self._is_gap, not is_held_up and silent_s > max(GAP_S, GAP_INTERVALS * self.frame_s)
         if self._is_gap and not was_gap and self._restarts_after_gaps:
             self.knobs.restart_encoder("size")
-        rate = f"{float(self._plan.camera.fps):g} Hz"
+        rate = f"{fps:g} Hz"
         if self.slow_fps and not was_slow:
             self._on_report(f"{self.slow_fps} of {rate}")
         elif was_slow and self._rate.is_steady:
@@ -260,7 +268,7 @@ class CameraPipeline:
     @property
     def frame_s(self) -> float:
         """Interval between two frames."""
-        return 1 / float(self._plan.camera.fps)
+        return 1 / float(self.knobs.fps)
 
     def drop_queued_packet(self) -> None:
         """Drop the packet queued for an interleaved viewer, if any."""

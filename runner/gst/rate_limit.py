@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from gi.repository import Gst
 
+from runner.dropping import DROPPING
 from runner.gst.allowance import Allowance
 from runner.gst.source import fixed_rate
 
@@ -41,6 +42,11 @@ class RateLimit:
             self._begin_anew()
             self._passed_at = now
 
+    def turn(self, fps: float) -> None:
+        """It is given another rate, Hz: what was due at the one before counts no more."""
+        self._fps = fps
+        self._begin_anew()
+
     def _begin_anew(self) -> None:
         above = self._rate.get_static_pad("sink").get_peer()
         if above:
@@ -57,7 +63,8 @@ class RateLimits:
     def follow(self, source: Gst.Bin) -> None:
         """Limit the elements of a new source in place of those before."""
         dropping = [rate for rate in fixed_rate(source) if rate.get_property("drop-only")]
-        self._limits = [RateLimit(rate, self._fps) for rate in dropping]
+        # What drops pictures of the source is not of it, though both may be in one pipeline.
+        self._limits = [RateLimit(rate, self._fps) for rate in dropping if rate.get_name() != DROPPING]
 
     def look(self, now: float) -> None:
         """As `RateLimit.look`."""

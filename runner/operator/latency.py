@@ -16,6 +16,8 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from msgspec import UNSET
+
 from runner.mqtt.messages import MqttMessage, read_clock
 from runner.records.operator import LatencyStages
 from runner.records.reception import Arrival
@@ -35,7 +37,7 @@ LONGEST_MS = 60_000.0  # of a frame that arrives: beyond, a clock was set in bet
 class Latency:
     """Compares the vehicle's clock with this machine's, and corrects latencies by it. May be used from any thread.
 
-    fps      of each camera
+    fps      of each camera, where the vehicle states no other
     cameras  returns what the vehicle states of them; nothing while it is offline
     """
 
@@ -177,7 +179,8 @@ class Latency:
             arrived_ms = corrected(1000 * (wall + newest.arrived - newest.captured), clock)
             if arrived_ms is None or self._clocks.was_set_since(newest.arrived - arrived_ms / 1000):
                 return None
-            overdue_s = max(0.0, now - newest.arrived - 1 / self._fps[name])
+            fps = self._fps[name] if camera.fps is UNSET else camera.fps
+            overdue_s = max(0.0, now - newest.arrived - 1 / fps)
             found.append(max(sampled.latency_ms, arrived_ms) + 1000 * overdue_s)
         return max(found) + 1000 * clock.bound_s if found and clock else None
 

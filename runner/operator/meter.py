@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from statistics import median
 from typing import TYPE_CHECKING
 
+from msgspec import UNSET
+
 from runner.records.vehicle import CameraState
 
 if TYPE_CHECKING:
@@ -30,6 +32,7 @@ class MeasuredRates:
 class ReceptionMeter:
     """Watches one camera: rates over a sliding window, and how well reception follows the decisions.
 
+    fps       the camera's own, where the vehicle states no other
     followed  kbit/s received over kbit/s allocated, one entry per settled window, of the last MOST_WINDOWS; likewise
               latencies_ms
     """
@@ -47,7 +50,7 @@ class ReceptionMeter:
 
     def add(self, t: float, counters: Reception, decided: CameraState | None) -> MeasuredRates:
         """Add a sample of the counters at time t, s; a few times a second."""
-        target = (decided.sending, decided.kbps, decided.width, decided.height) if decided else None
+        target = (decided.sending, decided.kbps, decided.width, decided.height, decided.fps) if decided else None
         if target != self._decided:
             self._decided, self._since = target, t
         self._past.append((t, counters))
@@ -71,7 +74,7 @@ class ReceptionMeter:
     def _compare(self, rates: MeasuredRates, counters: Reception, decided: CameraState) -> None:
         self.windows += 1
         self.followed.append(rates.kbps / decided.kbps)
-        self.short += rates.fps < 0.9 * self.fps
+        self.short += rates.fps < 0.9 * (self.fps if decided.fps is UNSET else decided.fps)
         size = (counters.width, counters.height)
         if size == (decided.width, decided.height):
             self.sizes[size] = self.sizes.get(size, 0) + 1

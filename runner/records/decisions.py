@@ -37,6 +37,9 @@ class CameraDecision:
     uplinks: Annotated[tuple[str, ...] | UnsetType, "that carry it, its own first; absent: there is one"] = field(
         default=UNSET, kw_only=True
     )
+    fps: Annotated[
+        Number | UnsetType, Limits(above=0), "Hz at which its pictures are sent; absent: the camera's own rate"
+    ] = field(default=UNSET, kw_only=True)
 
     @classmethod
     def of(cls, setting: Setting) -> CameraDecision:
@@ -67,7 +70,7 @@ class Turned:
     """A knob of a camera that was turned."""
 
     camera: CameraName
-    knob: Annotated[str, Limits(among=("sending", "roi", "size", "bitrate", "uplinks")), "name of the knob"]
+    knob: Annotated[str, Limits(among=("sending", "roi", "size", "bitrate", "fps", "uplinks")), "name of the knob"]
     value: Annotated[Any, "the new one"]
 
 
@@ -114,7 +117,7 @@ def applied_to_json(camera: str, knobs: KnobValues) -> Applied:
 
 def decided(setting: Setting) -> Json:
     """The fields of a `CameraDecision`."""
-    values = {
+    values: Json = {
         "on": setting.on,
         "sending": setting.sending,
         "demand_kbps": plain(setting.demand),
@@ -125,4 +128,8 @@ def decided(setting: Setting) -> Json:
         "height": setting.height,
         "reason": setting.reason,
     }
-    return {**values, "uplinks": setting.uplinks} if setting.uplinks else values
+    if setting.fps is not None:
+        values["fps"] = plain(setting.fps)
+    if setting.uplinks:
+        values["uplinks"] = setting.uplinks
+    return values

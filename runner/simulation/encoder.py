@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import random
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import Any
 
 from runner.core.commands import Command
@@ -43,18 +44,21 @@ class Encoder:
     """The encoder of one camera. Its start, a change of size and a request make the next frame a key frame."""
 
     def __init__(self, camera: Camera, model: EncoderModel, rng: random.Random) -> None:
-        self.interval_s = float(1 / camera.fps)
+        self._model, self._uniform, self._gauss = model, rng.uniform, rng.gauss
+        self._set = 0.0  # bytes of a frame at the bitrate that is set; 0: nothing is sent
+        self._mean = 0.0  # that it follows
+        self._send_at(camera.fps)
         self.restarts = camera.graph.key_frame is not None  # whether it makes a key frame on request
         self.frames = self.bytes = 0
         self.key = True  # whether the next frame is a key frame
-        self._model, self._uniform, self._gauss = model, rng.uniform, rng.gauss
-        self._keep = math.exp(-self.interval_s / model.error_s)
-        self._drawn = model.error * math.sqrt(1 - self._keep**2)
         self._error = rng.gauss(0, model.error) if model.error else 0.0
-        self._set = 0.0  # bytes of a frame at the bitrate that is set; 0: nothing is sent
-        self._mean = 0.0  # that it follows
         self._more = 0.0  # that the last frames took more, in frames
         self._values: dict[str, Any] = {}
+
+    def _send_at(self, fps: Fraction) -> None:
+        self.interval_s = float(1 / fps)
+        self._keep = math.exp(-self.interval_s / self._model.error_s)
+        self._drawn = self._model.error * math.sqrt(1 - self._keep**2)
 
     @property
     def sends(self) -> bool:
@@ -71,6 +75,10 @@ class Encoder:
         self._values[command.knob] = command.value
         if command.knob == "size" and before != command.value:
             self.key = True
+        if command.knob == "fps" and isinstance(command.value, Fraction):
+            before_s = self.interval_s
+            self._send_at(command.value)
+            self._mean *= self.interval_s / before_s
         sending, kbps = self._values.get("sending", False), self._values.get("bitrate", 0)
         self._set = self._model.filled * kbps * 125 * self.interval_s if sending else 0.0
         if not self._mean or self._set < self._mean:

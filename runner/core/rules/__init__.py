@@ -11,8 +11,9 @@ from typing import Any
 from runner.core import allocation, scaling
 from runner.core.budget import beside_sound
 from runner.core.decision import NOTHING, Decision, Draft, Picture, Setting, Shown, short
+from runner.core.frame_rate import sent_rate, varies_rate
 from runner.core.model import SMALLEST_SIDE_PX, Mode, Roi, Vehicle
-from runner.core.rules import seen, spread, steady  # noqa: F401  (register their rules, as the imports below do theirs)
+from runner.core.rules import motion, seen, spread, steady  # noqa: F401  (register their rules, as the imports below do theirs)
 from runner.core.rules.paper import whole
 from runner.core.rules.registry import GIVEN, Last, Memories, Memory, Rule, RuleCall, Step, rule
 from runner.core.rules.safe import follow_link
@@ -36,6 +37,8 @@ __all__ = [
 
 BITRATE_RULE = "must be kbit/s from 0 as an exact number (int or Fraction)"
 FACTOR_RULE = "must be a Fraction in ]0, 1]"
+RATE_RULE = "must be Hz above 0 as an exact number (int or Fraction)"
+WEIGHT_RULE = "must be 0 or more as an exact number (int or Fraction)"
 SHOWN_RULE = (
     f"must be Shown, its region at least {SMALLEST_SIDE_PX}x{SMALLEST_SIDE_PX}, its factor a Fraction in ]0, 1]"
 )
@@ -66,6 +69,8 @@ def decide(vehicle: Vehicle, state: State, memory: Memories) -> tuple[Decision, 
         memory = memory if kept is own else {**memory, call.key: kept}
         if draft.shown is not before.shown:  # the rules that follow share the bits among these regions
             inputs = replace(inputs, rois={**inputs.rois, **{name: shown.roi for name, shown in draft.shown.items()}})
+        if draft.weights is not before.weights:
+            inputs = replace(inputs, weights=_weighted(state.weights, draft.weights))
         if asked is None and draft.total is not None:
             asked = draft.total
             if vehicle.sound and not draft.bitrate:  # in mode S the total is what the operator has set for cameras
@@ -120,6 +125,10 @@ def _is_bitrate(value: Any) -> bool:
     return type(value) in (Fraction, int) and value.numerator >= 0  # comparing fractions is slow
 
 
+def _is_rate(value: Any) -> bool:
+    return _is_bitrate(value) and value.numerator > 0
+
+
 def _is_factor(value: Any) -> bool:
     return type(value) is Fraction and 0 < value.numerator <= value.denominator
 
@@ -147,6 +156,8 @@ PARTS = (
     ("scaling", _is_factor, FACTOR_RULE),
     ("shown", _is_shown, SHOWN_RULE),
     ("pictures", _is_picture, PICTURE_RULE),
+    ("fps", _is_rate, RATE_RULE),
+    ("weights", _is_bitrate, WEIGHT_RULE),
 )
 
 
@@ -161,10 +172,31 @@ def reads(vehicle: Vehicle, mode: Mode) -> frozenset[str]:
 def _settings(
     vehicle: Vehicle, on: Mapping[str, bool], lost: Mapping[str, str], rois: Mapping[str, Roi], draft: Draft
 ) -> Mapping[str, Setting]:
-    return {name: _setting(on[name], lost.get(name), rois[name], draft, name) for name in vehicle.cameras}
+    rates = _sent_rates(vehicle, draft.fps)
+    return {
+        name: _setting(on[name], lost.get(name), rois[name], draft, name, rates.get(name)) for name in vehicle.cameras
+    }
 
 
-def _setting(on: bool, lost: str | None, roi: Roi, draft: Draft, name: str) -> Setting:
+@Last
+def _weighted(weights: Mapping[str, Fraction], factors: Mapping[str, Fraction]) -> Mapping[str, Fraction]:
+    return {name: own * factors.get(name, 1) for name, own in weights.items()}
+
+
+def _sent_rates(vehicle: Vehicle, wanted: Mapping[str, Fraction]) -> Mapping[str, Fraction]:
+    """Hz by camera; empty for a vehicle whose rules set none."""
+    if not _varies_rate(vehicle):
+        return NOTHING
+    encoded = {name: camera for name, camera in vehicle.cameras.items() if not camera.graph.passes}
+    return {name: sent_rate(camera, wanted.get(name, camera.fps)) for name, camera in encoded.items()}
+
+
+@cache
+def _varies_rate(vehicle: Vehicle) -> bool:
+    return varies_rate(vehicle.modes)
+
+
+def _setting(on: bool, lost: str | None, roi: Roi, draft: Draft, name: str, fps: Fraction | None) -> Setting:
     if not on or lost is not None:
         why = f"lost: {lost}" if on else "switched off"
         return Setting(on, False, allocation.ZERO, 0, 0, None, roi, 0, 0, why)
@@ -177,4 +209,4 @@ def _setting(on: bool, lost: str | None, roi: Roi, draft: Draft, name: str) -> S
     if draft.notes:
         reason = "; ".join((reason, *draft.notes))
     video = (kbps if sending else 0, kbps, factor, *picture)
-    return Setting(True, sending, draft.demand[name], *video, reason, draft.placed.get(name, ()))
+    return Setting(True, sending, draft.demand[name], *video, reason, draft.placed.get(name, ()), fps)

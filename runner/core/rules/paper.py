@@ -113,7 +113,7 @@ def with_excess_noted(vehicle: Vehicle, state: State, draft: Draft) -> Draft:
     return draft.noted(f"cameras that encode by themselves send {whole(fixed)} of {whole(draft.total)} kbit/s")
 
 
-@rule(needs=["total", "demand"], gives=["bitrate"], reads=["streams", "weights"])
+@rule(needs=["total", "demand"], gives=["bitrate"], reads=["streams", "weights"], uses=["weights"])
 def share_by_demand(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
     """Eq. (2): the total is shared in proportion to demand times weight, no camera gets more than its demand."""
     assert draft.total is not None
@@ -122,7 +122,7 @@ def share_by_demand(vehicle: Vehicle, state: State, draft: Draft, memory: Memory
     return with_excess_noted(vehicle, state, draft.replaced(bitrate=given)), memory
 
 
-@rule(needs=["total", "demand"], gives=["bitrate"], reads=["streams", "weights"])
+@rule(needs=["total", "demand"], gives=["bitrate"], reads=["streams", "weights"], uses=["weights"])
 def share_equally(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
     """Each camera that is on gets the same, times its weight, but no more than its demand; for comparison."""
     assert draft.total is not None

@@ -71,6 +71,10 @@ class RuleCall:
     def reads(self) -> frozenset[str]:
         return self.rule.reads
 
+    @property
+    def gives(self) -> frozenset[str]:
+        return self.rule.gives
+
     def __call__(self, vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
         return self.rule.function(vehicle, state, draft, memory, **self.parameters)
 

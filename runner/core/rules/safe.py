@@ -16,6 +16,7 @@ from runner.core.budget import beside_sound, video_kbps, wire_kbps
 from runner.core.decision import Draft, UplinkShare
 from runner.core.events import LinkState
 from runner.core.follow_link import FLOOR, Ceiling, Reports
+from runner.core.frame_rate import slowed
 from runner.core.model import Camera, Kbps, Mode, Vehicle, exact, plain
 from runner.core.placement import shared
 from runner.core.rules.paper import (
@@ -36,7 +37,12 @@ _allocated = Last(allocation.allocate_above_floors)
 Share = Callable[[Mapping[str, Kbps], Kbps], Mapping[str, Kbps]]
 
 
-@rule(needs=["total", "demand"], gives=["bitrate"], reads=["copies", "streams", "weights"], uses=["placed", "uplinks"])
+@rule(
+    needs=["total", "demand"],
+    gives=["bitrate"],
+    reads=["copies", "streams", "weights"],
+    uses=["placed", "uplinks", "weights"],
+)
 def share_above_floors(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
     """As `share_by_demand`, but each camera first gets its `floor_kbps`; those with `shed` are given up first.
 
@@ -160,7 +166,7 @@ def _shed_order(vehicle: Vehicle) -> tuple[str, ...]:
     needs=["total", "bitrate", "scaling"],
     gives=["bitrate", "scaling"],
     reads=["copies", "rois", "streams", "weights"],
-    uses=["placed", "sized_for", "uplinks"],
+    uses=["placed", "sized_for", "uplinks", "weights"],
 )
 def fit_to_total(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -> Step:
     """Mode S with less: Eq. (2) in proportion to what the operator has set, with floors as in `share_above_floors`.
@@ -196,6 +202,7 @@ def fit_to_total(vehicle: Vehicle, state: State, draft: Draft, memory: Memory) -
     needs=["total"],
     gives=["total", "uncapped", "sized_for", "uplinks"],
     reads=["copies", "link", "links", "on", "operator_since", "prediction", "predictions", "rois", "streams", "t"],
+    uses=["fps"],
 )
 def follow_link(
     vehicle: Vehicle,
@@ -253,7 +260,7 @@ def _follow(
     begins = draft.total
     assert begins is not None
     asked = begins if of_all is None else of_all
-    cameras, is_automatic = sent_cameras(vehicle, state), state.mode is Mode.AUTOMATIC
+    cameras, is_automatic = sent_cameras(vehicle, state, draft.fps), state.mode is Mode.AUTOMATIC
     link = state.link if how.reports is Reports.FOLLOWED else None
     if not cameras or not follow.is_measured(state, link, past):
         if is_automatic:
@@ -347,10 +354,13 @@ def _why(note: str) -> str:
     return note.partition(": ")[2] or note
 
 
-def sent_cameras(vehicle: Vehicle, state: State) -> tuple[Camera, ...]:
-    """The cameras that are on, with repetitions for those that leave the vehicle in several copies."""
-    mounted = vehicle.cameras.items()
-    return tuple(c for name, c in mounted if state.on[name] for _ in range(state.copies.get(name, 1)))
+def sent_cameras(vehicle: Vehicle, state: State, fps: Mapping[str, Fraction]) -> tuple[Camera, ...]:
+    """The cameras that are on, with repetitions for those that leave the vehicle in several copies.
+
+    fps  of those that send fewer pictures than they have
+    """
+    sent = {name: slowed(c, fps[name]) if name in fps else c for name, c in vehicle.cameras.items() if state.on[name]}
+    return tuple(camera for name, camera in sent.items() for _ in range(state.copies.get(name, 1)))
 
 
 def _wanted(vehicle: Vehicle, state: State, draft: Draft) -> Mapping[str, Kbps]:

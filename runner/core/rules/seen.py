@@ -190,7 +190,7 @@ def demand_from_view(vehicle: Vehicle, state: State, draft: Draft, memory: Memor
     needs=["total", "demand", "shown"],
     gives=["bitrate"],
     reads=["copies", "weights"],
-    uses=["placed", "uplinks"],
+    uses=["placed", "uplinks", "weights"],
 )
 def share_by_quality(
     vehicle: Vehicle,

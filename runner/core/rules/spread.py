@@ -18,6 +18,7 @@ from runner.core.state import State
     needs=["total", "uplinks", "demand"],
     gives=["placed", "total", "uplinks", "sized_for"],
     reads=["on", "t", "weights"],
+    uses=["weights"],
 )
 def spread_over_uplinks(
     vehicle: Vehicle, state: State, draft: Draft, memory: Memory, *, clear_s: Fraction = Fraction(5)

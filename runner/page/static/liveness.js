@@ -27,7 +27,7 @@ export class Liveness {
   unopened = false; // whether the vehicle cannot open the source
   declined = ""; // why the vehicle refuses the station its pictures; "": it does not
   /** @type {number|null} */
-  slow_fps = null; // what the camera delivers, if well below its rate
+  slow_fps = null; // what the camera delivers, if well below the rate at which its pictures are sent
   /** @type {number|null} */
   failed_at = null; // when the source failed: it may repeat old pictures as new
   status = "synchronising";
@@ -37,6 +37,7 @@ export class Liveness {
   /** @param {{fps: number, wave_s: number|null, passed?: boolean}} camera  @param {any} station see `Stream` */
   constructor(camera, station) {
     this.camera = camera;
+    this.fps = camera.fps; // at which its pictures are sent
     this.station = station;
   }
 
@@ -50,10 +51,10 @@ export class Liveness {
 
   /** The vehicle's decision about this camera; undefined: the vehicle does not have it. Returns whether its pictures begin. */
   onDecision(decision) {
-    const { on = null, sending = null, scaling, fault, slow_fps = null } = decision ?? {};
+    const { on = null, sending = null, scaling, fault, slow_fps = null, fps = this.camera.fps } = decision ?? {};
     const begins = on && sending && (this.on === false || this.sending === false);
     if (begins && !this.unopened) this.beginning = new Beginning();
-    Object.assign(this, { on, sending, slow_fps, unopened: on === true && scaling === null });
+    Object.assign(this, { on, sending, slow_fps, fps, unopened: on === true && scaling === null });
     this.failed_at = fault ? (this.failed_at ?? now()) : null;
     return begins;
   }
@@ -82,7 +83,7 @@ export class Liveness {
     const upper = clock.toStation(time) - captured + bound + clock.bound; // not finite if a clock is unknown
     const age = Number.isFinite(upper) ? upper : clock.toStation(time) - arrived - clock.bound; // at least
     if (!Number.isFinite(age) || age <= limits.late_ms) return;
-    this.late_until = time + Math.max(LATE_HOLD_MS, (1000 * INTERVALS) / this.camera.fps);
+    this.late_until = time + Math.max(LATE_HOLD_MS, (1000 * INTERVALS) / this.fps);
     this.late_age = age;
   }
 
@@ -93,7 +94,7 @@ export class Liveness {
     const { wave_s } = this.camera;
     const known = { connected, ended, online, on, sending, unopened, refused, stood_since, waits_since, wave_s, damaged };
     const faulty = this.failed_at !== null;
-    const least = Math.min(this.slow_fps ?? this.camera.fps, fps);
+    const least = Math.min(this.slow_fps ?? this.fps, fps);
     const begins = !this.beginning.isOver;
     const stands = { begins, faulty, declined: this.declined !== "" };
     return { ...known, ...stands, arrived, decoded, late_until, drawn: this.drawn && drawn, fps: least };
@@ -131,7 +132,7 @@ export class Liveness {
    */
   noteText() {
     if (this.isNew) return alarmText(this.status, 0, NaN);
-    return this.slow_fps && this.moves ? slowText(this.slow_fps, this.camera.fps) : "";
+    return this.slow_fps && this.moves ? slowText(this.slow_fps, this.fps) : "";
   }
 
   alarmText(time) {

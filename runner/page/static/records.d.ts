@@ -33,6 +33,8 @@ export interface CameraState {
   reason: string;
   /** that carry it, its own first; absent: there is one */
   uplinks?: (string)[];
+  /** Hz at which its pictures are sent; absent: the camera's own rate */
+  fps?: number;
   /** in the allocation */
   weight: number;
   /** by knob, the value read back; empty for a camera without a pipeline */

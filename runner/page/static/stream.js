@@ -79,6 +79,7 @@ export class Stream {
   /** The vehicle's decision about this camera; undefined: the vehicle does not have it. */
   onDecision(decision) {
     if (this.live.onDecision(decision)) this.resetTimes();
+    this.pace.fps = this.live.fps;
     const { frame } = this.region;
     if (decision) this.region.update(decision);
     if (this.region.stated(this.shown) && !sameRegion(frame, this.region.frame)) this.canvas.painted_text = null; // laid out anew
@@ -244,7 +245,7 @@ export class Stream {
     const { live, composed_at } = this;
     this.composed_fps = fps;
     if (!this.isOnlyInBirdseye || !live.drawn || !one || one.meta.decoded <= composed_at) return;
-    const isOld = now() - one.meta.decoded > frozenAfter(this.station.limits, this.camera.fps);
+    const isOld = now() - one.meta.decoded > frozenAfter(this.station.limits, live.fps);
     live.decoded = composed_at === -Infinity && isOld ? one.meta.decoded : now(); // to show an old picture makes it no newer
     this.composed_at = one.meta.decoded;
     if (!isPart) return;

@@ -348,8 +348,12 @@ function refreshCaption(name, { rates, form, reason }) {
   const repair = sample?.buffer_ms ? `; the jitter buffer waits up to ${sample.buffer_ms} ms for retransmissions` : "";
   const part = now && isPart(name) && !isCropped(name) ? ` of ${percent(shareOf(now.roi, camera(name) ?? now.roi))} of the image` : "";
   const shape = `${size(sample?.width, sample?.height)} · ×${factor(now?.scaling)}${part}`;
-  const of = now?.slow_fps && !isSilent ? ` of ${whole(camera(name)?.fps)}` : "";
-  const rated = `pictures a second · ${KBPS}: received / allocated / demanded`;
+  const own = camera(name)?.fps;
+  const sent = now?.fps ?? own;
+  const isFewer = sent !== own;
+  const of = (now?.slow_fps || isFewer) && !isSilent ? ` of ${whole(sent)}` : "";
+  const left = isFewer ? ` received of those sent; the camera delivers ${whole(own)}` : "";
+  const rated = `pictures a second${left} · ${KBPS}: received / allocated / demanded`;
   caption(rates, bitrate, `${whole(sample?.fps)}${of} fps · ${kbps} ${KBPS}`, rated);
   const lost = sample?.lost ? ` · ${sample.lost} lost` : "";
   const wire = `${whole(sample?.lost)} packets lost, receiver rebuilt ${whole(sample?.rebuilt)} times`;
