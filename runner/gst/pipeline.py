@@ -32,6 +32,7 @@ from runner.turning import is_restarted_after_gaps
 if TYPE_CHECKING:
     from runner.gst.passed import PassedStream
     from runner.gst.pushed import PushedPictures
+    from runner.gst.repeated_sets import RepeatedSets
     from runner.gst.sound_pipeline import SoundPipeline
     from runner.gst.uplinks import CameraUplinks, VehicleUplinks
     from runner.ros.cameras import SharedPicture
@@ -122,6 +123,7 @@ class CameraPipeline:
         if dropping := pipeline.get_by_name(DROPPING):
             self.knobs.dropped = RateLimit(dropping, float(plan.camera.fps))
         self.knobs.set_now(self._allowed(self._first))
+        self._sets = self._repeated_sets()
         self._held_up = HeldUp(last)
         self.requests = RequestLimit(last, on_report)
         self._first_packet = BufferProbe(last, self._on_first_packet, in_lists=True)
@@ -136,6 +138,11 @@ class CameraPipeline:
         from runner.gst.passed import PassedStream
 
         return PassedStream(self._sent.get_static_pad("sink"), self._plan.camera, self._on_report)
+
+    def _repeated_sets(self) -> RepeatedSets | None:
+        from runner.gst.repeated_sets import RepeatedSets
+
+        return RepeatedSets.of(self._plan, self._sent)
 
     @property
     def is_opening(self) -> bool:
