@@ -178,6 +178,15 @@ def test_without_a_view_cropped_pictures_are_refused(tod, drive, tmp_path):
     assert refused.err.endswith(f"\n{path}: {rule}: view={path} scores what was seen\n")
 
 
+def test_a_model_is_not_measured_on_cropped_pictures(tod, drive, tmp_path):
+    clips = sorted(
+        (drive / "video").glob("front_center.vehicle.*.ts"), key=lambda path: path.stat().st_size, reverse=True
+    )
+    result = tod("model", "camera=front_center", f"sequence={clips[0]}", f"output={tmp_path / 'models'}")
+    rule = "shows only what a driver saw at times: whole pictures are needed, as `tod-runner record` keeps them"
+    assert (result.status, result.err) == (2, f"command line: sequence: '{clips[0]}': {rule}\n")
+
+
 def test_a_log_that_states_no_view_is_refused(tod, drive, tmp_path):
     log = tmp_path / "log.jsonl"
     log.write_text('{"t": 0.0, "event": "clock_advanced"}\n')
