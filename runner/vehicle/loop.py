@@ -419,7 +419,7 @@ class ControlLoop:
     def _publish_state(self) -> None:
         """Publish the decided and the applied values if either has changed; answer requests that are now applied."""
         now = self._now()
-        if not (self._replies.is_awaited or self._publisher.is_state_due(now)):
+        if not (self._replies.is_awaited or self._publisher.is_state_due(now, self._run.decision)):
             return
         self._readings.read()
         self._publisher.state(self._run, self._readings, now, has_viewer=bool(self._operators.present))

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 from msgspec import UNSET, UnsetType
 
+from runner.core.decision import Decision
 from runner.core.events import Attention, LinkMeasured, PositionReported, SteeringReported
 from runner.core.model import plain
 from runner.core.step import Run
@@ -63,9 +64,13 @@ class Publisher:
     _published: VehicleState | None = None  # the state as last published
     _steering_published: float = -STEERING_S
 
-    def is_state_due(self, now: float) -> bool:
-        """Whether to publish the state if it has changed."""
-        return self._published is None or self.again or now - self._published.t >= STATE_S
+    def is_state_due(self, now: float, decision: Decision) -> bool:
+        """Whether to publish the state if it has changed. Frame rates do not wait: pages judge by them what is frozen."""
+        last = self._published
+        if last is None or self.again or now - last.t >= STATE_S:
+            return True
+        rates = {name: plain(setting.fps) for name, setting in decision.settings.items() if setting.fps is not None}
+        return any(name in last.cameras and last.cameras[name].fps != fps for name, fps in rates.items())
 
     def state(self, run: Run, readings: Readings, now: float, *, has_viewer: bool) -> None:
         """Publish the decided and the applied values if either has changed.
