@@ -268,13 +268,14 @@ def _ages(
     captured = np.array([unit.captured for unit in newest])[number]
     came = np.array([unit.arrived for unit in newest])[number]
     age_ms = (at - captured) / 1e6
-    limit_ms = max(FROZEN_MS, 1000 * FROZEN_INTERVALS / float(camera.fps))
-    frozen = (at - arrived[number]) / 1e6 > limit_ms
+    rates = [float(decision.fps or camera.fps) for decision in sent.decisions]
+    limits_ms = _held(at, sent.since, [max(FROZEN_MS, 1000 * FROZEN_INTERVALS / rate) for rate in rates])
+    frozen = (at - arrived[number]) / 1e6 > limits_ms
     late = ~frozen & ((came - captured) / 1e6 > looks.late_ms)
     mean_ms, p95_ms = float(age_ms.mean()), float(np.percentile(age_ms, 95))
     return Ages(round(mean_ms, 1), round(p95_ms, 1), round(float(frozen.mean()), 4), round(float(late.mean()), 4))
 
 
-def _held(at: np.ndarray, since: Sequence[int], values: Sequence[bool]) -> np.ndarray:
-    """At each time, the value in force; False before the first."""
+def _held(at: np.ndarray, since: Sequence[int], values: Sequence[float]) -> np.ndarray:
+    """At each time, the value in force; False, or 0, before the first."""
     return np.array([False, *values])[np.searchsorted(np.array(since, dtype=np.int64), at, "right")]
