@@ -48,6 +48,8 @@ class Reception:
     refused     whether the vehicle refuses this viewer for want of room on its uplink
     arrivals    of each access unit since the previous sample, if requested: arrival and capture time, s since 1970
                 by this machine's and by the vehicle's clock
+    regions     likewise, whenever pictures begin to show another part of the image, as they state it: arrival of the
+                first one, and that part
     """
 
     frames: int = 0
@@ -66,6 +68,7 @@ class Reception:
     rebuilt: int = 0
     refused: bool = False
     arrivals: tuple[tuple[float, float | None], ...] = ()
+    regions: tuple[tuple[float, Roi], ...] = ()
 
 
 OnUnit = Callable[[str, AccessUnit], None]  # camera, access unit
@@ -109,6 +112,8 @@ class Receiver(StreamReceiver):
         self._video, self._sink_name = video, plan.operator[-1].name
         self._arrivals: deque[tuple[float, float | None]] | None = deque() if arrivals else None
         self._sampled = 0  # arrivals that have been read
+        self._full = self._region = plan.camera.full_roi  # the second: that the newest access unit shows
+        self._changes: deque[tuple[float, Roi]] = deque()  # of it, with arrivals
         self.newest: Arrival | None = None  # access unit, complete or not, that has left the jitter buffer
         self._on_unit, self._on_picture = on_unit, on_picture
         self._regions: deque[tuple[int | None, Roi]] = deque(maxlen=MAX_DECODING)  # by PTS
@@ -142,7 +147,11 @@ class Receiver(StreamReceiver):
             self.rtp.report_transport()
         received = self._count()
         received = replace(
-            received, buffer_ms=buffer_ms, waited_ms=self.rtp.waited_ms(), arrivals=self._arrived(received.frames)
+            received,
+            buffer_ms=buffer_ms,
+            waited_ms=self.rtp.waited_ms(),
+            arrivals=self._arrived(received.frames),
+            regions=self._changed(),
         )
         if self._is_alive(received.frames, received.foreign):
             self._next_picture.arm()
@@ -216,13 +225,25 @@ class Receiver(StreamReceiver):
         self._refused = 0
         self._frames += 1  # after its arrival is recorded: no sample counts a frame without one
         self._damaged += damaged
-        if self._on_picture and self._codec == "h264" and (region := stated_region(buffer.extract(0, HEAD_BYTES))):
-            self._regions.append((buffer.pts, region))
+        if self._codec == "h264" and (self._on_picture or self._arrivals is not None):
+            self._note_region(arrived, buffer.pts, stated_region(buffer.extract(0, HEAD_BYTES)))
         if self._on_unit:
             unit = read_unit(buffer.extract(0, size), captured, arrived, damaged=incomplete, codec=self._codec)
             if unit:
                 self._on_unit(self._name, unit._replace(damaged=damaged))
         return False
+
+    def _note_region(self, arrived: float, pts: int | None, region: Roi | None) -> None:
+        if self._on_picture and region:
+            self._regions.append((pts, region))
+        shown = region or self._full
+        if self._arrivals is not None and shown != self._region:
+            self._region = shown
+            self._changes.append((arrived, shown))
+
+    def _changed(self) -> tuple[tuple[float, Roi], ...]:
+        """Changes of the region since the last call."""
+        return tuple(self._changes.popleft() for _ in range(len(self._changes)))
 
     def _arrived(self, frames: int) -> tuple[tuple[float, float | None], ...]:
         """Arrivals since the last call, only of frames already counted: more may arrive meanwhile."""

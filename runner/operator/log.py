@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from msgspec import UNSET
+
 from runner.drive.log import Log
 from runner.operator.station import Listener, Station
 from runner.records.lines import Note, SoundReceived
@@ -42,7 +44,9 @@ class DriveLog(Listener):
 
     def _with_arrivals(self, name: str, camera: CameraSample) -> CameraSample:
         arrivals = tuple(self._arrival(name, *arrival) for arrival in self._station.samples[name].arrivals)
-        return replace(camera, arrivals=arrivals)
+        changes = self._station.samples[name].regions
+        regions = tuple((round(arrived - self._log.time, 4), region) for arrived, region in changes)
+        return replace(camera, arrivals=arrivals, regions=regions or UNSET)
 
     def _arrival(self, name: str, arrived: float, captured: float | None) -> tuple[float, float | None]:
         """Arrival time of a unit, s since the beginning, and its latency since capture, ms."""

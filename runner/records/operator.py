@@ -9,6 +9,7 @@ from typing import Annotated
 from msgspec import UNSET, UnsetType
 
 from runner.core.limits import Count, NonNegative, Share
+from runner.core.model import Roi
 from runner.records import Amount, Number, Time
 from runner.records.reception import UplinkReceived
 from runner.records.vehicle import EncoderCounts, Position, UplinkMeasured
@@ -35,6 +36,8 @@ class CameraSample(EncoderCounts):
     width, height  of the decoded picture, px; 0 before the first
     buffer_ms   how long a picture waits for retransmitted packets, ms; None: no retransmission
     arrivals    in a log, of each access unit since the previous sample: time, s, and ms since its capture if known
+    regions     in a log, whenever pictures begin to show another part of the image, as H.264 pictures state it: time of
+                arrival, s, and that part; at the beginning all of it. Absent: no change
 
     Latencies are accurate to within the sample's `clock_bound_ms`. Counts of the encoder alone are those of telemetry.
     """
@@ -62,6 +65,7 @@ class CameraSample(EncoderCounts):
     refused: Annotated[
         str | UnsetType, "why the vehicle refuses this operator its pictures, in words; absent: it does not"
     ] = UNSET
+    regions: tuple[tuple[float, Roi], ...] | UnsetType = UNSET
 
 
 @dataclass(frozen=True, slots=True)

@@ -188,6 +188,18 @@ def test_a_model_is_not_measured_on_cropped_pictures(tod, drive, tmp_path):
     assert (result.status, result.err) == (2, f"command line: sequence: '{clips[0]}': {rule}\n")
 
 
+def test_the_log_states_the_region_of_each_picture(drive):
+    samples = [line for line in lines(drive / "operator.jsonl") if line.get("log") == "sample"]
+    found = [each for line in samples for each in line["cameras"]["front_center"].get("regions", ())]
+    assert found
+    times, regions = zip(*found, strict=True)
+    assert list(times) == sorted(times)
+    shown = Roi(**regions[-1])
+    assert (shown.x, shown.y) <= (SHOWN.x, SHOWN.y)
+    assert shown.width >= SHOWN.width
+    assert shown.width < SIZE["width_px"]
+
+
 def test_a_log_that_states_no_view_is_refused(tod, drive, tmp_path):
     log = tmp_path / "log.jsonl"
     log.write_text('{"t": 0.0, "event": "clock_advanced"}\n')

@@ -244,6 +244,8 @@ export interface CameraSample {
   received?: Record<string, UplinkReceived>;
   /** why the vehicle refuses this operator its pictures, in words; absent: it does not */
   refused?: string;
+  /** in a log, whenever pictures begin to show another part of the image, as H.264 pictures state it: time of arrival, s, and that part; at the beginning all of it. Absent: no change */
+  regions?: ([number, Roi])[];
 }
 
 /** What the operator in control receives over one of several uplinks, as in `runner.core.events.LinkMeasured` */
