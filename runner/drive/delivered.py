@@ -4,8 +4,8 @@ For a moment t, the displayed picture is the newest one captured by t that had a
 lost or late picture is compared with a scene that has moved on. Pictures are compared at the full size of the camera,
 after scaling, as a screen shows them, damage included.
 
-The scene is the camera's rendered clip, if its source has one: losses by scaling and encoding are included. For other
-sources only the stream as sent is known, so these losses are not included.
+The scene is the clip that the camera's source plays, if it does: losses by scaling and encoding are included. For
+other sources only the stream as sent is known, so these losses are not included.
 """
 
 from __future__ import annotations

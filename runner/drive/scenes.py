@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from runner.drive.videos import FileTimes, Picture, Videos
 from runner.rate_quality.metrics.interface import Luma
 
 BLOCKS = 32  # along the shorter side of an image
+KEPT_BYTES = 400_000_000  # of pictures of a clip, for each camera that is measured at the same time
 
 Blocks = NDArray[np.float32]
 
@@ -26,6 +28,8 @@ def scenes(
     size: tuple[int, int] | None = None,
 ) -> Iterator[tuple[int, Picture]]:
     """Moments and their scenes, in the order of capture. All scenes of a drive would not fit into memory.
+
+    Those of a short clip do: it is decoded once for all of its repetitions.
 
     moments  capture times of pictures that were sent, ns
     clip     that the source played; None: the scenes are the pictures as sent
@@ -47,12 +51,20 @@ def scenes(
             if blocks.size:  # a region smaller than a block is not recognised
                 numbers[ns] = _nearest([each[where] for each in clipped], blocks)
     needed = set(numbers.values())
-    kept = {n: luma[window] for n, (_, luma) in enumerate(_played(camera, videos, clip)) if n in needed}
-    yield from ((ns, Picture(kept[number], camera.full_roi)) for ns, number in numbers.items())
+    if len(needed) * camera.width * camera.height <= KEPT_BYTES:
+        kept = {n: luma[window] for n, (_, luma) in enumerate(_played(camera, videos, clip)) if n in needed}
+        yield from ((ns, Picture(kept[number], camera.full_roi)) for ns, number in numbers.items())
+        return
+    repeated = chain.from_iterable(enumerate(_played(camera, videos, clip)) for _ in numbers)
+    played, (_, luma) = next(repeated)
+    for ns, number in numbers.items():
+        while played != number:
+            played, (_, luma) = next(repeated)
+        yield ns, Picture(luma[window], camera.full_roi)
 
 
 def _played(camera: Camera, videos: Videos, clip: Path) -> Iterator[tuple[int, Luma]]:
-    return videos.decode(clip, camera.source_size)
+    return videos.clip(clip, camera.source_size)
 
 
 def lookup(found: Iterator[tuple[int, Picture]]) -> Callable[[int], Picture | None]:

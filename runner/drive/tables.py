@@ -19,7 +19,7 @@ LEGEND = (
     " or of the mean and 150 ms, whichever is longer. Damaged: frames whose picture shows that packets were lost."
     " Quality is estimated from the bitrate: a frozen picture keeps its last estimate, so read it together with the"
     " share of time frozen. Delivered: MSSIM of the displayed picture, twice a second, against the scene at that time;"
-    " for sources that are not rendered, against the stream as sent."
+    " for sources that play no clip, against the stream as sent."
 )
 UPLINKS = (
     "Share: of the packets that arrived, copies included. Lost alone: what this uplink without the others would have"

@@ -29,6 +29,7 @@ T = TypeVar("T")
 REPORT_S = 0.25  # between two reports of progress
 
 DecodeVideo = Callable[[Path, "tuple[int, int] | None"], Iterator[tuple[int, Luma]]]
+DecodeClip = Callable[[Path, tuple[int, int]], Iterator[tuple[int, Luma]]]
 Regions = Callable[["Unit", int], Roi]  # what a unit shows that was captured then, ns
 
 
@@ -59,11 +60,15 @@ class _FileUnit(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Videos:
-    """The video files of a drive."""
+    """The video files of a drive.
+
+    clip  decodes a clip as a camera's source plays it, fitted to a size
+    """
 
     directory: Path
     read: ReadVideo
     decode: DecodeVideo
+    clip: DecodeClip
 
     def pictures(
         self, timed: Sequence[FileTimes], size: tuple[int, int] | None = None

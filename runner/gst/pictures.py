@@ -15,6 +15,7 @@ from runner.gst.caps import structure
 from runner.gst.video_reader import pulled
 from runner.system.files import file_problem
 
+RAW = "video/x-raw,format=I420"
 LumaPlane = NDArray[np.uint8]  # height x width
 
 
@@ -35,11 +36,26 @@ def decode_video(path: Path, size: tuple[int, int] | None) -> Iterator[tuple[int
     size    to which pictures are scaled; None: as they were coded
     raises  RunError if the path names no file or nothing can be decoded. Damaged pictures come as they were decoded
     """
+    yield from _decoded(path, f"videoscale add-borders=false ! {_caps(*size)}" if size else RAW)
+
+
+def decode_clip(path: Path, size: tuple[int, int]) -> Iterator[tuple[int, LumaPlane]]:
+    """Likewise, as conf/source/file.yaml fits a clip to a camera's size: upright, cropped, and scaled.
+
+    raises  RunError
+    """
+    width, height = size
+    fit = f"videoflip video-direction=auto ! aspectratiocrop aspect-ratio={width}/{height} ! videoscale"
+    return _decoded(path, f"{fit} ! {_caps(width, height)}")
+
+
+def _caps(width: int, height: int) -> str:
+    return f"{RAW},width={width},height={height},pixel-aspect-ratio=1/1"
+
+
+def _decoded(path: Path, form: str) -> Iterator[tuple[int, LumaPlane]]:
     if why := file_problem(path):
         raise RunError(f"{path}: {why}")
-    form = "video/x-raw,format=I420"
-    if size:
-        form = f"videoscale add-borders=false ! {form},width={size[0]},height={size[1]},pixel-aspect-ratio=1/1"
     pipeline = Gst.parse_launch(
         "filesrc name=file ! parsebin ! identity name=units ! decodebin ! videoconvert"
         f" ! {form} ! appsink name=out sync=false max-buffers=4"

@@ -2,9 +2,9 @@
 
 Measures the quality of what the operator saw: twice a second, the displayed picture is compared with the scene that the
 camera saw at that time (MSSIM of luma at the camera's full size). Freezes, delay and damage lower the score. Needs
-drives with log.video=true on both sides. With a rendered source (synthetic) the scene is the clip's picture; otherwise
-it is the stream as sent, and losses in the encoder are not included. Pictures that were cropped to what the driver saw
-are left out.
+drives with log.video=true on both sides. With a source that plays a clip (synthetic, file) the scene is the picture of
+the clip; otherwise it is the stream as sent, and losses in the encoder are not included. Pictures that were cropped to
+what the driver saw are left out.
 
 Writes the score at each of these times to DRIVE/quality.json, which `report` shows.
 
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from runner.drive.seen_file import Optimum, SeenCamera, SeenDrive
     from runner.drive.videos import Videos
     from runner.drive.views import Views
+    from runner.graph import Plan
     from runner.rate_quality.metrics import Metric
     from runner.settings import Setup
 
@@ -147,7 +148,10 @@ def _warn(what: str) -> None:
 
 
 def _recorded(path: Path) -> _Recorded:
-    """raises  UserError if it cannot be read, or lacks a side"""
+    """The drive in a directory. Clips of full range are left out: they were converted before they were sent.
+
+    raises  UserError if it cannot be read, or lacks a side
+    """
     from runner.configuration.config import configuration
     from runner.drive.read import read_drive
     from runner.drive.videos import Videos
@@ -161,14 +165,22 @@ def _recorded(path: Path) -> _Recorded:
         raise UserError(str(drive.path), "", None, f"no log of the {' and the '.join(missing)}: both sides are needed")
     began = drive.sides["vehicle"].began
     setup = configuration([], base=(dict(began.config), f"{drive.path}: config"), runnable=False).setup()
-    clips = {  # only rendered ones have the shape of the camera's picture; others are cropped by their source
+    apply = streaming()
+    clips = {
         plan.camera.name: Path(str(plan.source[0].properties["location"]))
         for plan in compile_plans(setup)
-        if plan.loops and plan.camera.source.render
+        if _fits(plan)
     }
-    apply = streaming()
-    known = {name: clip for name, clip in clips.items() if clip.is_file()}
-    return _Recorded(drive, setup, known, Videos(path, apply.read_video, apply.decode_video))
+    known = {
+        name: clip for name, clip in clips.items() if clip.is_file() and not apply.discover(clip, "clip").colorimetry
+    }
+    return _Recorded(drive, setup, known, Videos(path, apply.read_video, apply.decode_video, apply.decode_clip))
+
+
+def _fits(plan: Plan) -> bool:
+    """Whether a source plays a clip that it fits to the camera's size as `decode_clip` does."""
+    rendered, fitted = plan.camera.source.render, any(each.factory == "aspectratiocrop" for each in plan.source)
+    return plan.loops and bool(rendered or (fitted and plan.source[0].factory == "filesrc"))
 
 
 def _metrics() -> list[Metric]:

@@ -7,6 +7,7 @@ import shutil
 
 import pytest
 from helpers import shared_cache
+from shared_data import shared
 
 from rig import free_port, run
 
@@ -75,6 +76,21 @@ def test_without_its_clip_the_stream_as_sent_is_the_reference(tod, drive, tmp_pa
     camera = measured(tod, drive)["cameras"]["front_center"]
     assert camera["clip"] is False
     assert sum(camera["mssim"]) / len(camera["mssim"]) > 0.99
+
+
+def test_the_scene_of_a_recorded_clip_is_its_picture(tod, tmp_path, monkeypatch):
+    """The clip is cropped and scaled as its source does it; a long one is decoded again where it is needed."""
+    clip = shared("video/forward_highway_day_540p25_A.mp4")
+    path, ports = tmp_path / "recorded", (f"media.port={free_port()}", f"control.port={free_port()}")
+    words = (*OTHERS, *SIZE, "fps_max=5", "page.serve=false", "modes=open_loop", "source=file", f"source.clip={clip}")
+    rate = ("pqos=constant", "pqos.kbps=5000", "log.video=true", "duration_s=4", *ports)
+    done = run("demo", *words, *rate, f"log={path}")
+    assert done.returncode == 0, done.stderr
+    found = measured(tod, changed(path, tmp_path / "prompt", in_time))
+    assert found["cameras"]["front_center"]["clip"] is True
+    assert 0.9 < found["mean"] < 0.9999
+    monkeypatch.setattr("runner.drive.scenes.KEPT_BYTES", 0)
+    assert measured(tod, tmp_path / "prompt")["cameras"] == found["cameras"]
 
 
 def test_a_drive_without_video_is_refused(tod, drive, tmp_path):
