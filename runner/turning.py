@@ -17,6 +17,7 @@ from runner.dropping import EVERY
 _COUNT_FRAMES = ("x264enc", "x265enc")
 # Encoders whose rate control makes up for time without pictures, by pictures that are too large.
 _SAVE_UP = ("openh264enc",)
+NEVER_S = 1e6  # between two waves that the encoder begins by itself, where each is asked for
 Assignment = tuple[str, str, Value]  # element, property, value
 
 
@@ -27,7 +28,7 @@ def assignments(camera: Camera, knob: str, value: KnobValue, pace: float = 1.0) 
             counts frames. The length of its buffer stays, since it counts that in frames too
     raises  ModelError if the type of the value does not fit the knob
     """
-    if knob == "uplinks":  # which carry the camera is no element's property
+    if knob in ("uplinks", "wave_s"):  # which carry the camera, and when waves are asked for, is no element's property
         return []
     of_time, of_frames = _quantities(camera, value), _quantities(camera, value, pace)
     count_frames = {element.name for element in camera.graph.vehicle if element.factory in _COUNT_FRAMES}
@@ -94,6 +95,8 @@ def _buffer(of_frames: Mapping[str, int], kbps: int) -> dict[str, Value]:
 def per_frame_rate(settings: GraphSettings, fps: Fraction) -> Mapping[str, int]:
     """The placeholders that settings of a graph fill at a frame rate."""
     seconds, frames = settings.key_interval_s, settings.vbv_frames
+    if settings.shortest_wave_s is not None:
+        seconds = NEVER_S
     values = {} if seconds is None else {"key_interval_frames": seconds * fps}
     values |= {} if frames is None else {"vbv_ms": 1000 * frames / fps}
     return {name: max(1, round(value)) for name, value in values.items()}

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
+from functools import reduce
 from ipaddress import IPv4Network, IPv6Network, ip_network
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -20,7 +21,7 @@ from runner.configuration.uplinks import Ways, built_uplinks, reserves_kbps, upl
 from runner.core.budget import SOUND, VOICE
 from runner.core.capture import Capture
 from runner.core.commands import KnobValue
-from runner.core.frame_rate import varies_rate
+from runner.core.frame_rate import is_given
 from runner.core.hull import Curve, concave
 from runner.core.model import Camera, Graph, Kbps, Mode, ModelError, RateQualityModel, Roi, Source, Vehicle, exact
 from runner.core.mounting import Place, Pose, overlapping
@@ -29,6 +30,7 @@ from runner.dropping import with_rate_knob
 from runner.errors import ConfigError, Problem, suggest
 from runner.graph import Plan, check_video, compile_graph
 from runner.redact import redacted
+from runner.refresh import with_asked_waves
 from runner.settings import (
     Control,
     Dimensions,
@@ -58,6 +60,7 @@ SAMPLE_KNOBS: Mapping[str, KnobValue] = {"sending": True, "roi": Roi(0, 0, 16, 1
 TOPIC = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")  # design.ros2.org, topic and service names
 TOPIC_RULE = "must be the name of a topic: letters, digits and _ between slashes, no part beginning with a digit"
 CAMERA_NEEDS = ("width_px", "height_px", "fps", "rate_quality")  # keys that the schema requires, set by the kind
+GRAPH_CHANGES = {"fps": with_rate_knob, "wave_s": with_asked_waves}  # that what a rule gives needs
 SECTIONS = (
     *("media", "control", "page", "log", "latency", "keys", "insecure", "metrics", "ros", "strict", "uplinks"),
     *("sound", "voice"),
@@ -93,7 +96,7 @@ class Builder:
         self.problems += [self.composed.problem(f.path, f.found, f.rule) for f in wrong]
         self.bad = {f.path for f in wrong} | {f.meant for f in wrong}
         modes = {mode: self._rules(mode) for mode in Mode if self.is_valid("modes", mode)}
-        self.varies_rate = varies_rate(modes)
+        self.graph_changes = [change for part, change in GRAPH_CHANGES.items() if is_given(part, modes)]
         mounted = document.get("cameras")
         cameras = {name: self._camera(name) for name in mounted} if isinstance(mounted, dict) else {}
         if not all(map(self.is_valid, SECTIONS)):
@@ -235,7 +238,7 @@ class Builder:
                 height=data["height_px"],
                 fps=fps if limit is None else min(fps, _rate(limit)),
                 rate_quality=model,
-                graph=with_rate_knob(graph) if self.varies_rate else graph,
+                graph=reduce(lambda changed, change: change(changed), self.graph_changes, graph),
                 source=source,
                 native=(native["width_px"], native["height_px"]) if native else None,
                 crop=_crop(native, data["width_px"], data["height_px"]) if native else None,

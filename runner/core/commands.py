@@ -19,7 +19,8 @@ class Command:
     """Turn one knob of one camera. Commands of a camera that arrive together take effect between the same two frames.
 
     value  sending: bool; roi: Roi in px of the full image; size: (width, height) in px; bitrate: whole kbit/s, >= 1;
-           uplinks: names of those that carry it; fps: Hz, each n-th picture of the camera
+           uplinks: names of those that carry it; fps: Hz, each n-th picture of the camera;
+           wave_s: time between two refresh waves
     """
 
     camera: str
@@ -48,6 +49,8 @@ def wanted(setting: Setting) -> KnobValues:
     values: dict[str, KnobValue] = {"sending": True, "roi": setting.roi, "size": size, "bitrate": setting.kbps}
     if setting.fps is not None:
         values["fps"] = setting.fps
+    if setting.wave_s is not None:
+        values["wave_s"] = setting.wave_s
     if setting.uplinks:
         values["uplinks"] = setting.uplinks
     return values

@@ -25,6 +25,7 @@ class Setting:
     scaling        selected factor; None when off, or when its source cannot be opened
     width, height  px of the encoded picture, 0 when off
     uplinks        that carry it, its own first, if the vehicle's have names and a rule places cameras on them
+    wave_s         between two refresh waves; None: none is asked for
     fps            Hz at which pictures are sent, see `sent_rate`; None: no rule of the vehicle sets rates
     reason         for the operator; ignored in comparisons
     """
@@ -41,6 +42,7 @@ class Setting:
     reason: str = field(compare=False)
     uplinks: tuple[str, ...] = ()
     fps: Fraction | None = None
+    wave_s: Fraction | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,6 +138,7 @@ class Draft(NamedTuple):
 
     shown      by camera that is on, what its operator sees; empty: everything
     fps        Hz by camera, at most this is sent; empty: every picture
+    wave_s     by camera whose waves are asked for, time between two; empty: the shortest
     weights    by camera, what the operator's weight is multiplied by; empty: 1
     total      kbit/s of all cameras
     demand     kbit/s by camera, 0 when off
@@ -172,6 +175,7 @@ class Draft(NamedTuple):
     pictures: Mapping[str, Picture] = NOTHING
     fps: Mapping[str, Fraction] = NOTHING
     weights: Mapping[str, Fraction] = NOTHING
+    wave_s: Mapping[str, Fraction] = NOTHING
 
     def replaced(self, **changes: Any) -> Draft:
         """The draft with these parts replaced."""

@@ -13,9 +13,9 @@ from runner.core.model import Camera, Mode, ModeRule
 LEAST_HZ = 5  # that a camera keeps of its own rate: with less no driver can judge movement
 
 
-def varies_rate(modes: Mapping[Mode, Iterable[ModeRule]]) -> bool:
-    """Whether a rule of any mode sets frame rates: then pipelines can drop pictures, and the rate is stated."""
-    return any("fps" in call.gives for calls in modes.values() for call in calls)
+def is_given(part: str, modes: Mapping[Mode, Iterable[ModeRule]]) -> bool:
+    """Whether a rule of any mode gives a part of the draft, such as frame rates: then pipelines must be able to."""
+    return any(part in call.gives for calls in modes.values() for call in calls)
 
 
 def sent_rate(camera: Camera, wanted: Fraction) -> Fraction:

@@ -43,7 +43,9 @@ class GraphSettings:
     retransmission_ms  how long the vehicle keeps packets for retransmission; 0: there is none
     srt_latency_ms     how long SRT may take to repair a loss, its playout delay
     dscp               DiffServ code point of the video packets; -1 leaves it to the system
-    key_interval_s     between key frames, or length of a refresh wave; fills {key_interval_frames}
+    key_interval_s     between key frames or refresh waves, at most; fills {key_interval_frames}
+    longest_wave_s     between refresh waves, at most, where a rule sets how often they are asked for
+    shortest_wave_s    between refresh waves that are asked for, at least; None: the encoder makes them by itself
     vbv_frames         rate control buffer in frames at the bitrate in force; fills {vbv_ms}
     lowest_kbps        to which a camera that encodes by itself can be set
     """
@@ -56,5 +58,7 @@ class GraphSettings:
     srt_latency_ms: int = 0
     dscp: int = -1
     key_interval_s: float | None = None
+    longest_wave_s: float = 6.0
+    shortest_wave_s: float | None = None
     vbv_frames: float | None = None
     lowest_kbps: int = 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from fractions import Fraction
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from gi.repository import Gst, GstRtp, GstVideo
@@ -108,6 +109,7 @@ class CameraPipeline:
         self._restarts_after_gaps = is_restarted_after_gaps(plan.camera.graph)
         self._passed = self._passed_stream()
         self._is_gap = False
+        self._waved = 0.0  # when a refresh wave was asked for last, time.monotonic
         self._pushed: PushedPictures | None = None  # those of a Python program
         self._elements = [pipeline.get_by_name(element.name) for element in plan.vehicle]
         self._encoder = EncoderWatch(self._elements)
@@ -229,6 +231,7 @@ class CameraPipeline:
             self._look_at_rate(now, passed_counts(self._entered)[0])
         if self.sent_frames:
             self.sent_frames.look()
+        self._ask_for_wave(now)
         if self._passed:
             self._passed.look()
 
@@ -292,9 +295,19 @@ class CameraPipeline:
             case "caps":
                 self.knobs.restart_encoder("size")
             case "event":
-                event = GstVideo.video_event_new_upstream_force_key_unit(Gst.CLOCK_TIME_NONE, True, 0)
-                if self._sent:
-                    self._sent.get_static_pad("sink").push_event(event)
+                self._force_key_unit()
+
+    def _force_key_unit(self) -> None:
+        if self._sent:
+            event = GstVideo.video_event_new_upstream_force_key_unit(Gst.CLOCK_TIME_NONE, True, 0)
+            self._sent.get_static_pad("sink").push_event(event)
+
+    def _ask_for_wave(self, now: float) -> None:
+        """Let x264 begin a refresh wave, if one is due. While it is on its way, another one would begin after it."""
+        interval = self.knobs.applied.get("wave_s")
+        if isinstance(interval, Fraction) and now - self._waved >= interval and not self._rate.silent_s(now) > 1:
+            self._waved = now
+            self._force_key_unit()
 
     def stages(self) -> SenderStages | None:
         """How long the last sampled picture took to leave the encoder; a few times a second, from one thread.

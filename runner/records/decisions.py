@@ -14,6 +14,7 @@ from runner.core.limits import Count, Limits
 from runner.core.model import Mode, Roi, plain
 from runner.records import Amount, CameraName, Json, Number, Time, to_json
 
+KNOBS = ("sending", "roi", "size", "bitrate", "fps", "wave_s", "uplinks")
 Applied = Annotated[Mapping[str, Any], "by knob, the value read back; empty for a camera without a pipeline"]
 
 
@@ -39,6 +40,9 @@ class CameraDecision:
     )
     fps: Annotated[
         Number | UnsetType, Limits(above=0), "Hz at which its pictures are sent; absent: the camera's own rate"
+    ] = field(default=UNSET, kw_only=True)
+    wave_s: Annotated[
+        Number | UnsetType, Limits(above=0), "between two refresh waves, s; absent: none is asked for"
     ] = field(default=UNSET, kw_only=True)
 
     @classmethod
@@ -70,7 +74,9 @@ class Turned:
     """A knob of a camera that was turned."""
 
     camera: CameraName
-    knob: Annotated[str, Limits(among=("sending", "roi", "size", "bitrate", "fps", "uplinks")), "name of the knob"]
+    knob: Annotated[
+        str, Limits(among=("sending", "roi", "size", "bitrate", "fps", "wave_s", "uplinks")), "name of the knob"
+    ]
     value: Annotated[Any, "the new one"]
 
 
@@ -130,6 +136,8 @@ def decided(setting: Setting) -> Json:
     }
     if setting.fps is not None:
         values["fps"] = plain(setting.fps)
+    if setting.wave_s is not None:
+        values["wave_s"] = plain(setting.wave_s)
     if setting.uplinks:
         values["uplinks"] = setting.uplinks
     return values

@@ -65,7 +65,7 @@ class Publisher:
     _steering_published: float = -STEERING_S
 
     def is_state_due(self, now: float, decision: Decision) -> bool:
-        """Whether to publish the state if it has changed. Frame rates do not wait: pages judge by them what is frozen."""
+        """Whether to publish the state if it has changed. Frame rates do not wait: pages judge by them."""
         last = self._published
         if last is None or self.again or now - last.t >= STATE_S:
             return True

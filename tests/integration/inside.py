@@ -94,3 +94,12 @@ def storing_video_at(monkeypatch: Any, directory: Path, device: str, queue_bytes
 
     monkeypatch.setattr(video_files, "_new_file", new_file)
     monkeypatch.setitem(graph._FILE_QUEUE.properties, "max-size-bytes", queue_bytes)
+
+
+def nal_types(buffer):
+    """Of an access unit whose NAL units have lengths in front of them."""
+    data, at, types = buffer.extract_dup(0, buffer.get_size()), 0, []
+    while at < len(data):
+        types.append(data[at + 4] & 0x1F)
+        at += 4 + int.from_bytes(data[at : at + 4], "big")
+    return types

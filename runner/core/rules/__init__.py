@@ -11,9 +11,9 @@ from typing import Any
 from runner.core import allocation, scaling
 from runner.core.budget import beside_sound
 from runner.core.decision import NOTHING, Decision, Draft, Picture, Setting, Shown, short
-from runner.core.frame_rate import sent_rate, varies_rate
-from runner.core.model import SMALLEST_SIDE_PX, Mode, Roi, Vehicle
-from runner.core.rules import motion, seen, spread, steady  # noqa: F401  (register their rules, as the imports below do theirs)
+from runner.core.frame_rate import is_given, sent_rate
+from runner.core.model import SMALLEST_SIDE_PX, Mode, Roi, Vehicle, exact
+from runner.core.rules import motion, seen, spread, steady, waves  # noqa: F401  (register their rules, as the imports below do theirs)
 from runner.core.rules.paper import whole
 from runner.core.rules.registry import GIVEN, Last, Memories, Memory, Rule, RuleCall, Step, rule
 from runner.core.rules.safe import follow_link
@@ -172,9 +172,10 @@ def reads(vehicle: Vehicle, mode: Mode) -> frozenset[str]:
 def _settings(
     vehicle: Vehicle, on: Mapping[str, bool], lost: Mapping[str, str], rois: Mapping[str, Roi], draft: Draft
 ) -> Mapping[str, Setting]:
-    rates = _sent_rates(vehicle, draft.fps)
+    rates, intervals = _sent_rates(vehicle, draft.fps), _wave_intervals(vehicle, draft.wave_s)
     return {
-        name: _setting(on[name], lost.get(name), rois[name], draft, name, rates.get(name)) for name in vehicle.cameras
+        name: _setting(on[name], lost.get(name), rois[name], draft, name, rates.get(name), intervals.get(name))
+        for name in vehicle.cameras
     }
 
 
@@ -191,12 +192,18 @@ def _sent_rates(vehicle: Vehicle, wanted: Mapping[str, Fraction]) -> Mapping[str
     return {name: sent_rate(camera, wanted.get(name, camera.fps)) for name, camera in encoded.items()}
 
 
+def _wave_intervals(vehicle: Vehicle, wanted: Mapping[str, Fraction]) -> Mapping[str, Fraction]:
+    """s by camera whose waves are asked for one by one."""
+    least = {name: camera.graph.settings.shortest_wave_s for name, camera in vehicle.cameras.items()}
+    return {name: wanted.get(name, exact(shortest)) for name, shortest in least.items() if shortest}
+
+
 @cache
 def _varies_rate(vehicle: Vehicle) -> bool:
-    return varies_rate(vehicle.modes)
+    return is_given("fps", vehicle.modes)
 
 
-def _setting(on: bool, lost: str | None, roi: Roi, draft: Draft, name: str, fps: Fraction | None) -> Setting:
+def _setting(on: bool, lost: str | None, roi: Roi, draft: Draft, name: str, *more: Fraction | None) -> Setting:
     if not on or lost is not None:
         why = f"lost: {lost}" if on else "switched off"
         return Setting(on, False, allocation.ZERO, 0, 0, None, roi, 0, 0, why)
@@ -209,4 +216,4 @@ def _setting(on: bool, lost: str | None, roi: Roi, draft: Draft, name: str, fps:
     if draft.notes:
         reason = "; ".join((reason, *draft.notes))
     video = (kbps if sending else 0, kbps, factor, *picture)
-    return Setting(True, sending, draft.demand[name], *video, reason, draft.placed.get(name, ()), fps)
+    return Setting(True, sending, draft.demand[name], *video, reason, draft.placed.get(name, ()), *more)

@@ -35,6 +35,8 @@ export interface CameraState {
   uplinks?: (string)[];
   /** Hz at which its pictures are sent; absent: the camera's own rate */
   fps?: number;
+  /** between two refresh waves, s; absent: none is asked for */
+  wave_s?: number;
   /** in the allocation */
   weight: number;
   /** by knob, the value read back; empty for a camera without a pipeline */
