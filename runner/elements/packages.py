@@ -20,7 +20,7 @@ PACKAGES = {  # elements by Debian package; `doctor` and messages on missing plu
     " rtph265pay rtph265depay udpsink v4l2src rtpbin rtpsession jpegdec capssetter qtdemux matroskademux matroskamux"
     " vp8enc vp8dec rtpvp8pay rtpvp8depay v4l2h264enc rtpopuspay rtpopusdepay level pulsesrc",
     "gstreamer1.0-plugins-bad": "h264parse h265parse mpegtsmux tsdemux openh264enc x265enc srtsrc srtsink bayer2rgb"
-    " vah264enc nvh264enc",
+    " vah264enc nvh264enc vah265enc nvh265enc",
     "gstreamer1.0-plugins-ugly": "x264enc",
     "gstreamer1.0-libav": "avdec_h264 avdec_h265 avdec_ffv1 avenc_ffv1",
     "gstreamer1.0-rtsp": "rtspclientsink",
@@ -30,7 +30,9 @@ PACKAGES = {  # elements by Debian package; `doctor` and messages on missing plu
 }
 HARDWARE = {  # plugin by element that exists only with its hardware
     "vah264enc": "va",
+    "vah265enc": "va",
     "nvh264enc": "nvcodec",
+    "nvh265enc": "nvcodec",
     "v4l2h264enc": "video4linux2",
 }
 PACKAGE_OF = {element: package for package, elements in PACKAGES.items() for element in elements.split()}

@@ -19,7 +19,7 @@ from pathlib import Path
 import pytest
 
 from browser import all_live, has_started, luma, measure, opened, send, shot, state_when, take_control, until, visit
-from rig import CHECKOUT, SMALL_ROBOT, answers, clock_ahead, free_port, needs_browser, needs_compiler, process
+from rig import SMALL_ROBOT, answers, clock_ahead, free_port, needs_browser, needs_compiler, process
 from runner.core.roles import Role
 from runner.drive.read import read_drive
 from runner.mqtt.broker import private_broker
@@ -286,30 +286,9 @@ def caption(page, camera):
     return " ".join(parts).replace("\u2009", "")
 
 
-X265 = """\
-element: x265enc
-    properties: {tune: zerolatency, speed-preset: ultrafast, key-int-max: "{key_interval_frames}"}
-"""
-
-
-@pytest.fixture
-def h265(tmp_path):
-    """A user's directory with an H.265 graph, made from the packaged H.264 graph by swapping elements."""
-    text = (CHECKOUT / "conf" / "graph" / "h264_rtsp.yaml").read_text()
-    text = re.sub(r"element: x264enc\n    properties:\n(      .*\n)+", X265, text)
-    text = re.sub(r".*property: vbv-buf-capacity.*\n", "", text)
-    for old, new in {"h264depay": "h265depay", "h264pay": "h265pay", "x-h264": "x-h265", "=H264": "=H265"}.items():
-        text = text.replace(old, new)
-    text = text.replace("avdec_h264, properties: {max-threads: 1}", "avdec_h265").replace("vbv_frames: 1.5", "")
-    graph = tmp_path / "conf" / "graph" / "h265.yaml"
-    graph.parent.mkdir(parents=True)
-    graph.write_text(text)
-    return f"conf={tmp_path / 'conf'}"
-
-
 @pytest.mark.soak
-def test_h265_is_played_or_refused_with_the_reason(chromium, h265):
-    with sides(h265, "+graph@cameras.rear.graph=h265") as (url, vehicle, _), vehicle(), opened(chromium, url) as page:
+def test_h265_is_played_or_refused_with_the_reason(chromium):
+    with sides("+graph@cameras.rear.graph=h265_rtsp") as (url, vehicle, _), vehicle(), opened(chromium, url) as page:
         until(lambda: {"live", "unsupported"} >= {camera["status"] for camera in measure(page).values()})
         until(lambda: page.evaluate("tod.sample?.cameras?.rear?.fps ?? 0") > 5)
         supported = "VideoDecoder.isConfigSupported({codec: 'hev1.1.6.L90.90'}).then(({supported}) => supported)"
@@ -331,7 +310,7 @@ def test_h265_is_played_or_refused_with_the_reason(chromium, h265):
         until(lambda: measure(page)["rear"]["received"] > received + 60)  # the refusal outlasts further keyframes
         assert tile.locator(".status").inner_text() == "⊘ NO PICTURE"
         shot(page, "h265")
-        with opened(chromium, url) as later:  # since then x265 has sent no parameter sets
+        with opened(chromium, url) as later:
             until(lambda: re.fullmatch(expected, later.locator("[data-camera=rear] .refused").inner_text()))
             assert measure(later)["rear"]["status"] == "unsupported"
 
