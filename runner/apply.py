@@ -56,7 +56,7 @@ if TYPE_CHECKING:
     from runner.gst.first_look import first_look
     from runner.gst.lanes import run_lanes
     from runner.gst.parameter_sets import parameter_set_notes
-    from runner.gst.pictures import decode_clip, decode_video
+    from runner.gst.pictures import decode_video
     from runner.gst.received_uplinks import Addresses
     from runner.gst.recording_side import RecordingSide
     from runner.gst.secure import StreamLogin
@@ -91,7 +91,6 @@ __all__ = [
     "check_plan",
     "check_recorders",
     "check_vehicle",
-    "decode_clip",
     "decode_video",
     "discover",
     "first_look",
@@ -108,7 +107,6 @@ SELDOM = {  # by name, its module
     "OnSound": "sound_receiver",
     "SoundPacket": "sound_receiver",
     "SoundReception": "sound_receiver",
-    "decode_clip": "pictures",
     "decode_video": "pictures",
     "discover": "sequence",
     "first_look": "first_look",

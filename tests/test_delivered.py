@@ -93,7 +93,7 @@ def test_a_video_without_pictures_of_the_vehicle_is_reported(tmp_path: Path) -> 
     drive = read_drive(write_drive(tmp_path, ["vehicle", "operator"], seconds=5, change=recorded))
     warnings: list[str] = []
     cameras = {"front_left": vehicle().cameras["front_left"]}
-    videos = Videos(tmp_path, lambda _: iter(()), lambda *_: iter(()), lambda *_: iter(()))
+    videos = Videos(tmp_path, lambda _: iter(()), lambda *_, **__: iter(()))
     measure(drive, videos, cameras, {}, on_warning=warnings.append)
     ends = "the vehicle's video ends at 0.0 s, what arrived at 5.0 s"
     assert warnings == [f"front_left: {ends}: scored up to its end"]

@@ -64,7 +64,7 @@ def scenes(
 
 
 def _played(camera: Camera, videos: Videos, clip: Path) -> Iterator[tuple[int, Luma]]:
-    return videos.clip(clip, camera.source_size)
+    return videos.decode(clip, camera.source_size, fitted=True)
 
 
 def lookup(found: Iterator[tuple[int, Picture]]) -> Callable[[int], Picture | None]:

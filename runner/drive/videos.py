@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from hashlib import blake2b
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar
 
 from runner.core.model import Camera, Roi
 from runner.drive.captures import ReadVideo, RecordedVideo, UnitTimes, arrivals, files, matched, received, unfiled
@@ -28,9 +28,15 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 REPORT_S = 0.25  # between two reports of progress
 
-DecodeVideo = Callable[[Path, "tuple[int, int] | None"], Iterator[tuple[int, Luma]]]
-DecodeClip = Callable[[Path, tuple[int, int]], Iterator[tuple[int, Luma]]]
 Regions = Callable[["Unit", int], Roi]  # what a unit shows that was captured then, ns
+
+
+class DecodeVideo(Protocol):
+    """See `runner.gst.pictures.decode_video`."""
+
+    def __call__(
+        self, path: Path, size: tuple[int, int] | None, *, fitted: bool = False
+    ) -> Iterator[tuple[int, Luma]]: ...
 
 
 class Captured(NamedTuple):
@@ -60,15 +66,11 @@ class _FileUnit(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Videos:
-    """The video files of a drive.
-
-    clip  decodes a clip as a camera's source plays it, fitted to a size
-    """
+    """The video files of a drive."""
 
     directory: Path
     read: ReadVideo
     decode: DecodeVideo
-    clip: DecodeClip
 
     def pictures(
         self, timed: Sequence[FileTimes], size: tuple[int, int] | None = None

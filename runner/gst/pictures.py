@@ -15,7 +15,6 @@ from runner.gst.caps import structure
 from runner.gst.video_reader import pulled
 from runner.system.files import file_problem
 
-RAW = "video/x-raw,format=I420"
 LumaPlane = NDArray[np.uint8]  # height x width
 
 
@@ -30,32 +29,19 @@ def luma_of(buffer: Gst.Buffer, caps: Gst.Caps) -> LumaPlane:
     return rows[:, :width]
 
 
-def decode_video(path: Path, size: tuple[int, int] | None) -> Iterator[tuple[int, LumaPlane]]:
+def decode_video(path: Path, size: tuple[int, int] | None, *, fitted: bool = False) -> Iterator[tuple[int, LumaPlane]]:
     """Decode a file, whatever sizes its pictures change to: ns since its first access unit, and luma.
 
     size    to which pictures are scaled; None: as they were coded
+    fitted  as conf/source/file.yaml fits a clip to a camera: turned upright and cropped to the aspect ratio, too
     raises  RunError if the path names no file or nothing can be decoded. Damaged pictures come as they were decoded
     """
-    yield from _decoded(path, f"videoscale add-borders=false ! {_caps(*size)}" if size else RAW)
-
-
-def decode_clip(path: Path, size: tuple[int, int]) -> Iterator[tuple[int, LumaPlane]]:
-    """Likewise, as conf/source/file.yaml fits a clip to a camera's size: upright, cropped, and scaled.
-
-    raises  RunError
-    """
-    width, height = size
-    fit = f"videoflip video-direction=auto ! aspectratiocrop aspect-ratio={width}/{height} ! videoscale"
-    return _decoded(path, f"{fit} ! {_caps(width, height)}")
-
-
-def _caps(width: int, height: int) -> str:
-    return f"{RAW},width={width},height={height},pixel-aspect-ratio=1/1"
-
-
-def _decoded(path: Path, form: str) -> Iterator[tuple[int, LumaPlane]]:
     if why := file_problem(path):
         raise RunError(f"{path}: {why}")
+    form = "video/x-raw,format=I420"
+    if size:
+        fit = f"videoflip video-direction=auto ! aspectratiocrop aspect-ratio={size[0]}/{size[1]} ! " if fitted else ""
+        form = f"{fit}videoscale add-borders=false ! {form},width={size[0]},height={size[1]},pixel-aspect-ratio=1/1"
     pipeline = Gst.parse_launch(
         "filesrc name=file ! parsebin ! identity name=units ! decodebin ! videoconvert"
         f" ! {form} ! appsink name=out sync=false max-buffers=4"

@@ -174,11 +174,11 @@ def _recorded(path: Path) -> _Recorded:
     known = {
         name: clip for name, clip in clips.items() if clip.is_file() and not apply.discover(clip, "clip").colorimetry
     }
-    return _Recorded(drive, setup, known, Videos(path, apply.read_video, apply.decode_video, apply.decode_clip))
+    return _Recorded(drive, setup, known, Videos(path, apply.read_video, apply.decode_video))
 
 
 def _fits(plan: Plan) -> bool:
-    """Whether a source plays a clip that it fits to the camera's size as `decode_clip` does."""
+    """Whether a source plays a clip that it fits to the camera's size as `decode_video` does."""
     rendered, fitted = plan.camera.source.render, any(each.factory == "aspectratiocrop" for each in plan.source)
     return plan.loops and bool(rendered or (fitted and plan.source[0].factory == "filesrc"))
 
