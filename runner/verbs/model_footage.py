@@ -153,7 +153,7 @@ def _sent_whole(drive: Drive, camera: Camera) -> Path | str:
 
     returns  why there is none, in words
     """
-    from runner.apply import decode_video
+    from runner.apply import decode_video, discover
     from runner.drive.captures import files
     from runner.errors import RunError
 
@@ -172,7 +172,13 @@ def _sent_whole(drive: Drive, camera: Camera) -> Path | str:
         smallest = min([smallest, *((width, height) for width, height in sizes)])
         if len(sizes) > most and set(sizes) == {(camera.width, camera.height)}:
             best, most = drive.path / file.name, len(sizes)
-    return best or f"was sent at {smallest[0]}x{smallest[1]} px at times, its image has {camera.width}x{camera.height}"
+    if best is None:
+        return f"was sent at {smallest[0]}x{smallest[1]} px at times, its image has {camera.width}x{camera.height}"
+    try:
+        discover(best, best.name)
+    except ArgumentError:  # some cameras that encode by themselves state no rate
+        return f"{best.name} states no frame rate"
+    return best
 
 
 def _is_cropped(drive: Drive, camera: Camera) -> bool:
