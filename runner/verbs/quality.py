@@ -231,7 +231,8 @@ def _show_seen(path: Path, seen: SeenDrive) -> None:
 
     _print_table(path, *seen_rows(seen))
     if unknown := [name for name, camera in seen.cameras.items() if not camera.scene]:
-        print(f"{', '.join(unknown)} compared with the stream as sent: what the encoder lost is not included")
+        lost = "what the encoder lost, and what was not sent, is not included"
+        print(f"{', '.join(unknown)} compared with the stream as sent: {lost}")
     if seen.optimum:
         print(f"optimum: the best static allocation of {seen.optimum.kbps:.0f} kbit/s by the cameras' own models")
 
