@@ -6,6 +6,7 @@ import base64
 import io
 import os
 import random
+import shutil
 import subprocess
 import time
 from contextlib import contextmanager
@@ -21,6 +22,7 @@ from runner.configuration.config import configuration
 from runner.core.model import Roi
 from runner.h264.access_unit import read_unit
 from runner.h264.region import with_region
+from runner.page import documents
 from runner.page.server import PageServer
 
 pytestmark = [pytest.mark.gst, needs_browser]
@@ -104,7 +106,22 @@ def inner(picture, roi, margin=6):
     return picture[roi.y + margin : roi.y + roi.height - margin, roi.x + margin : roi.x + roi.width - margin]
 
 
-def test_a_part_is_drawn_in_its_place_and_the_rest_is_marked_as_not_sent(chromium):
+@pytest.fixture
+def as_with_gpu(monkeypatch, tmp_path):
+    """The page takes Chromium's WebGL in software for a GPU."""
+    static = tmp_path / "static"
+    shutil.copytree(documents.STATIC, static)
+    worker = static / "warp_worker.js"
+    text = worker.read_text()
+    assert text.count("return !SOFTWARE.test(name);") == 1
+    worker.write_text(text.replace("return !SOFTWARE.test(name);", "return name !== '';"))
+    monkeypatch.setattr(documents, "STATIC", static)
+
+
+@pytest.mark.parametrize("gpu", [False, True])
+def test_a_part_is_drawn_in_its_place_and_the_rest_is_marked_as_not_sent(chromium, gpu, request):
+    if gpu:
+        request.getfixturevalue("as_with_gpu")
     whole = texture()
     part, full = encoded(whole, MIDDLE), encoded(whole, FULL)
     with (
@@ -112,6 +129,7 @@ def test_a_part_is_drawn_in_its_place_and_the_rest_is_marked_as_not_sent(chromiu
         repeating(lambda: send(station, station.unit), 0.05),
         opened(chromium, station.page.url, 1280, 720) as page,
     ):
+        until(lambda: page.evaluate("tod.measure()")["gpu"] == gpu)
         page.add_style_tag(content="#attention, #toasts, .diagram { visibility: hidden; }")
 
         def shows(unit, region, note):
@@ -138,7 +156,9 @@ def test_a_part_is_drawn_in_its_place_and_the_rest_is_marked_as_not_sent(chromiu
             return own > 0.9 and own > beside and outside.mean() < 90
 
         until(is_placed)
-        shot(page, "part-not-sent")
+        shot(page, f"part-not-sent{'-gpu' * gpu}")
+        drawn = page.evaluate("tod.measure()")["cameras"][FRONT]["drawn_size"]
+        assert (drawn["width"] > WIDTH) == gpu  # as large as on the screen, or left to the browser
         squeezed = encoded(whole, MIDDLE, (96, 128)), encoded(whole, FULL, (96, 128))  # pixels that are not square
         until(lambda: shows(squeezed[0], MIDDLE.to_json(), "PART NOT SENT"))
         until(is_placed)
@@ -181,3 +201,40 @@ def test_each_drawn_picture_has_its_own_region_through_changes_at_ten_a_second(c
             found = decoded(text)
             others = [alike(found, part_of(whole, other, SIZE)) for other in regions if other != own]
             assert alike(found, part_of(whole, own, SIZE)) > max(0.9, *others), region
+
+
+def catmull_rom(picture, width, height):
+    """A picture enlarged by definition: Keys's kernel with a = -1/2, its rim repeated."""
+
+    def matrix(small, large):
+        at = (np.arange(large) + 0.5) * small / large - 0.5
+        weights = np.zeros((large, small))
+        for tap in range(-1, 3):
+            place = np.floor(at).astype(int) + tap
+            off = np.abs(at - place)
+            near, far = 1.5 * off**3 - 2.5 * off**2 + 1, -0.5 * off**3 + 2.5 * off**2 - 4 * off + 2
+            np.add.at(weights, (np.arange(large), place.clip(0, small - 1)), np.where(off <= 1, near, far))
+        return weights
+
+    high, wide = picture.shape
+    return matrix(high, height) @ picture @ matrix(wide, width).T
+
+
+def test_the_gpu_s_kernel_is_cubic_and_leaves_the_picture_in_place(chromium):
+    """Two pictures in turn, the second one smaller."""
+    noise = np.random.default_rng(SEED).integers(0, 256, (9, 12), dtype=np.uint8)
+    with served() as station, opened(chromium, station.page.url) as page:
+        for picture, (width, height) in ((noise, (60, 45)), (noise[:5, :7], (28, 20))):
+            high, wide = picture.shape
+            pixels = np.repeat(picture[..., None], 4, axis=2)
+            pixels[..., 3] = 255
+            found = page.evaluate(f"""import("/static/enlarger.js").then(({{ Enlarger }}) => {{
+              globalThis.enlarger ??= new Enlarger();
+              const image = new ImageData(Uint8ClampedArray.from({pixels.ravel().tolist()}), {wide}, {high});
+              const upload = (gl) => gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, image);
+              const context = new OffscreenCanvas({width}, {height}).getContext("2d", {{ willReadFrequently: true }});
+              enlarger.paint(context, {{ upload }}, {{ x: 0, y: 0, width: {width}, height: {height} }});
+              return Array.from(context.getImageData(0, 0, {width}, {height}).data.filter((_, i) => i % 4 === 1));
+            }})""")
+            expected = catmull_rom(picture, width, height).clip(0, 255)
+            assert np.abs(np.reshape(found, (height, width)) - expected).max() <= 1.5

@@ -4,6 +4,7 @@
  * video and its alarms. So the planes are copied out of the frame and converted to pixels here, without waiting.
  */
 
+import { Enlarger } from "./enlarger.js";
 import { scaled, toRgba } from "./yuv.js";
 
 /** @typedef {"I420"|"NV12"} Format */
@@ -26,6 +27,7 @@ class FramePicture {
 
   /** @param {import("./framing.js").Rectangle} place in the canvas */
   paint(context, place) {
+    if (place.width > this.width && enlarges()) return void enlarger?.paint(context, this, place);
     context.drawImage(this.frame, place.x, place.y, place.width, place.height);
   }
 
@@ -109,10 +111,21 @@ class PlanePicture {
 /** Whether this browser draws with a GPU. The check takes a while: the first pictures are drawn without it. */
 export let hasGpu = false;
 
+/** @type {Enlarger|null} */
+let enlarger = null;
+
 /** @param {boolean} found */
 export function setGpu(found) {
   hasGpu = found;
+  try {
+    enlarger = found ? new Enlarger() : null;
+  } catch {
+    enlarger = null; // the worker of warp.js has WebGL, this one has not: pictures are enlarged linearly
+  }
 }
+
+/** Whether pictures are enlarged with a cubic kernel in a canvas that is larger than they are. */
+export const enlarges = () => enlarger !== null && !enlarger.isLost;
 
 function memoryFor(width, height, size) {
   const fits = ({ bytes, image }) => bytes.length === size && image.width === width && image.height === height;

@@ -3,7 +3,7 @@
 import { placement, visible, WHOLE } from "./framing.js";
 import { ESTIMATED, GuideLines, labelPicture } from "./guide_lines.js";
 import { drawNote, drawOverlay, drawUnsent, readably } from "./overlay.js";
-import { paintImage } from "./picture.js";
+import { enlarges, paintImage } from "./picture.js";
 import { resize } from "./resizing.js";
 import { STALLED } from "./status.js";
 import { straightOptics } from "./straight.js";
@@ -103,15 +103,16 @@ export class StreamCanvas {
   }
 
   /**
-   * The canvas has the picture's size. For a lasting alarm it is an integer multiple of it, close to the size on the
-   * screen, so that words are sharp while the aspect ratio, and with it the page's layout, stays the same.
+   * The canvas has the picture's size. For a lasting alarm, and with a GPU, it is an integer multiple of it, close to the
+   * size on the screen, so that words are sharp and small pictures are enlarged with a better kernel than the browser's,
+   * while the aspect ratio, and with it the page's layout, stays the same.
    */
   resize(canvas, shown, isStraight, place, sharp) {
     const { width: wide, height: high, ratio } = this.display;
     const box = { width: Math.round(wide * ratio) || 480, height: Math.round(high * ratio) || 270 };
     const painted = shown && place ? sizeWith(shown.picture.painted, place, this.camera) : shown?.picture.painted;
     const own = isStraight ? (shown?.image ?? this.straightSize()) : (painted ?? box);
-    const times = sharp ? Math.min(6, Math.max(1, Math.ceil(this.widthOnScreen(own) / own.width))) : 1;
+    const times = sharp || (enlarges() && !isStraight) ? Math.min(6, Math.max(1, Math.ceil(this.widthOnScreen(own) / own.width))) : 1;
     const size = { width: own.width * times, height: own.height * times };
     if (this.isFresh) Object.assign(canvas, size); // nothing is shown yet
     this.isPictureResizeDue = !resize(canvas, size);

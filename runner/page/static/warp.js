@@ -124,7 +124,7 @@ export class Warp {
     this.gl = gl;
     this.lost = false; // browsers drop the context when the graphics driver restarts
     canvas.addEventListener("webglcontextlost", () => (this.lost = true));
-    const program = (this.program = linkedProgram(gl));
+    const program = (this.program = linkedProgram(gl, VERTEX, FRAGMENT));
     gl.useProgram(program);
     this.uniforms = Object.fromEntries(["frame", "region", "fill", "stripe"].map((name) => [name, gl.getUniformLocation(program, name)]));
     gl.enable(gl.BLEND);
@@ -175,10 +175,10 @@ export class Warp {
   }
 }
 
-/** @param {WebGL2RenderingContext} gl */
-function linkedProgram(gl) {
+/** @param {WebGL2RenderingContext} gl  @param {string} vertex  @param {string} fragment */
+export function linkedProgram(gl, vertex, fragment) {
   const program = gl.createProgram();
-  for (const [kind, source] of /** @type {[number, string][]} */ ([[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, FRAGMENT]])) {
+  for (const [kind, source] of /** @type {[number, string][]} */ ([[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]])) {
     const shader = gl.createShader(kind);
     if (!shader) throw new Error("WebGL lost its context");
     gl.shaderSource(shader, source);
