@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Literal
+
 import numpy as np
 
 from runner.core.model import Roi
 from runner.core.view import Seen
 from runner.rate_quality.metrics.interface import Luma
 
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+Kernel = Literal["linear", "cubic"]
 REDUCED = 1.0  # px of a picture for each px of the screen, above which the average of several is shown
 
 
-def on_screen(luma: Luma, region: Roi, seen: Seen) -> Luma:
+def on_screen(luma: Luma, region: Roi, seen: Seen, kernel: Kernel = "linear") -> Luma:
     """What a view shows of a picture; black where nothing was sent.
 
     luma    the picture, which may have any size
     region  of the full image that it shows
     seen    of the full image, and px of the screen
-
-    Enlarged pictures are drawn linearly, as Chromium's canvas draws the frames of a video whatever it is told.
+    kernel  of pictures that are enlarged. The page's is linear, as Chromium's canvas draws the frames of a video
+            whatever it is told, and with a GPU Catmull and Rom's cubic one (`enlarger.js`)
     """
     import cv2
 
@@ -35,9 +41,35 @@ def on_screen(luma: Luma, region: Roi, seen: Seen) -> Luma:
     whole = (
         whole and seen.x + seen.width <= region.x + region.width and seen.y + seen.height <= region.y + region.height
     )
+    if kernel == "cubic" and max(step_x, step_y) < 1:
+        return _cubic(luma, matrix, size)
     border = cv2.BORDER_REPLICATE if whole else cv2.BORDER_CONSTANT
     shown: Luma = cv2.warpAffine(luma, matrix, size, flags=flags, borderMode=border)  # type: ignore[assignment]
     return shown
+
+
+def _cubic(luma: Luma, matrix: NDArray[np.float64], size: tuple[int, int]) -> Luma:
+    """The px of a screen at places of the picture, which repeats its rim, but black beyond it.
+
+    matrix  from px of the screen to those of the picture
+    """
+    across, down = (
+        _weights(matrix[axis, axis] * np.arange(length) + matrix[axis, 2], luma.shape[1 - axis])
+        for axis, length in enumerate(size)
+    )
+    shown: Luma = np.rint(down @ luma @ across.T).clip(0, 255).astype(np.uint8)
+    return shown
+
+
+def _weights(places: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """Of `count` px at each place, by Keys's kernel with a = -1/2 (IEEE Transactions on ASSP 29.6, 1981)."""
+    weights = np.zeros((len(places), count))
+    for px in (np.floor(places).astype(int) + tap for tap in range(-1, 3)):
+        off = np.abs(places - px)
+        near, far = (1.5 * off - 2.5) * off**2 + 1, ((2.5 - 0.5 * off) * off - 4) * off + 2
+        np.add.at(weights, (np.arange(len(places)), px.clip(0, count - 1)), np.where(off <= 1, near, far))
+    weights[(places < -0.5) | (places > count - 0.5)] = 0
+    return weights
 
 
 def _reduced(luma: Luma, region: Roi, step_x: float, step_y: float) -> tuple[Luma, float, float, float, float]:
