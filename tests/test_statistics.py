@@ -169,6 +169,14 @@ def test_a_report_says_for_how_long_a_camera_was_slow(hz: float, expected: tuple
     assert found == (expected and pytest.approx(expected, rel=0.05))
 
 
+def test_a_camera_is_not_slow_while_rules_send_fewer_of_its_pictures() -> None:
+    t = np.arange(0, 20.2, 0.2)
+    sent = Sent(t, np.floor(t * 10 + 1e-6), t, t)
+    fewer = camera(400, 0.5)
+    fewer = replace(fewer, sent=sent, fps=40.0, decided=replace(fewer.decided, fps=np.array([10.0])))
+    assert slow_time(fewer, 20.0) is None
+
+
 # --- quality ----------------------------------------------------------------------------------------------------------
 
 MODEL = Model("mssim", {0.5: RateCurve(np.array([100.0, 400.0]), np.array([0.6, 0.8]))})

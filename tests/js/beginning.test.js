@@ -103,3 +103,14 @@ test("a source that repeats its picture is frozen for at least the limit", () =>
   live.judge(DRAWING, failed);
   assert.equal(live.alarmText(failed), "FROZEN 0.1 s");
 });
+
+test("a picture counts as frozen by the rate at which the vehicle sends, not by the camera's", () => {
+  const { live, draw } = camera();
+  const begun = now();
+  for (const t of [0, 1000]) draw(begun + t);
+  live.onDecision({ ...DECISION, fps: 5 });
+  assert.equal(draw(begun + 1500, 250), "live");
+  assert.equal(draw(begun + 1600, 270), "frozen");
+  live.onDecision(DECISION);
+  assert.equal(draw(begun + 1700, 250), "frozen");
+});
