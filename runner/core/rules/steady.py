@@ -132,7 +132,7 @@ def calm_pictures(
     within: Fraction = Fraction(2),
     for_s: Fraction = Fraction(5),
     at_once: Fraction = Fraction(2),
-    turn_s: Fraction = Fraction(2, 25),
+    turn_s: Fraction = Fraction(3, 50),
 ) -> Step:
     """A region moves and zooms behind its encoded size; cameras that need another one get it in turn.
 

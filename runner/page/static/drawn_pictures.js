@@ -7,6 +7,7 @@ const STAGES = 1200;
 
 export class DrawnPictures {
   stages = []; // captured, arrived at the station, received here, decoded, drawn; ms on the station's clock
+  shown = []; // of the same pictures: captured, drawn, what it says that it shows, width, height
   first_at = null; // page time
 
   /** @param {any} camera as in hello  @param {any} station see `Stream` */
@@ -15,11 +16,14 @@ export class DrawnPictures {
     this.station = station;
   }
 
-  record(meta, drawn) {
+  record({ meta, picture }, drawn) {
     this.first_at ??= drawn;
     const page = [meta.received, meta.decoded, drawn].map((time) => this.station.clock.toStation(time));
     this.stages.push([meta.captured, meta.arrived, ...page]);
-    if (this.stages.length > STAGES) this.stages.shift();
+    this.shown.push([meta.captured, page[2], meta.region, picture.width, picture.height]);
+    if (this.stages.length <= STAGES) return;
+    this.stages.shift();
+    this.shown.shift();
   }
 
   /** Report how long ago the screen showed the counter in the picture just drawn. */

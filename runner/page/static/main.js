@@ -65,6 +65,8 @@ listen("reply", ({ id, result, reason }) => {
 globalThis.tod = {
   measure: () => ask("measure"),
   stages: () => ask("stages"),
+  stated: () => ask("stated"),
+  shown: () => ask("shown"),
   hearing,
   talking,
   picture: (name) => ask("picture", name),

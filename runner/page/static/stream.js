@@ -164,7 +164,7 @@ export class Stream {
     if (!this.isOnlyInBirdseye) this.live.checkAge(next.meta, now());
     this.live.judge(this.drawing(), now());
     this.paint(now());
-    if (!this.isOnlyInBirdseye) this.drawn.record(next.meta, now());
+    if (!this.isOnlyInBirdseye) this.drawn.record(next, now());
     if (this.station.keep) this.first ??= described(next);
     if (this.station.counted === this.name) this.drawn.readCounter(next);
   }
@@ -250,7 +250,7 @@ export class Stream {
     this.composed_at = one.meta.decoded;
     if (!isPart) return;
     live.checkAge(one.meta, now());
-    this.drawn.record(one.meta, now());
+    this.drawn.record(one, now());
   }
 
   /** What `Liveness` does not know: whether the pictures can be decoded, and how they are drawn. */

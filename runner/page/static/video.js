@@ -353,6 +353,8 @@ const orders = {
       guides: () => find(name)?.canvas.guideLines(),
       ground: () => ground.measure(),
       stages: allStages,
+      stated: () => seen.stated.map(([time, view]) => [station.clock.toStation(time), view]),
+      shown: () => Object.fromEntries(streams.map((stream) => [stream.name, stream.drawn.shown])),
       picture: () => described(find(name)?.shown),
       first: () => find(name)?.first,
     };

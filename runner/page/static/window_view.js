@@ -5,7 +5,10 @@ import { NOWHERE, seenFromAbove, seenInBox, seenStraight, Stating, united } from
 /** @typedef {import("./stream.js").Stream} Stream */
 /** @typedef {import("./seen.js").Seen} Seen */
 
+const STATED = 100;
+
 export class WindowView {
+  stated = []; // for benchmarks: page time and view of each change
   stating = new Stating();
   /** @type {{key: string, seen: Seen[]}} */
   above = { key: "", seen: [] }; // by the bird's-eye view, which takes longer to compute
@@ -25,7 +28,12 @@ export class WindowView {
   state(streams, now) {
     if (!this.stating.isDue(now) || !streams.some(({ canvas }) => canvas.isShown)) return; // not laid out yet
     const view = this.view(streams);
-    if (this.stating.states(JSON.stringify(view), now) && !this.send({ view })) this.reset();
+    const [text, before] = [JSON.stringify(view), this.stating.text];
+    if (!this.stating.states(text, now)) return;
+    if (!this.send({ view })) return this.reset();
+    if (text === before) return;
+    this.stated.push([now, view]);
+    if (this.stated.length > STATED) this.stated.shift();
   }
 
   /** By camera; one that is left out is seen in full. @param {Stream[]} streams  @returns {Record<string, Seen>} */

@@ -1,0 +1,228 @@
+"""How soon the screen shows a new view, over a limited link, and what changes of views do to its queue.
+
+  python bench/new_views.py                                                  about two and a half minutes
+  python bench/new_views.py --set modes.automatic.calm_pictures.at_once=8    likewise, all new sizes together
+
+The eight cameras of the paper's vehicle at a quarter of their pixels, over a link of 3000 kbit/s with delay. Times are
+from the page's statement of the new view to the first picture drawn that shows what is seen in its new size. Cameras
+that need nothing new do not count. Needs chromium. Run it on an otherwise idle machine.
+"""
+
+from __future__ import annotations
+
+import needs_tests  # noqa: F401 (first: makes parts of the tests importable)  # isort: skip
+
+import argparse
+import json
+import random
+import shutil
+import subprocess
+import tempfile
+import time
+from bisect import bisect_right
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from playwright.sync_api import Page, sync_playwright
+from table import Row, show, spread
+
+from browser import all_live, take_control, viewing
+from rig import CHROMIUM_FLAGS, answers, free_port, process, until
+from runner.configuration.config import configuration
+from runner.core.model import Roi
+from runner.core.view import enclosing
+from runner.operator.meter import percentile
+from runner.plans import render_missing
+
+FPS, RTT_MS = 15, 40
+SIZES = {"front_left": (960, 520), "front_center": (960, 520), "front_right": (960, 520), "rear_center": (960, 600)}
+TOPS = dict.fromkeys(("top_front", "top_left", "top_right", "top_rear"), (640, 400))
+WORDS = (
+    "vehicle=tum_q7",
+    "source=synthetic",
+    f"fps_max={FPS}",
+    "modes=seen",
+    "pqos=constant",
+    "pqos.kbps=3000",
+    "link=relay",
+    "link.kbps=3000",
+    f"link.delay_ms={RTT_MS // 2}",
+    f"link.reverse={{kbps: 2000, queue_ms: 200, delay_ms: {RTT_MS // 2}}}",
+    *(
+        f"cameras.{name}.{side}_px={length}"
+        for name, size in (SIZES | TOPS).items()
+        for side, length in zip(("width", "height"), size, strict=True)
+    ),
+)
+FRONT = "front_center"
+SETTLE_S, SOON_S = 12, 0.95  # a region narrows after one second
+PAUSES_S = (1.5, 4.0)  # before another view
+SEED = 3
+
+
+def high(values: Sequence[float], share: float = 0.95) -> float:
+    return percentile(values, share) or 0.0
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=75, help="with changes, at most 75; half of it without")
+    parser.add_argument("--set", nargs="*", default=[], help="overrides")
+    options = parser.parse_args()
+    show(rows(options.seconds, options.set))
+
+
+def rows(seconds: float = 75, more: Sequence[str] = ()) -> list[Row]:
+    render_missing(configuration([*WORDS, *more]).vehicle(), lambda *_: None)
+    with tempfile.TemporaryDirectory() as directory, driven(Path(directory), more) as page:
+        take_control(page)
+        viewing(page, "drive")
+        time.sleep(SETTLE_S)
+        calm = Phase(page)
+        time.sleep(seconds / 2)
+        calm.end(page)
+        changing = Phase(page)
+        selected = change_views(page, seconds)
+        changing.end(page)
+        log = [json.loads(line) for line in (Path(directory) / "drive" / "drive.jsonl").read_text().splitlines()]
+    return [
+        *waits(changing, selected),
+        *compared(calm, "without", log),
+        *compared(changing, "with", log),
+    ]
+
+
+@contextmanager
+def driven(directory: Path, more: Sequence[str]) -> Iterator[Page]:
+    """The page of a demo that has started."""
+    ports = {part: free_port() for part in ("page", "media", "control")}
+    words = (*WORDS, *more, "duration_s=1200", *(f"{part}.port={port}" for part, port in ports.items()), f"log={directory / 'drive'}")
+    with process("demo", *words, stdout=subprocess.DEVNULL) as demo, sync_playwright() as playwright:
+        until(lambda: answers(ports["page"]))
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=CHROMIUM_FLAGS)
+        page = browser.new_page(viewport={"width": 1280, "height": 720})
+        page.goto(f"http://127.0.0.1:{ports['page']}/")
+        until(lambda: page.evaluate("window.tod !== undefined"))
+        all_live(page)
+        yield page
+        browser.close()
+        demo.terminate()
+        demo.wait(timeout=20)
+
+
+def change_views(page: Page, seconds: float) -> Mapping[int, str]:
+    """Change what the page shows, at random times; returns by number of the change the camera that it selects."""
+    chance, end = random.Random(SEED), time.monotonic() + seconds
+    selected: dict[int, str] = {}
+    for number in range(10_000):
+        if time.monotonic() > end:
+            return selected
+        match number % 6:
+            case 0 | 3:
+                page.keyboard.press("v")  # Drive or Configure view
+            case 1:
+                camera = chance.choice([*SIZES])
+                selected[len(page.evaluate("tod.stated()"))] = camera
+                page.locator(f'.tile[data-camera="{camera}"] .picture').dblclick()
+            case 2:
+                page.keyboard.press("Escape")
+            case 4 | 5:
+                selected[len(page.evaluate("tod.stated()"))] = "rear_center" if number % 6 == 4 else FRONT
+                page.keyboard.press("r")  # the rear camera in place of the front one, and back
+        time.sleep(chance.uniform(*PAUSES_S))
+    return selected
+
+
+class Drawn(NamedTuple):
+    """A picture: when it was captured and drawn, ms, its region (None: all of it) and its size, px."""
+
+    captured: float
+    at: float
+    region: Roi | None
+    size: tuple[int, int]
+
+
+class Phase:
+    """Part of a drive: pictures drawn, views stated, marks of pictures that are not live.
+
+    first  how many views were stated before
+    """
+
+    def __init__(self, page: Page) -> None:
+        self.began = time.time() * 1000
+        self.ended = self.began
+        self.drawn: dict[str, list[Drawn]] = {}
+        self.stated: list[tuple[float, Mapping[str, Any]]] = []
+        self.first, self._marks_before = len(page.evaluate("tod.stated()")), len(_marks(page))
+        self.marks: list[str] = []
+
+    def end(self, page: Page) -> None:
+        self.ended = time.time() * 1000
+        for name, shown in page.evaluate("tod.shown()").items():
+            every = [Drawn(captured, at, Roi(**r) if r else None, (w, h)) for captured, at, r, w, h in shown]
+            self.drawn[name] = [each for each in every if each.at >= self.began]
+        self.stated = page.evaluate("tod.stated()")[self.first :]
+        self.marks = [f"{camera} {mark}" for _, camera, mark in _marks(page)[self._marks_before :] if mark != "live"]
+
+
+def _marks(page: Page) -> Any:
+    return page.evaluate("tod.measure()")["status_log"]
+
+
+def waits(phase: Phase, selected: Mapping[int, str]) -> Iterator[Row]:
+    """From a statement to the picture, of the front and selected cameras, and of the last of all."""
+    first, last, cameras = list[float](), list[float](), list[float]()
+    for number, (at, view) in enumerate(phase.stated):
+        found = {name: wait for name in view if (wait := _wait(phase.drawn[name], at, view[name])) is not None}
+        cameras += found.values()
+        first += [found[name] for name in {FRONT, selected.get(phase.first + number, FRONT)} if name in found]
+        if found:
+            last.append(max(found.values()))
+    for what, values, most in (
+        ("front and selected camera", first, RTT_MS + 3 * 1000 / FPS),
+        ("each camera", cameras, RTT_MS + 500),
+        ("last camera", last, RTT_MS + 500),
+    ):
+        p95 = high(values)
+        yield Row(f"{what}: new view after, p95", p95, "ms", most=most, note=spread("", values, "").note)
+        yield Row(f"{what}: new view after, median", high(values, 0.5), "ms")
+    yield Row("changes that needed new pictures", len(last), "")
+
+
+def _wait(drawn: Sequence[Drawn], at: float, seen: Mapping[str, int]) -> float | None:
+    """ms until a camera's picture shows what is seen in its new size; None: it already did."""
+    begin = bisect_right([each.at for each in drawn], at)
+    end = bisect_right([each.at for each in drawn], at + 1000 * SOON_S)
+    if not begin or begin == end or not seen["width"]:
+        return None
+    region = Roi(*(seen[key] for key in ("x", "y", "width", "height")))
+
+    def shows(picture: Drawn) -> bool:
+        covered = picture.region is None or enclosing(picture.region, region) == picture.region
+        return covered and picture.size == drawn[end - 1].size
+
+    if shows(drawn[begin - 1]):
+        return None
+    return next((each.at - at for each in drawn[begin:end] if shows(each)), 1000 * SOON_S)
+
+
+def compared(phase: Phase, what: str, log: Sequence[Mapping[str, Any]]) -> Iterator[Row]:
+    """The queue in front of the link, the age of pictures, and those marked as not live."""
+    began = log[0]["time"]
+    looks = [line for line in log if line.get("event") == "link_measured"]
+    queues = [look["queue_ms"] for look in looks if phase.began <= 1000 * (began + look["t"]) <= phase.ended]
+    ages = [each.at - each.captured for drawn in phase.drawn.values() for each in drawn]
+    for of, values in (("queue", queues), ("age on the screen", ages)):
+        yield Row(f"{of} {what} changes, p95", high(values), "ms", note=spread("", values, "").note)
+    sizes = sum(one.size != other.size for drawn in phase.drawn.values() for one, other in pairwise(drawn))
+    yield Row(
+        f"new sizes {what} changes", 60_000 * sizes / len(phase.drawn) / (phase.ended - phase.began), "a minute, camera"
+    )
+    yield Row(f"late, frozen or damaged {what} changes", len(phase.marks), "", note=", ".join(phase.marks[:3]))
+
+
+if __name__ == "__main__":
+    main()
