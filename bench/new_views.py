@@ -99,8 +99,8 @@ def rows(seconds: float = 75, more: Sequence[str] = ()) -> list[Row]:
 def driven(directory: Path, more: Sequence[str]) -> Iterator[Page]:
     """The page of a demo that has started."""
     ports = {part: free_port() for part in ("page", "media", "control")}
-    words = (*WORDS, *more, "duration_s=1200", *(f"{part}.port={port}" for part, port in ports.items()), f"log={directory / 'drive'}")
-    with process("demo", *words, stdout=subprocess.DEVNULL) as demo, sync_playwright() as playwright:
+    own = ("duration_s=1200", f"log={directory / 'drive'}", *(f"{part}.port={port}" for part, port in ports.items()))
+    with process("demo", *WORDS, *more, *own, stdout=subprocess.DEVNULL) as demo, sync_playwright() as playwright:
         until(lambda: answers(ports["page"]))
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=CHROMIUM_FLAGS)
         page = browser.new_page(viewport={"width": 1280, "height": 720})
