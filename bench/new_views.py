@@ -156,7 +156,8 @@ class Phase:
         self.ended = self.began
         self.drawn: dict[str, list[Drawn]] = {}
         self.stated: list[tuple[float, Mapping[str, Any]]] = []
-        self.first, self._marks_before = len(page.evaluate("tod.stated()")), len(_marks(page))
+        self.first = len(page.evaluate("tod.stated()"))
+        self._marks_before = max((at for at, *_ in _marks(page)), default=0.0)
         self.marks: list[str] = []
 
     def end(self, page: Page) -> None:
@@ -165,7 +166,8 @@ class Phase:
             every = [Drawn(captured, at, Roi(**r) if r else None, (w, h)) for captured, at, r, w, h in shown]
             self.drawn[name] = [each for each in every if each.at >= self.began]
         self.stated = page.evaluate("tod.stated()")[self.first :]
-        self.marks = [f"{camera} {mark}" for _, camera, mark in _marks(page)[self._marks_before :] if mark != "live"]
+        marks = [(camera, mark) for at, camera, mark in _marks(page) if at > self._marks_before]
+        self.marks = [f"{camera} {mark}" for camera, mark in marks if mark != "live"]
 
 
 def _marks(page: Page) -> Any:
