@@ -91,6 +91,7 @@ class SeenDrive:
 
     view     log that states what the screen showed
     metrics  by name, their identities
+    kernel   by which pictures were enlarged
     optimum  None: not every camera has a model of its own
     """
 
@@ -99,6 +100,7 @@ class SeenDrive:
     cameras: Mapping[str, SeenCamera]
     optimum: Optimum | None = None
     every_s: float = field(default=0.5, kw_only=True)
+    kernel: str = field(default="linear", kw_only=True)
 
     def screen(self, metric: str) -> tuple[tuple[float, ...], Scores]:
         """Moments, and scores of the whole screen: means of all cameras by px, where all of them are known."""

@@ -27,7 +27,7 @@ from runner.drive.seen_file import Ages, Scores, SeenCamera
 from runner.drive.videos import CameraVideo, Picture, Videos, each_camera
 from runner.drive.views import Views, seen_of
 from runner.rate_quality.metrics.interface import Luma, Metric, PictureSize, QualityMeter
-from runner.rate_quality.screen import on_screen
+from runner.rate_quality.screen import Kernel, on_screen
 from runner.records.decisions import CameraDecision, DecisionMade
 from runner.settings import FROZEN_INTERVALS, FROZEN_MS
 from runner.system.clocks import SECOND_NS
@@ -40,11 +40,13 @@ class Looks(NamedTuple):
 
     metrics  that score pictures
     late_ms  age on arrival above which the page marks a picture as late
+    kernel   by which the page enlarges pictures
     """
 
     views: Views
     metrics: Sequence[Metric]
     late_ms: float
+    kernel: Kernel = "linear"
 
 
 def measure_seen(
@@ -87,7 +89,7 @@ def _camera(
     sent = _Decided.of(drive, camera)
     found = list(_looks(camera, video.units, looks.views, sent, began, until))
     filed = [look for look in found if look.unit and look.unit not in video.absent]
-    scores = _scores(camera, videos, video, looks.metrics, filed, clip)
+    scores = _scores(camera, videos, video, looks, filed, clip)
     unknown = [(look.at - began) / SECOND_NS for look in found if look.unit in video.absent]
 
     def scored(metric: Metric) -> Scores:
@@ -153,12 +155,12 @@ def _scores(
     camera: Camera,
     videos: Videos,
     video: CameraVideo,
-    metrics: Sequence[Metric],
-    looks: Sequence[_Look],
+    looks: Looks,
+    found: Sequence[_Look],
     clip: Path | None,
 ) -> dict[str, dict[_Key, float]]:
     """By metric, the score of each picture as it was seen, unless no file has it or its scene is unknown."""
-    scored = {(look.unit.captured, look.seen) for look in looks if look.unit}
+    scored = {(look.unit.captured, look.seen) for look in found if look.unit}
     # A metric that also compares neighbouring pictures gets the one before each.
     before = dict(zip(times := [unit.captured for unit in video.units], [0, *times], strict=False))
     shown = scored | {(before[captured], seen) for captured, seen in scored if before[captured]}
@@ -168,7 +170,7 @@ def _scores(
     captures = list(by_capture)
     of_sent = _nearest(sorted(video.captured), captures)
     scene_at = lookup(scenes(camera, videos, video.sent, [ns for ns in of_sent if ns is not None], clip))
-    meters = _Meters(metrics, camera.fps, scored, by_capture)
+    meters = _Meters(looks.metrics, looks.kernel, camera.fps, scored, by_capture)
     try:
         for number, picture in at_captures(captures, videos.pictures(video.shown) if captures else ()):
             sent = of_sent[number]
@@ -199,6 +201,7 @@ class _Meters:
     """
 
     metrics: Sequence[Metric]
+    kernel: Kernel
     fps: Fraction
     scored: set[_Key]
     by_capture: Mapping[int, Sequence[Seen]]
@@ -215,7 +218,7 @@ class _Meters:
             wanted = [m for m in self.metrics if min(size) >= m.smallest_px and (m.every_frame or key in self.scored)]
             if not wanted:
                 continue
-            both = _displayed(scene, seen), _displayed(picture, seen)
+            both = _displayed(scene, seen, self.kernel), _displayed(picture, seen, self.kernel)
             for metric in wanted:
                 meter, keys = self._meter(metric, size)
                 meter.add(len(keys), *both)
@@ -243,8 +246,8 @@ def _size(seen: Seen) -> PictureSize:
     return seen.screen_width, seen.screen_height
 
 
-def _displayed(picture: Picture, seen: Seen) -> Luma:
-    return np.ascontiguousarray(on_screen(picture.luma, picture.region, seen))
+def _displayed(picture: Picture, seen: Seen, kernel: Kernel) -> Luma:
+    return np.ascontiguousarray(on_screen(picture.luma, picture.region, seen, kernel))
 
 
 # --- ages -------------------------------------------------------------------------------------------------------------

@@ -129,7 +129,12 @@ VERBS = {
         composes=False,
     ),
     "quality": Verb(
-        "measure the quality of what the operator saw", "runner.verbs.quality", ("view",), DRIVE, composes=False
+        "measure the quality of what the operator saw",
+        "runner.verbs.quality",
+        ("view", "kernel"),
+        DRIVE,
+        composes=False,
+        choices={"kernel": ("linear", "cubic")},
     ),
     "map": Verb(
         "a bandwidth map from drives",

@@ -1,4 +1,4 @@
-"""usage: tod-runner quality DRIVE [DRIVE ...] [view=LOG]
+"""usage: tod-runner quality DRIVE [DRIVE ...] [view=LOG [kernel=cubic]]
 
 Measures the quality of what the operator saw: twice a second, the displayed picture is compared with the scene that the
 camera saw at that time (MSSIM of luma at the camera's full size). Freezes, delay and damage lower the score. Needs
@@ -12,7 +12,8 @@ With view= it measures what was on the screen: of each camera the part that wind
 black where nothing was sent. A picture is compared with the scene at its capture (MSSIM, and VMAF if an ffmpeg has it);
 cameras are weighted by their area on the screen. The age of pictures, and the time in which they were frozen or late,
 are figures of their own. LOG states what windows showed, in events view_reported: the drive itself, or the log of
-another one, whose time also counts from its beginning. Writes DRIVE/seen.json, which `report` shows.
+another one, whose time also counts from its beginning. Writes DRIVE/seen.json, which `report` shows. kernel= is how the
+page enlarges pictures: linear, or cubic as it does with a GPU.
 
   tod-runner demo log=monday log.video=true duration_s=60
   tod-runner quality monday
@@ -25,7 +26,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar, cast
 
 from runner.errors import RunError, UserError
 from runner.system import signals
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
     from runner.drive.views import Views
     from runner.graph import Plan
     from runner.rate_quality.metrics import Metric
+    from runner.rate_quality.screen import Kernel
     from runner.settings import Setup
 
 SIDES = ("vehicle", "operator")
@@ -53,7 +55,7 @@ def run(arguments: Arguments) -> int:
     view = arguments.path("view")
     for word in arguments.words:
         if view:
-            _measure_seen(Path(word), view)
+            _measure_seen(Path(word), view, cast("Kernel", arguments.choice("kernel")))
         else:
             _measure_drive(Path(word))
     return 0
@@ -91,7 +93,7 @@ def _measure_drive(path: Path) -> None:
     _show(path, found)
 
 
-def _measure_seen(path: Path, view: Path) -> None:
+def _measure_seen(path: Path, view: Path, kernel: Kernel) -> None:
     from runner.drive.seen_file import DOCUMENT, SeenDrive, to_json
     from runner.drive.seen_quality import Looks, measure_seen
     from runner.drive.views import read_views
@@ -104,13 +106,13 @@ def _measure_seen(path: Path, view: Path) -> None:
     for warning in warnings if views.path.parent.resolve() != path.resolve() else ():
         _warn(warning)
     views.check(recorded.cameras)
-    looks = Looks(views, _metrics(), setup.page.late_ms)
+    looks = Looks(views, _metrics(), setup.page.late_ms, kernel)
     found = _with_progress(
         path, lambda progress: measure_seen(drive, videos, recorded.cameras, clips, looks, progress, _warn)
     )
     _check(recorded, {name: (any(map(_is_known, each.scores.values())), each.scene) for name, each in found.items()})
     identities = {metric.name: metric.identity for metric in looks.metrics}
-    seen = SeenDrive(str(view), identities, found, _optimum(recorded, views, found))
+    seen = SeenDrive(str(view), identities, found, _optimum(recorded, views, found), kernel=kernel)
     write_whole(path / DOCUMENT, dumps(to_json(seen)))
     _show_seen(path, seen)
 
