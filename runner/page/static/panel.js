@@ -96,7 +96,7 @@ function field(label, ...content) {
 
 function comparison() {
   const body = make("tbody");
-  for (const [key, label] of [["sending", "Sending"], ["bitrate", KBPS], ["size", "Size"], ["ROI", "ROI"]]) {
+  for (const [key, label] of [["sending", "Sending"], ["bitrate", KBPS], ["rate", "Pictures/s"], ["size", "Size"], ["ROI", "ROI"]]) {
     const cells = [make("td"), make("td")];
     rows.set(key, { row: make("tr", {}, make("th", { scope: "row" }, label), ...cells), cells });
     body.append(rows.get(key).row);
@@ -247,6 +247,8 @@ function refreshFactors(info, now, why) {
   }
 }
 
+const rateOf = (fps) => (fps === undefined ? "–" : `${Math.round(10 * fps) / 10}`);
+
 function refreshComparison(now) {
   const applied = now?.applied ?? {};
   const yes = (value) => (value === undefined ? "–" : value ? "yes" : "no");
@@ -256,9 +258,11 @@ function refreshComparison(now) {
   const values = {
     sending: [yes(now?.sending), yes(applied.sending)],
     bitrate: [whole(now?.kbps), kept(whole(applied.bitrate))],
+    rate: [rateOf(now?.fps), kept(rateOf(applied.fps))],
     size: [size(now?.width, now?.height), kept(size(applied.size?.width, applied.size?.height))],
     ROI: [region(now?.roi), region(applied.roi)],
   };
+  rows.get("rate").row.hidden = now?.fps === undefined; // no rule sets it
   for (const [key, { row, cells }] of rows) {
     setText(cells[0], values[key][0]);
     setText(cells[1], differs.includes(key) ? `◌ ${values[key][1]}` : values[key][1]);

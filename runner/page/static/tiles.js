@@ -378,12 +378,13 @@ function caption(element, differs, text, title) {
   setAttribute(element, "title", differs ? `pending: decided, not yet read back; ${title}` : title);
 }
 
-/** The decided values that have not been read back from the elements yet. */
-export function unapplied({ on, sending, roi, width, height, kbps, applied }) {
+/** The decided values that have not been read back from the elements yet. @param {import("./store.js").Decision} decision */
+export function unapplied({ on, sending, roi, width, height, kbps, fps, applied }) {
   const found = [];
   if (applied.sending !== undefined && applied.sending !== sending) found.push("sending");
   if (!on || !sending) return found;
   if (applied.bitrate !== undefined && applied.bitrate !== kbps) found.push("bitrate");
+  if (applied.fps !== undefined && applied.fps !== fps) found.push("rate");
   const { size: appliedSize, roi: appliedRoi } = applied;
   if (appliedSize && (appliedSize.width !== width || appliedSize.height !== height)) found.push("size");
   if (appliedRoi && ["x", "y", "width", "height"].some((key) => appliedRoi[key] !== roi[key])) found.push("ROI");
