@@ -38,7 +38,9 @@ def test_sampled_pictures_score_as_in_the_whole_video() -> None:
         whole.add(number, scene, picture)
     expected = whole.close()
     captures = [5, 10, 15, 20]
-    meters = _Meters([vmaf], FPS, {(n, SEEN) for n in captures}, {n: [SEEN] for c in captures for n in (c - 1, c)})
+    meters = _Meters(
+        [vmaf], "linear", FPS, {(n, SEEN) for n in captures}, {n: [SEEN] for c in captures for n in (c - 1, c)}
+    )
     for captured in meters.by_capture:
         meters.add(captured, Picture(scenes[captured], FULL), Picture(shown[captured], FULL))
     meters.close()
@@ -50,7 +52,7 @@ def test_of_each_size_pictures_are_scored_by_a_meter_of_their_own() -> None:
     small = Seen(80, 45, 160, 90, 80, 45)
     (scene,) = moving(1)
     scored = {(0, SEEN), (0, small), (1, small)}
-    meters = _Meters([find_metric("mssim")], FPS, scored, {0: [SEEN, small], 1: [small]})
+    meters = _Meters([find_metric("mssim")], "linear", FPS, scored, {0: [SEEN, small], 1: [small]})
     part = Picture(np.ascontiguousarray(scene[45:135, 80:240]), small.roi)
     for captured in (0, 1):
         meters.add(captured, Picture(scene, FULL), part)

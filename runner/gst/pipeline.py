@@ -125,7 +125,7 @@ class CameraPipeline:
         if dropping := pipeline.get_by_name(DROPPING):
             self.knobs.dropped = RateLimit(dropping, float(plan.camera.fps))
         self.knobs.set_now(self._allowed(self._first))
-        self._sets = self._repeated_sets()
+        self._sets = _repeated_sets(plan, self._sent)
         self._held_up = HeldUp(last)
         self.requests = RequestLimit(last, on_report)
         self._first_packet = BufferProbe(last, self._on_first_packet, in_lists=True)
@@ -140,11 +140,6 @@ class CameraPipeline:
         from runner.gst.passed import PassedStream
 
         return PassedStream(self._sent.get_static_pad("sink"), self._plan.camera, self._on_report)
-
-    def _repeated_sets(self) -> RepeatedSets | None:
-        from runner.gst.repeated_sets import RepeatedSets
-
-        return RepeatedSets.of(self._plan, self._sent)
 
     @property
     def is_opening(self) -> bool:
@@ -326,6 +321,12 @@ class CameraPipeline:
             known = wanted
             self.knobs.turn({"sending": wanted["sending"]})
         return True
+
+
+def _repeated_sets(plan: Plan, sent: Gst.Element | None) -> RepeatedSets | None:
+    from runner.gst.repeated_sets import RepeatedSets
+
+    return RepeatedSets.of(plan, sent)
 
 
 def _count_before(encoder: Gst.Element) -> Gst.Element:

@@ -126,7 +126,7 @@ FAULTS = [
     Fault("ros/inputs.py", "if other != camera:", "if False:", "test_ros_cameras"),
     Fault("metrics/prometheus.py", "if not is_own:", "if False:", "test_prometheus"),
     Fault(
-        "graph.py",
+        "turning.py",
         "right, bottom = native_width - left - value.width",
         "right, bottom = native_width - value.width",
         "test_graph",
