@@ -58,7 +58,7 @@ def model(clip: Path, directory: Path, plan: str, *words: str) -> tuple[dict[str
     """A model file, and the seconds that it took with no point in the cache."""
     output, cache = directory / plan, directory / "cache"
     shutil.rmtree(cache / "tod-runner", ignore_errors=True)
-    words = ("camera=front_center", f"sequence={clip}", f"output={output}", f"plan={plan}", *words)
+    words = ("camera=front_center", f"sequence={clip}", f"output={output}", f"plan={plan}", "screens=[]", *words)
     began = time.perf_counter()
     run([sys.executable, "-m", "runner", "model", *words], env={**os.environ, "XDG_CACHE_HOME": str(cache)})
     spent = time.perf_counter() - began

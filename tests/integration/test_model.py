@@ -336,7 +336,7 @@ def test_measuring_works_while_a_dask_worker_inspects_its_threads(clip, measured
 @pytest.mark.soak
 def test_the_adaptive_plan_finds_the_same_as_the_full_one(tmp_path, cache):
     # A clip that is hardly longer than one refresh wave, 1.5 s, has no bitrate that one could interpolate.
-    words = ("camera=front_center", f"sequence={street(tmp_path, 60)}")
+    words = ("camera=front_center", f"sequence={street(tmp_path, 60)}", "screens=[]")
     found = {}
     for plan in ("full", "adaptive"):
         done = model(*words, f"output={tmp_path / plan}", f"plan={plan}", cache=cache)
@@ -539,5 +539,5 @@ def test_on_a_recorded_drive_each_factor_wins_a_range(tmp_path, cache):
     assert done.returncode == 0, done.stderr
     document = read_model(tmp_path / "front_center.model.json")
     assert len(document["scaling"]) >= 3
-    assert len(document["points"]) <= 53
+    assert len(document["points"]) <= 80  # of 160, with those for smaller screens
     assert document["b_min_kbps"] == sorted(document["b_min_kbps"])
