@@ -38,6 +38,7 @@ def test_a_printed_pair_of_lines_sends_and_shows_the_decided_size(tod, graph):
         tod, "source=test", f"graph={graph}", f"graph.first_port={free_port(3)}", "vehicle=delivery_robot"
     )["rear"]
     operator = start(camera["operator"])
+    until(lambda: "PLAYING" in operator.stdout.readline())  # it needs the first picture, with the parameter sets
     vehicle = start(camera["vehicle"])
     size = f"width=(int){camera['decision']['width']}, height=(int){camera['decision']['height']}"
     try:
