@@ -39,6 +39,7 @@ from runner.settings import Endpoint
 
 SEEN = "seen"
 COMMON = ("vehicle=tum_q7", "pqos=constant", "mode=collective")
+TOTAL = "modes.collective.total_from_operator.start_kbps"
 SETTLE_S, LOOK_S = 8.0, 1.0
 SIDES = ("vehicle", "operator", "browser")
 MOST_SHARE = 0.9
@@ -50,7 +51,7 @@ def main() -> None:
     parser.add_argument("output", type=Path)
     parser.add_argument("--pairs", type=int, default=5)
     parser.add_argument("--seconds", type=float, default=40)
-    parser.add_argument("--total", type=int, default=1000, help="kbit/s")
+    parser.add_argument("--total", type=int, default=3000, help="kbit/s")
     parser.add_argument("words", nargs="*", default=["source=synthetic", "fps_max=5"], help="further overrides")
     options = parser.parse_args()
     options.output.mkdir(parents=True, exist_ok=True)
@@ -125,7 +126,7 @@ def drive(browser: Browser, policy: str, number: int, options: argparse.Namespac
     """One drive, and what each side used in its middle."""
     rules = POLICIES[policy]
     log = options.output / f"{policy.partition(',')[0]}-{number}"
-    words = [*COMMON, *options.words, *rules.words, *rules.graph, f"pqos.kbps={options.total}", f"log={log}"]
+    words = [*COMMON, *options.words, *rules.words, *rules.graph, f"{TOTAL}={options.total}", f"log={log}"]
     words += own_models(options.models, options.output, rules.own or ())
     words += [f"log.video={keeps_video(options)}".lower()]
     with both_sides(words) as (url, pids), browser.new_context(viewport={"width": 1920, "height": 1080}) as context:
