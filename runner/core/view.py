@@ -46,10 +46,14 @@ class Seen:
             return Fraction(0)
         return max(Fraction(self.screen_width, self.width), Fraction(self.screen_height, self.height))
 
+    def lies_in(self, camera: Camera) -> bool:
+        """Whether the camera's full image has this part."""
+        return self.x + self.width <= camera.width and self.y + self.height <= camera.height
+
     def problem(self, camera: Camera) -> str | None:
         """What a camera's image cannot show of it; None: nothing."""
         lengths = (self.width, self.height, self.screen_width, self.screen_height)
-        if self.x + self.width > camera.width or self.y + self.height > camera.height:
+        if not self.lies_in(camera):
             return f"must lie inside the image of {camera.width}x{camera.height} px"
         if len({length > 0 for length in lengths}) > 1:
             return "width, height and both sides on the screen: all or none must be 0"

@@ -43,8 +43,7 @@ class Views:
         problems = []
         for name, camera in cameras.items():
             seen = [view[name] for view in self.views if name in view]
-            beyond = (s for s in seen if s.x + s.width > camera.width or s.y + s.height > camera.height)
-            if one := next(beyond, None):
+            if one := next((each for each in seen if not each.lies_in(camera)), None):
                 found = f"{one.width}x{one.height} px at {one.x}, {one.y}"
                 rule = f"must lie inside the camera's image of {camera.width}x{camera.height} px"
                 problems.append(Problem(str(self.path), f"view.{name}", found, rule))

@@ -63,13 +63,7 @@ class StatedViews:
     def _possible(self, view: View) -> View:
         """Without what this vehicle's cameras cannot show: another configuration may have been drawn."""
         cameras = self.vehicle.cameras
-        return {
-            name: seen
-            for name, seen in view.items()
-            if name in cameras
-            and seen.x + seen.width <= cameras[name].width
-            and seen.y + seen.height <= cameras[name].height
-        }
+        return {name: seen for name, seen in view.items() if name in cameras and seen.lies_in(cameras[name])}
 
 
 def _without(runs: dict[int | UnsetType, _Stated], run: int | UnsetType) -> dict[int | UnsetType, _Stated]:
