@@ -17,6 +17,7 @@ from pathlib import Path
 from statistics import fmean, pstdev
 
 import gi
+from footage import WAIT, pictures
 
 from runner.configuration.config import configuration
 from runner.graph import launch
@@ -32,7 +33,6 @@ CASES = ((100, (240, 130)), (300, (480, 260)), (600, (480, 260)), (1500, (960, 5
 SWITCH, MOST = 30, 600  # frames between two changes of size, and of a clip
 CAMERA = ("vehicle=delivery_robot", f"fps_max={FPS}", "~cameras.rear", "~cameras.mast")
 SIZED = ("cameras.front.width_px={}", "cameras.front.height_px={}")
-WAIT = 10 * Gst.SECOND
 Turns = Mapping[int, tuple[int, tuple[int, int]]]  # by frame: kbit/s, px
 
 
@@ -50,7 +50,7 @@ def main() -> None:
         "clip, kbit/s: mean, deviation of seconds, of frames, correlation | first, key, next two | a third | threefold"
     )
     for clip in options.clips:
-        frames = pictures(clip)
+        frames = pictures(clip, FULL, MOST, FPS)
         for kbps, size in CASES:
             print(f"{clip.stem}, {kbps}: {encoder.row(frames, kbps, size)}", flush=True)
 
@@ -104,21 +104,6 @@ class Encoder:
             found.append(sink.emit("try-pull-sample", WAIT).get_buffer().get_size())
         pipeline.set_state(Gst.State.NULL)
         return found
-
-
-def pictures(clip: Path) -> list[bytes]:
-    """The clip's pictures at FULL and FPS, as I420."""
-    pipeline = Gst.parse_launch(
-        f'filesrc location="{clip}" ! decodebin ! videoconvert ! videorate ! videoscale ! video/x-raw,format=I420,'
-        f"width={FULL[0]},height={FULL[1]},framerate={FPS}/1,pixel-aspect-ratio=1/1 ! appsink name=out sync=false"
-    )
-    pipeline.set_state(Gst.State.PLAYING)
-    sink, found = pipeline.get_by_name("out"), []
-    while len(found) < MOST and (sample := sink.emit("try-pull-sample", WAIT)):
-        buffer = sample.get_buffer()
-        found.append(buffer.extract_dup(0, buffer.get_size()))
-    pipeline.set_state(Gst.State.NULL)
-    return found
 
 
 if __name__ == "__main__":

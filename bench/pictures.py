@@ -21,6 +21,7 @@ from statistics import fmean
 from typing import NamedTuple
 
 import numpy as np
+from footage import WAIT, pictures
 
 from runner.configuration.config import configuration
 from runner.core.model import Camera
@@ -34,7 +35,6 @@ KBPS = (150, 250, 400, 700)
 RATES = (1, 2, 3, 5)  # each n-th picture
 WAVES = (1.5, 6.0, 60.0)  # s
 RULES = ("modes=motion", "modes.collective.waves_by_loss={loss: 0.01, calm_s: 10}")
-WAIT = 10 * Gst.SECOND
 
 
 class Encoded(NamedTuple):
@@ -50,20 +50,6 @@ def camera(*words: str) -> Camera:
     native = (f"cameras.front.native={{width_px: {SIZE[0]}, height_px: {SIZE[1]}, top_px: 0}}",)
     setup = configuration(("vehicle=delivery_robot", "source=test", *own, *native, *words)).setup()
     return setup.vehicle.cameras["front"]
-
-
-def pictures(clip: Path) -> list[bytes]:
-    """The clip's pictures, as I420; again from its start until there are enough."""
-    pipeline = Gst.parse_launch(
-        f'filesrc location="{clip}" ! decodebin ! videoconvert ! videoscale ! video/x-raw,format=I420,'
-        f"width={SIZE[0]},height={SIZE[1]},pixel-aspect-ratio=1/1 ! appsink name=out sync=false"
-    )
-    pipeline.set_state(Gst.State.PLAYING)
-    sink, found = pipeline.get_by_name("out"), []
-    while len(found) < HZ * SECONDS and (sample := sink.emit("try-pull-sample", WAIT)):
-        found.append(sample.get_buffer().extract_dup(0, sample.get_buffer().get_size()))
-    pipeline.set_state(Gst.State.NULL)
-    return [found[number % len(found)] for number in range(HZ * SECONDS)]
 
 
 def luma(picture: bytes) -> np.ndarray:
@@ -129,7 +115,8 @@ def main() -> None:
         sys.exit(__doc__)
     Gst.init(None)
     for clip in map(Path, sys.argv[1:]):
-        frames = pictures(clip)
+        once = pictures(clip, SIZE, HZ * SECONDS)
+        frames = [once[number % len(once)] for number in range(HZ * SECONDS)]  # again from its start
         print(f"\n{clip.name}: MSSIM sent / held at kbit/s asked")
         print(" " * 12, *(f"{kbps:>16}" for kbps in KBPS))
         for nth in RATES:
