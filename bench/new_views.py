@@ -1,6 +1,6 @@
 """How soon the screen shows a new view, over a limited link, and what changes of views do to its queue.
 
-  python bench/new_views.py                                                  about two and a half minutes
+  python bench/new_views.py                                                  two drives of two and a half minutes
   python bench/new_views.py --set modes.automatic.calm_pictures.at_once=8    likewise, all new sizes together
 
 The eight cameras of the paper's vehicle at a quarter of their pixels, over a link of 3000 kbit/s with delay. Times are
@@ -14,12 +14,14 @@ import needs_tests  # noqa: F401 (first: makes parts of the tests importable)  #
 
 import argparse
 import json
+import math
 import random
 import shutil
 import subprocess
 import tempfile
 import time
 from bisect import bisect_right
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
@@ -70,13 +72,21 @@ def high(values: Sequence[float], share: float = 0.95) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=75, help="with changes, at most 75; half of it without")
+    parser.add_argument("--drives", type=int, default=2)
     parser.add_argument("--set", nargs="*", default=[], help="overrides")
     options = parser.parse_args()
-    show(rows(options.seconds, options.set))
+    show(rows(options.seconds, options.drives, options.set))
 
 
-def rows(seconds: float = 75, more: Sequence[str] = ()) -> list[Row]:
+def rows(seconds: float = 75, drives: int = 2, more: Sequence[str] = ()) -> list[Row]:
     render_missing(configuration([*WORDS, *more]).vehicle(), lambda *_: None)
+    parts = [parts_of_a_drive(seconds, SEED + number, more) for number in range(drives)]
+    calm, changing = ([each[part] for each in parts] for part in (0, 1))
+    return [*waits(changing), *compared(calm, "without"), *compared(changing, "with")]
+
+
+def parts_of_a_drive(seconds: float, seed: int, more: Sequence[str]) -> tuple[Phase, Phase]:
+    """Without changes of views, and with them."""
     with tempfile.TemporaryDirectory() as directory, driven(Path(directory), more) as page:
         take_control(page)
         viewing(page, "drive")
@@ -85,14 +95,12 @@ def rows(seconds: float = 75, more: Sequence[str] = ()) -> list[Row]:
         time.sleep(seconds / 2)
         calm.end(page)
         changing = Phase(page)
-        selected = change_views(page, seconds)
+        changing.selected = change_views(page, seconds, random.Random(seed))
         changing.end(page)
         log = [json.loads(line) for line in (Path(directory) / "drive" / "drive.jsonl").read_text().splitlines()]
-    return [
-        *waits(changing, selected),
-        *compared(calm, "without", log),
-        *compared(changing, "with", log),
-    ]
+    for part in (calm, changing):
+        part.read(log)
+    return calm, changing
 
 
 @contextmanager
@@ -113,9 +121,9 @@ def driven(directory: Path, more: Sequence[str]) -> Iterator[Page]:
         demo.wait(timeout=20)
 
 
-def change_views(page: Page, seconds: float) -> Mapping[int, str]:
+def change_views(page: Page, seconds: float, chance: random.Random) -> Mapping[int, str]:
     """Change what the page shows, at random times; returns by number of the change the camera that it selects."""
-    chance, end = random.Random(SEED), time.monotonic() + seconds
+    end = time.monotonic() + seconds
     selected: dict[int, str] = {}
     for number in range(10_000):
         if time.monotonic() > end:
@@ -148,7 +156,10 @@ class Drawn(NamedTuple):
 class Phase:
     """Part of a drive: pictures drawn, views stated, marks of pictures that are not live.
 
-    first  how many views were stated before
+    first     how many views were stated before
+    selected  by number of a view, the camera that it selects
+    changed   when new pictures were needed
+    queues    of the link, ms, as they were measured
     """
 
     def __init__(self, page: Page) -> None:
@@ -157,8 +168,11 @@ class Phase:
         self.drawn: dict[str, list[Drawn]] = {}
         self.stated: list[tuple[float, Mapping[str, Any]]] = []
         self.first = len(page.evaluate("tod.stated()"))
+        self.selected: Mapping[int, str] = {}
         self._marks_before = max((at for at, *_ in _marks(page)), default=0.0)
-        self.marks: list[str] = []
+        self.marks: list[tuple[float, str]] = []
+        self.queues: list[float] = []
+        self.changed: list[float] = []
 
     def end(self, page: Page) -> None:
         self.ended = time.time() * 1000
@@ -166,23 +180,35 @@ class Phase:
             every = [Drawn(captured, at, Roi(**r) if r else None, (w, h)) for captured, at, r, w, h in shown]
             self.drawn[name] = [each for each in every if each.at >= self.began]
         self.stated = page.evaluate("tod.stated()")[self.first :]
-        marks = [(camera, mark) for at, camera, mark in _marks(page) if at > self._marks_before]
-        self.marks = [f"{camera} {mark}" for camera, mark in marks if mark != "live"]
+        self.marks = [(at, mark) for at, _, mark in _marks(page) if at > self._marks_before and mark != "live"]
+
+    def read(self, log: Sequence[Mapping[str, Any]]) -> None:
+        """What the vehicle measured meanwhile."""
+        began = log[0]["time"]
+        looks = [line for line in log if line.get("event") == "link_measured"]
+        self.queues = [look["queue_ms"] for look in looks if self.began <= 1000 * (began + look["t"]) <= self.ended]
+
+    @property
+    def minutes(self) -> float:
+        """Of all cameras together."""
+        return len(self.drawn) * (self.ended - self.began) / 60_000
 
 
 def _marks(page: Page) -> Any:
     return page.evaluate("tod.measure()")["status_log"]
 
 
-def waits(phase: Phase, selected: Mapping[int, str]) -> Iterator[Row]:
+def waits(phases: Sequence[Phase]) -> Iterator[Row]:
     """From a statement to the picture, of the front and selected cameras, and of the last of all."""
     first, last, cameras = list[float](), list[float](), list[float]()
-    for number, (at, view) in enumerate(phase.stated):
-        found = {name: wait for name in view if (wait := _wait(phase.drawn[name], at, view[name])) is not None}
-        cameras += found.values()
-        first += [found[name] for name in {FRONT, selected.get(phase.first + number, FRONT)} if name in found]
-        if found:
-            last.append(max(found.values()))
+    for phase in phases:
+        for number, (at, view) in enumerate(phase.stated, phase.first):
+            found = {name: wait for name in view if (wait := _wait(phase.drawn[name], at, view[name])) is not None}
+            cameras += found.values()
+            first += [found[name] for name in {FRONT, phase.selected.get(number, FRONT)} if name in found]
+            if found:
+                last.append(max(found.values()))
+                phase.changed.append(at)
     for what, values, most in (
         ("front and selected camera", first, RTT_MS + 3 * 1000 / FPS),
         ("each camera", cameras, RTT_MS + 500),
@@ -211,19 +237,29 @@ def _wait(drawn: Sequence[Drawn], at: float, seen: Mapping[str, int]) -> float |
     return next((each.at - at for each in drawn[begin:end] if shows(each)), 1000 * SOON_S)
 
 
-def compared(phase: Phase, what: str, log: Sequence[Mapping[str, Any]]) -> Iterator[Row]:
-    """The queue in front of the link, the age of pictures, and those marked as not live."""
-    began = log[0]["time"]
-    looks = [line for line in log if line.get("event") == "link_measured"]
-    queues = [look["queue_ms"] for look in looks if phase.began <= 1000 * (began + look["t"]) <= phase.ended]
-    ages = [each.at - each.captured for drawn in phase.drawn.values() for each in drawn]
-    for of, values in (("queue", queues), ("age on the screen", ages)):
-        yield Row(f"{of} {what} changes, p95", high(values), "ms", note=spread("", values, "").note)
-    sizes = sum(one.size != other.size for drawn in phase.drawn.values() for one, other in pairwise(drawn))
-    yield Row(
-        f"new sizes {what} changes", 60_000 * sizes / len(phase.drawn) / (phase.ended - phase.began), "a minute, camera"
-    )
-    yield Row(f"late, frozen or damaged {what} changes", len(phase.marks), "", note=", ".join(phase.marks[:3]))
+def compared(phases: Sequence[Phase], what: str) -> Iterator[Row]:
+    """The queue in front of the link, the age of pictures, the time between two, and those marked as not live."""
+    drawn = [pictures for phase in phases for pictures in phase.drawn.values()]
+    pairs = [pair for pictures in drawn for pair in pairwise(pictures)]
+    anew = [other.at - one.at for one, other in pairs if one.size != other.size]
+    for of, values in (
+        ("queue", [queue for phase in phases for queue in phase.queues]),
+        ("age on the screen", [each.at - each.captured for pictures in drawn for each in pictures]),
+        ("between two pictures", [other.at - one.at for one, other in pairs]),
+        ("before the first of a new size", anew),
+    ):
+        if values:
+            yield Row(f"{of}, {what} changes, p95", high(values), "ms", note=spread("", values, "").note)
+    minutes = sum(phase.minutes for phase in phases)
+    yield Row(f"new sizes {what} changes", len(anew) / minutes, "a minute, camera")
+    marks = Counter(mark for phase in phases for _, mark in phase.marks)
+    yield Row(f"marks {what} changes", marks.total() / minutes, "a minute, camera", note=str(dict(marks)))
+    soon = [(at, at + 1000 * SOON_S) for phase in phases for at in phase.changed]
+    if soon:
+        seconds = sum(min(end, after) - at for (at, end), (after, _) in pairwise([*soon, (math.inf, math.inf)])) / 1000
+        near = sum(any(at <= mark <= end for at, end in soon) for phase in phases for mark, _ in phase.marks)
+        cameras = len(drawn) / len(phases)
+        yield Row(f"marks within {SOON_S:g} s of a new view", 60 * near / (seconds * cameras), "a minute, camera")
 
 
 if __name__ == "__main__":

@@ -172,6 +172,20 @@ def test_what_is_stated_is_reported_on_change_and_again_while_unchanged() -> Non
     assert seen.report(9) is UNSET
 
 
+def test_whoever_reports_is_woken_once_something_else_is_stated_than_was_reported() -> None:
+    seen, woken = StatedView(), list[int]()
+    seen.on_change = lambda: woken.append(1)
+    seen.state(None)
+    assert not woken
+    seen.state({FRONT: LEFT})
+    assert len(woken) == 1
+    seen.report(0)
+    seen.state({FRONT: LEFT})
+    assert len(woken) == 1  # the page repeats what is unchanged
+    seen.state({FRONT: RIGHT})
+    assert len(woken) == 2
+
+
 def test_a_statement_holds_as_long_as_it_says() -> None:
     seen = StatedView()
     seen.state({FRONT: LEFT}, 60)

@@ -52,6 +52,7 @@ CONTROL_FIRST_S, POLL_S = 1.0, 0.01  # how long the streams wait for the vehicle
 STUCK_S = 2.0  # a side that samples nothing for this long hangs
 GIVE_UP_S = 60.0  # after this long it ends; an overloaded machine may recover before
 END_S = 1.0  # how long the last sample may take
+SOONEST_S = 0.01  # between two reports, however often something else is seen
 
 
 class LiveOperator:
@@ -82,7 +83,7 @@ class LiveOperator:
         self.on_dropped: Callable[[Collection[str]], None] = lambda cameras: None  # that are no longer received
         self._log, self._build = log, build
         self._side: OperatorSide | None = None
-        self._stopped = threading.Event()
+        self._stopped, self._sees_else = threading.Event(), threading.Event()
         self._duration_s, self._latest_start = inf, inf
         self._online_at: float | None = None  # time.monotonic
         self._requests = deque(requests)
@@ -104,6 +105,7 @@ class LiveOperator:
         """
         if self._demand:
             self._follow(self._demand)
+        self.station.seen.on_change = self._sees_else.set  # what is newly seen arrives a report earlier
         self.station.connect()
         if not self._demand:
             self._await_vehicle()
@@ -198,6 +200,7 @@ class LiveOperator:
     def end(self) -> None:
         """Stop sampling soon. From any thread, any number of times."""
         self._stopped.set()
+        self._sees_else.set()
 
     def stop(self) -> None:
         """Sign off from the vehicle, and end."""
@@ -225,7 +228,7 @@ class LiveOperator:
         side = self._side
         assert side
         try:
-            self._repeat("sample", SAMPLE_S, lambda: self._sample(side))
+            self._repeat("sample", lambda: self._stopped.wait(SAMPLE_S), lambda: self._sample(side))
         except RunError as error:  # GStreamer has hung for GIVE_UP_S; the main thread raises it
             self._failure = error
         for request in self._requests:
@@ -235,20 +238,29 @@ class LiveOperator:
         """In its own thread, since a sample waits for GLib: to the vehicle a missing report means a bad link."""
         side = self._side
         assert side
-        self._repeat("reception report", REPORT_S, lambda: self._report_reception(side))
+        self._repeat("reception report", self._await_report, lambda: self._report_reception(side))
+
+    def _await_report(self) -> None:
+        """Until the next report is due, or something else is seen."""
+        self._stopped.wait(SOONEST_S)
+        self._sees_else.wait(REPORT_S - SOONEST_S)
+        self._sees_else.clear()
 
     def _report_reception(self, side: OperatorSide) -> None:
         is_held_up = self._late.is_excused(time.monotonic())  # other threads first read what has arrived meanwhile
         if not is_held_up and not self.station.link.is_behind():  # else they accumulate for the next report
             self.station.report_reception(side.take_arrivals())
 
-    def _repeat(self, what: str, every_s: float, work: Callable[[], None]) -> None:
+    def _repeat(self, what: str, pause: Callable[[], object], work: Callable[[], None]) -> None:
         """Repeat a piece of work until stopped; an exception must not end the operator's view of a moving vehicle.
 
         raises  RunError if nothing was sampled for GIVE_UP_S
         """
         last_fault = ""
-        while not self._stopped.wait(every_s) and self._elapsed_s() < self._duration_s:
+        while True:
+            pause()
+            if self._stopped.is_set() or self._elapsed_s() >= self._duration_s:
+                return
             try:
                 work()
             except Exception as error:

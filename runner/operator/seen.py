@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from math import inf
 
 from msgspec import UNSET, UnsetType
@@ -21,6 +22,7 @@ class StatedView:
         self._views: dict[str, tuple[View, float]] = {}  # and until when each holds: time.monotonic
         self._reported: View = {}
         self._reported_at = -inf
+        self.on_change: Callable[[], None] = lambda: None  # called when something else is stated than was reported
 
     def state(self, view: View | None, for_s: float = inf, *, by: str = "program") -> None:
         """State what is shown, until the next call.
@@ -31,6 +33,8 @@ class StatedView:
         """
         with self._lock:
             self._views[by] = view or {}, time.monotonic() + for_s
+        if self.view != self._reported:
+            self.on_change()
 
     @property
     def view(self) -> View:

@@ -305,7 +305,7 @@ class Station:
             listener.on_sample(sample)
 
     def report_reception(self, arrivals: Mapping[str, Arrivals]) -> None:
-        """Report arrivals since the last report to the vehicle; to be called every REPORT_S, by one thread.
+        """Report arrivals since the last report to the vehicle; to be called at least every REPORT_S, by one thread.
 
         arrivals  by uplink; "": the vehicle has one
         """
