@@ -4,8 +4,8 @@
   python bench/new_views.py --set modes.automatic.calm_pictures.at_once=8    likewise, all new sizes together
 
 The eight cameras of the paper's vehicle at a quarter of their pixels, over a link of 3000 kbit/s with delay. Times are
-from the page's statement of the new view to the first picture drawn that shows what is seen in its new size. Cameras
-that need nothing new do not count. Needs chromium. Run it on an otherwise idle machine.
+from the page's statement of the new view to the first picture drawn that shows what is seen, as finely as it soon will.
+Cameras that need nothing new do not count. Needs chromium. Run it on an otherwise idle machine.
 """
 
 from __future__ import annotations
@@ -145,12 +145,18 @@ def change_views(page: Page, seconds: float, chance: random.Random) -> Mapping[i
 
 
 class Drawn(NamedTuple):
-    """A picture: when it was captured and drawn, ms, its region (None: all of it) and its size, px."""
+    """A picture: when it was captured and drawn, ms, its region (None: all), its size, the image's width, px."""
 
     captured: float
     at: float
     region: Roi | None
     size: tuple[int, int]
+    full_px: int
+
+    @property
+    def fineness(self) -> float:
+        """Pixels of the picture for each of the image."""
+        return self.size[0] / (self.region.width if self.region else self.full_px)
 
 
 class Phase:
@@ -177,7 +183,8 @@ class Phase:
     def end(self, page: Page) -> None:
         self.ended = time.time() * 1000
         for name, shown in page.evaluate("tod.shown()").items():
-            every = [Drawn(captured, at, Roi(**r) if r else None, (w, h)) for captured, at, r, w, h in shown]
+            full_px = (SIZES | TOPS)[name][0]
+            every = [Drawn(captured, at, Roi(**r) if r else None, (w, h), full_px) for captured, at, r, w, h in shown]
             self.drawn[name] = [each for each in every if each.at >= self.began]
         self.stated = page.evaluate("tod.stated()")[self.first :]
         self.marks = [(at, mark) for at, _, mark in _marks(page) if at > self._marks_before and mark != "live"]
@@ -221,7 +228,7 @@ def waits(phases: Sequence[Phase]) -> Iterator[Row]:
 
 
 def _wait(drawn: Sequence[Drawn], at: float, seen: Mapping[str, int]) -> float | None:
-    """ms until a camera's picture shows what is seen in its new size; None: it already did."""
+    """ms until a camera's picture shows what is seen at least as finely as it soon will; None: it already did."""
     begin = bisect_right([each.at for each in drawn], at)
     end = bisect_right([each.at for each in drawn], at + 1000 * SOON_S)
     if not begin or begin == end or not seen["width"]:
@@ -230,7 +237,7 @@ def _wait(drawn: Sequence[Drawn], at: float, seen: Mapping[str, int]) -> float |
 
     def shows(picture: Drawn) -> bool:
         covered = picture.region is None or enclosing(picture.region, region) == picture.region
-        return covered and picture.size == drawn[end - 1].size
+        return covered and picture.fineness >= drawn[end - 1].fineness
 
     if shows(drawn[begin - 1]):
         return None
