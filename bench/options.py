@@ -45,7 +45,7 @@ OPTIONS: Mapping[str, Sequence[str]] = {
     "scaler: two threads": (f"+{SCALER}.n-threads=2",),
     "encoder: two threads, two slices": (f"{ENCODER}.threads=2",),
     **{
-        f"encoder: {options}": (f'graph.efforts.medium.options="{options}"',)
+        f"encoder: {options}": (f'graph.efforts.medium.options="repeat-headers=0:{options}"',)
         for options in (
             "no-deblock=1",
             "subme=0",

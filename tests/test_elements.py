@@ -75,7 +75,7 @@ def test_links_and_knobs(tod: Command, conf: UserConf, target: str) -> None:
 
 
 def test_what_only_a_newer_version_has(tod: Command, conf: UserConf) -> None:
-    conf.change("graph/h264_rtsp.yaml", {"byte-stream: true": "byte-stream: true\n      nal-hrd: cbr"})
+    conf.change("graph/h264_rtsp.yaml", {"threads: 1 ": "nal-hrd: cbr\n      threads: 1 "})
     (found,) = problems(tod, conf, "gstreamer-1.22")
     assert found.startswith(f"{GRAPH}: encoder[0].properties.nal-hrd: 'cbr': x264enc has no such property")
     assert tod("validate", conf.word, *ONE, "target=gstreamer-1.28").status == 0

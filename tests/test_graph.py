@@ -27,10 +27,11 @@ SOURCE = (
     "caps=video/x-raw,format=I420,width=1920,height=1040,framerate=40/1,pixel-aspect-ratio=1/1,colorimetry=bt709"
 )
 ENCODER = (
-    "x264enc name=encoder tune=zerolatency speed-preset=superfast intra-refresh=true key-int-max=60 "
-    "pass=qual quantizer=10 vbv-buf-capacity=38 threads=1 byte-stream=true"
+    "x264enc name=encoder tune=zerolatency speed-preset=superfast option-string=repeat-headers=0 intra-refresh=true "
+    "key-int-max=60 pass=qual quantizer=10 vbv-buf-capacity=38 threads=1 aud=false"
 )
-PAY = "identity name=sent ! rtph264pay name=pay0 pt=96 mtu=1200 config-interval=-1"
+SENT = "capsfilter name=form caps=video/x-h264,stream-format=avc ! identity name=sent"
+PAY = f"{SENT} ! rtph264pay name=pay0 pt=96 mtu=1200 config-interval=-1 aggregate-mode=zero-latency"
 DECODE = (
     "rtph264depay name=depay ! capsfilter name=units caps=video/x-h264,stream-format=byte-stream,alignment=au "
     "! identity name=received ! capssetter name=colors caps=video/x-h264,colorimetry=bt709 "

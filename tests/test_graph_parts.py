@@ -62,11 +62,11 @@ def test_the_command_line_changes_a_part(conf: UserConf) -> None:
 @pytest.mark.parametrize(
     "words, properties",
     [
-        ((), "tune=zerolatency speed-preset=superfast intra-refresh"),
-        (("graph.effort=high",), "tune=zerolatency speed-preset=veryfast intra-refresh"),
+        ((), "tune=zerolatency speed-preset=superfast option-string=repeat-headers=0 intra-refresh"),
+        (("graph.effort=high",), "tune=zerolatency speed-preset=veryfast option-string=repeat-headers=0 intra-refresh"),
         (
             ("graph=h264_srt", "graph.effort=lowest"),
-            "speed-preset=ultrafast option-string=cabac=1:8x8dct=1:deblock=0,0 intra-refresh",
+            "speed-preset=ultrafast option-string=repeat-headers=0:cabac=1:8x8dct=1:deblock=0,0 intra-refresh",
         ),
         (
             ("graph.effort=low", "graph.efforts.low.preset=faster"),

@@ -33,6 +33,7 @@ from runner.turning import is_restarted_after_gaps
 if TYPE_CHECKING:
     from runner.gst.passed import PassedStream
     from runner.gst.pushed import PushedPictures
+    from runner.gst.repeated_sets import RepeatedSets
     from runner.gst.sound_pipeline import SoundPipeline
     from runner.gst.uplinks import CameraUplinks, VehicleUplinks
     from runner.ros.cameras import SharedPicture
@@ -124,6 +125,7 @@ class CameraPipeline:
         if dropping := pipeline.get_by_name(DROPPING):
             self.knobs.dropped = RateLimit(dropping, float(plan.camera.fps))
         self.knobs.set_now(self._allowed(self._first))
+        self._sets = _repeated_sets(plan, self._sent)
         self._held_up = HeldUp(last)
         self.requests = RequestLimit(last, on_report)
         self._first_packet = BufferProbe(last, self._on_first_packet, in_lists=True)
@@ -319,6 +321,12 @@ class CameraPipeline:
             known = wanted
             self.knobs.turn({"sending": wanted["sending"]})
         return True
+
+
+def _repeated_sets(plan: Plan, sent: Gst.Element | None) -> RepeatedSets | None:
+    from runner.gst.repeated_sets import RepeatedSets
+
+    return RepeatedSets.of(plan, sent)
 
 
 def _count_before(encoder: Gst.Element) -> Gst.Element:

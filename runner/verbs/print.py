@@ -2,9 +2,10 @@
 
 Dry run: prints for each camera the pipelines of vehicle and operator, and the rules' decision for a total of N kbit/s,
 with the reason. Starts nothing and needs no GStreamer. Each line runs as printed: a UDP sink and the matching source
-replace the live system's RTSP server and client, which gst-launch does not have. Passwords are never
-printed: for a camera with `credentials`, add user-id= and user-pw= to rtspsrc. Of several uplinks it says where
-predictions of what each carries come from.
+replace the live system's RTSP server and client, which gst-launch does not have. Start the operator's line first: x264
+states its parameter sets once, and only the vehicle itself repeats them. Passwords are never printed: for a camera
+with `credentials`, add user-id= and user-pw= to rtspsrc. Of several uplinks it says where predictions of what each
+carries come from.
 
 format=yaml shows the composed configuration instead, with the file or the override that each value comes from.
 
