@@ -9,7 +9,7 @@ from helpers import vehicle
 from runner.core.driving import Control, Driving
 from runner.core.events import ViewReported
 from runner.core.state import State
-from runner.core.view import NOWHERE, Seen, united
+from runner.core.view import MAX_PX, NOWHERE, Seen, united
 from runner.operator.seen import StatedView
 from runner.records.reception import ReceptionReport
 from runner.vehicle.views import MAX_RUNS, VALID_S, StatedViews
@@ -74,6 +74,14 @@ def test_what_two_processes_show_is_united_and_one_without_a_view_shows_everythi
     assert at.report(0.1, run=3) == {}
     at.report(0.9)
     assert at.report(1.2, run=2) == {"front": Seen(0, 0, 640, 360, 1280, 720), "rear": QUARTER, "mast": NOWHERE}
+
+
+def test_what_a_magnified_part_and_the_whole_show_together_can_be_reported():
+    """Otherwise the vehicle would refuse the report, and with it what it says of the link."""
+    magnified, whole = Seen(0, 0, 10, 10, 1000, 1000), Seen(0, 0, 1280, 720, 640, 360)
+    view = {"front": united(magnified, whole)}
+    assert view == {"front": Seen(0, 0, 1280, 720, MAX_PX, MAX_PX)}
+    assert view["front"].problem(ROBOT.cameras["front"]) is None
 
 
 def test_what_the_cameras_cannot_show_counts_as_everything():

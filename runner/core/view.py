@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from fractions import Fraction
 from math import ceil
 from typing import Annotated
@@ -52,16 +52,18 @@ class Seen:
 
     def problem(self, camera: Camera) -> str | None:
         """What a camera's image cannot show of it; None: nothing."""
-        lengths = (self.width, self.height, self.screen_width, self.screen_height)
+        for key in KEYS:
+            if type(length := getattr(self, key)) is not int or not 0 <= length <= MAX_PX:
+                return f"{key}: must be an integer from 0 to {MAX_PX}"
         if not self.lies_in(camera):
             return f"must lie inside the image of {camera.width}x{camera.height} px"
+        lengths = (self.width, self.height, self.screen_width, self.screen_height)
         if len({length > 0 for length in lengths}) > 1:
             return "width, height and both sides on the screen: all or none must be 0"
-        if max(lengths) > MAX_PX:
-            return f"no length may be above {MAX_PX} px"
         return None
 
 
+KEYS = tuple(field.name for field in fields(Seen))
 View = Mapping[str, Seen]  # by camera; those not named are seen in full, as large as they are
 NOWHERE = Seen(0, 0, 0, 0, 0, 0)
 
@@ -71,7 +73,8 @@ def united(one: Seen, other: Seen) -> Seen:
     if one.is_empty or other.is_empty:
         return other if one.is_empty else one
     both, scale = enclosing(one.roi, other.roi), max(one.scale, other.scale)
-    return Seen(both.x, both.y, both.width, both.height, ceil(both.width * scale), ceil(both.height * scale))
+    screen = (min(MAX_PX, ceil(length * scale)) for length in (both.width, both.height))  # one may be magnified
+    return Seen(both.x, both.y, both.width, both.height, *screen)
 
 
 def together(views: Iterable[View]) -> View:

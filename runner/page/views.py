@@ -5,19 +5,17 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
 from typing import Any, NamedTuple
 
 from runner.core.events import Attention
 from runner.core.model import Camera
-from runner.core.view import MAX_PX, NOWHERE, Seen, View, united
+from runner.core.view import KEYS, NOWHERE, Seen, View, united
 from runner.operator.seen import StatedView
 from runner.page.viewer import PageViewer
 from runner.page.windows import Windows
 
 VALID_S = 2.0  # what a window has stated holds for so long; it states it again every 0.5 s
 LOOK_S = 0.1  # between two looks at what has expired
-KEYS = tuple(field.name for field in fields(Seen))
 
 
 class _Stated(NamedTuple):
@@ -90,7 +88,4 @@ def _problem_of(camera: Camera, seen: object) -> str | None:
     """What is wrong with a region as a window states it."""
     if not isinstance(seen, Mapping) or set(seen) != set(KEYS):
         return f"must have {', '.join(KEYS)}, and no other key"
-    for key in KEYS:
-        if type(seen[key]) is not int or not 0 <= seen[key] <= MAX_PX:
-            return f"{key}: must be an integer from 0 to {MAX_PX}"
     return Seen(**seen).problem(camera)

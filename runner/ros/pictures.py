@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 from runner.core.intrinsics import Intrinsics, delivered_intrinsics
 from runner.core.model import Camera, Roi
-from runner.core.view import NOWHERE, Seen, View
+from runner.core.view import KEYS, NOWHERE, Seen, View
 from runner.records.vehicle import CameraState
 from runner.ros.inputs import check_names, ros_name
 from runner.ros.process import NodeProcess, check_discovery
 from runner.settings import Setup
 
-SEEN_KEYS = tuple(field.name for field in fields(Seen))
 SEEN_S = 2.0  # what a message says is shown holds for so long
 
 
@@ -98,7 +97,7 @@ class DecodedPictures:
 
 def seen_of(message: Mapping[str, Any], camera: Camera) -> Seen:
     """What a sensor_msgs/CameraInfo states: `roi` of the full image, all zeros for the whole, on width x height px."""
-    x, y, width, height, *screen = (message[key] for key in SEEN_KEYS)
+    x, y, width, height, *screen = (message[key] for key in KEYS)
     if not any(screen):
         return NOWHERE
     return Seen(x, y, width, height, *screen) if width or height else Seen(0, 0, camera.width, camera.height, *screen)
