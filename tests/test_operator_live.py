@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import re
 import time
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from helpers import vehicle
 
-from runner.errors import RunError
+from runner.core.view import NOWHERE, Seen
+from runner.errors import RunError, UserError
 from runner.operator import live
 from runner.operator.live import LiveOperator
+from runner.operator.seen import StatedView
 
 HANGS = "GStreamer hangs: reading the receivers' counters takes more than 10 s"
 
@@ -38,6 +42,31 @@ def operator(hangs: int, notes: list[str], samples: list[Any]) -> LiveOperator:
     )
     log: Any = SimpleNamespace(begin=lambda: None, close=lambda: None)
     return LiveOperator(SimpleNamespace(), station, log, lambda *_on_unit: side)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("view", "problem"),
+    [
+        ({"fron": NOWHERE}, "view: fron: unknown camera, did you mean front?"),
+        ({"front": Seen(0, 0, 2000, 100, 10, 10)}, "must lie inside the image of 1280x720 px"),
+        ({"front": Seen(-1, 0, 10, 10, 10, 10)}, "x: must be an integer from 0 to 65535"),
+        ({"front": Seen(0, 0, 10, 10, 70_000, 10)}, "screen_width: must be an integer from 0 to 65535"),
+        ({"front": Seen(0, 0, 10, 10, 10, 10.5)}, "screen_height: must be an integer from 0 to 65535"),
+        ({"front": Seen(0, 0, 10, 10, 0, 0)}, "all or none must be 0"),
+    ],
+)
+def test_a_program_that_shows_the_impossible_is_told_so(view: dict[str, Seen], problem: str) -> None:
+    stated = StatedView()
+    running = LiveOperator(
+        SimpleNamespace(vehicle=vehicle("vehicle=delivery_robot")),  # type: ignore[arg-type]
+        SimpleNamespace(seen=stated),  # type: ignore[arg-type]
+        SimpleNamespace(),  # type: ignore[arg-type]
+        lambda *_: SimpleNamespace(),  # type: ignore[arg-type,return-value]
+    )
+    running.see({"rear": NOWHERE})
+    with pytest.raises(UserError, match=re.escape(problem)):
+        running.see({"rear": Seen(0, 0, 10, 10, 10, 10), **view})
+    assert stated.view == {"rear": NOWHERE}
 
 
 def test_a_view_survives_a_machine_that_is_overloaded_for_a_while(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,7 +26,7 @@ from runner.core.evidence import REPORT_S
 from runner.core.model import Roi
 from runner.core.view import View
 from runner.drive.log import Log
-from runner.errors import RunError
+from runner.errors import RunError, UserError, suggest
 from runner.metrics.side import SideMetrics
 from runner.operator.log import DriveLog
 from runner.operator.station import Listener, Station, holds_control
@@ -154,7 +154,14 @@ class LiveOperator:
         view   by camera, the region of its full image and the size at which it is used; NOWHERE: nothing of it. Cameras
                that are not named are used in full. None: nothing is stated any more, as without a call
         for_s  how long it holds at most, s; then all is used in full
+        raises UserError if the vehicle has no such camera, or its image no such region; what was stated before holds
         """
+        cameras = self.setup.vehicle.cameras
+        for name, seen in (view or {}).items():
+            if name not in cameras:
+                raise UserError("view", name, None, f"unknown camera{suggest(name, cameras)}")
+            if problem := seen.problem(cameras[name]):
+                raise UserError("view", name, str(seen), problem)
         self.station.seen.state(view, for_s)
 
     def speak(self, samples: bytes, spoken: float, clock: float = 0.0) -> None:
