@@ -288,3 +288,15 @@ def test_new_sizes_take_turns_the_front_and_the_largest_first():
     assert turns[0] == {"front_center", "top_rear"}
     assert [len(changed) for changed in turns] == [2, 4, 6, 8]
     assert last <= 10.4
+
+
+def test_with_a_share_for_the_worst_all_cameras_can_be_switched_off():
+    drive = Drive(*SEEN, *MEASURED, "modes.collective.share_by_quality.worst=0.5")
+    for name in drive.vehicle.cameras:
+        run = drive.accept("camera_switched", camera=name, on=False)
+        assert run.fault is None and not drive[name].sending
+    for name in drive.vehicle.cameras:
+        drive.accept("camera_switched", camera=name, on=True)
+    run = drive.accept("weights_set", weights=dict.fromkeys(drive.vehicle.cameras, 0))
+    assert run.fault is None
+    assert {drive[name].kbps for name in drive.vehicle.cameras} == {drive["rear"].kbps}, "of equal cameras, each"

@@ -76,7 +76,7 @@ def _slope(one: tuple[float, float], other: tuple[float, float]) -> float:
 class Contender:
     """Who takes part in the sharing of a total.
 
-    weight       of its quality, above 0
+    weight       of its quality; 0: it gets no more than the least
     least, most  kbit/s; the least comes first
     """
 
@@ -103,9 +103,9 @@ def best_shares(contenders: Sequence[Contender], total: float, worst: float = 0.
     if (needed := sum(least)) >= total:
         return [total / needed * own for own in least] if needed else least, inf
     steps = _steps(contenders)
-    if not worst:
-        return _bought(contenders, steps, least, total)
     weights = [one.weight for one in contenders]
+    if not worst or not any(weights):
+        return _bought(contenders, steps, least, total)
 
     def floors(level: float) -> list[float]:
         return [min(one.most, max(own, one.curve.needs(level))) for one, own in zip(contenders, least, strict=True)]
