@@ -1,15 +1,19 @@
-"""VP9 in place of packaged x264: how its rate follows, what lost packets cost, processor time.
+"""VP9 in place of packaged x264: how its rate follows a new target, what lost packets cost, processor time.
 
-  python bench/vp9.py CLIP...                  the synthetic drive, and clips; --only rate, size, loss or time
-  python bench/vp9.py --set error-resilient=0 aq-mode=3     other properties of vp9enc
+  python bench/vp9.py CLIP...                            the synthetic drive and clips, seven minutes for each
+  python bench/vp9.py --only rate --set aq-mode=3        other properties of vp9enc
 
-Encoder, payloader, depayloader and decoder are those of GStreamer, one picture after the other; the way between them is
-computed, so nothing depends on how busy the machine is: a link that carries the target and a ninth, 30 ms each way,
-random loss. A missing packet is asked for and awaited as the operator's side does, or (`none`) awaited for 40 ms. A
-browser gets no incomplete picture, as from the page's server. Until a key picture, or x264's refresh wave, has healed
-the picture, 25 reports a second state damage, and the vehicle makes a key picture each half second at most.
-Quality is that of what is on the screen at each picture of the source, 30 ms and two picture intervals after it: a
-picture that was late or lost leaves the one before it there.
+Encoder, payloader, depayloader and decoder are those of GStreamer, one picture after the other; what is between them is
+computed, so that no figure but times depends on how busy the machine is: a link that carries a ninth more than the
+target, 30 ms each way, random loss. The operator's side asks for missing packets and waits for them as
+`runner/gst/repair.py` does, or, without retransmission, for 40 ms. Its browser gets whole pictures only, and a grey one
+in place of an incomplete key picture of H.264, as `read_unit` makes it. Until a key picture or a whole refresh wave has
+healed the damage, 25 reports a second state it, and the vehicle answers with a key picture twice a second at most: with
+new caps, which `vp9enc` takes for a new start, too. (If an event asks for a key picture instead, the picture behind it
+is up to 15 times as large as the mean one.)
+
+Quality is that of what is on the screen 30 ms and two intervals after each picture of the source was captured: where
+that picture is late or lost, one before it.
 """
 
 from __future__ import annotations
@@ -18,9 +22,8 @@ import argparse
 import random
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
 from statistics import fmean
@@ -29,76 +32,84 @@ from typing import NamedTuple
 import numpy as np
 from footage import pictures
 
+from runner.clips import rendered
 from runner.configuration.config import configuration
+from runner.core.commands import KnobValue
 from runner.core.model import Camera
 from runner.graph import compile_graph, launch
 from runner.gst import Gst
+from runner.gst.repair import ATTEMPTS, REORDER_MS
 from runner.h264.access_unit import starts
-from runner.h264.damage import Damage
+from runner.h264.damage import HEAD_BYTES, Damage
+from runner.h264.keyframe import grey_idr
 from runner.plans import render_missing
-from runner.clips import rendered
 from runner.rate_quality.metrics import find_metric
 from runner.turning import assignments, text
+from runner.vehicle.repair import KEY_FRAME_S
 
 SIZES = {(480, 260): 300, (960, 520): 1000}  # px: kbit/s
 RATES = (15, 30)  # Hz
-ONE_WAY_S, WAIT_S, REORDER_S, ATTEMPTS = 0.03, 0.04, 0.005, 3  # s; as `runner.gst.repair`
-REPORT_S, KEY_S = 0.04, 0.5
-CARRIES = 10 / 9  # of the target
-LOSSES = (0.0, 0.005, 0.02)
-SECONDS, SEEDS = 20, (1, 2, 3)
+LINKS = ((0.0, True), (0.02, True), (0.005, False), (0.02, False))  # share of packets lost, whether they are sent again
+ONE_WAY_S, WAIT_S, REPORT_S = 0.03, 0.04, 0.04
+UDP_BYTES = 28  # of headers in front of RTP
+CARRIES = 10 / 9  # times the target
 HIGH, LOW, STEP_S = 2000, 300, 6  # kbit/s; s at each
 PROPERTIES = {  # of vp9enc
     "deadline": 1,
     "cpu-used": 8,
     "end-usage": "cbr",
     "lag-in-frames": 0,
-    "error-resilient": "default",
+    "error-resilient": "default",  # else a lost picture leaves the decoder with other probabilities than the encoder
     "buffer-size": 200,
     "buffer-initial-size": 100,
     "buffer-optimal-size": 100,
-    "max-intra-bitrate": 150,
+    "max-intra-bitrate": 100,
     "keyframe-max-dist": 100_000,
     "threads": 1,
     "tile-columns": 0,
 }
-DEPAY = {
-    "x264": "rtph264depay ! video/x-h264,stream-format=byte-stream,alignment=au",
-    "vp9": "rtpvp9depay",
-}
-DECODE = {"x264": "avdec_h264 max-threads=1", "vp9": "vp9dec threads=1"}
+X264, VP9, ANEW = "x264", "VP9", "VP9, anew"  # the last one starts anew with each lower target
+DEPAYLOADER = {X264: "rtph264depay ! video/x-h264,stream-format=byte-stream,alignment=au", VP9: "rtpvp9depay"}
+DECODER = {X264: "avdec_h264 max-threads=1", VP9: "vp9dec threads=1"}
 
 
 class Case(NamedTuple):
-    """One camera. codec: x264 or vp9."""
+    """One camera and its encoder."""
 
-    codec: str
+    encoder: str
     clip: Path
     size: tuple[int, int]
     fps: int
-    vp9: Mapping[str, object]
+    properties: Mapping[str, object]
+
+    @property
+    def codec(self) -> str:
+        return X264 if self.encoder == X264 else VP9
+
+    @property
+    def name(self) -> str:
+        return f"{self.clip.stem[:15]:15} {self.size[0]:4} px {self.fps} Hz {self.encoder:9}"
 
     def camera(self) -> Camera:
         words = ["vehicle=delivery_robot", "source=test", f"cameras.front.fps={self.fps}"]
-        for key, px in zip(("width_px", "height_px"), self.size, strict=True):
-            words += [f"cameras.front.{key}={px}"]
+        words += [f"cameras.front.{side}_px={px}" for side, px in zip(("width", "height"), self.size, strict=True)]
         words += [f"cameras.front.native={{width_px: {self.size[0]}, height_px: {self.size[1]}, top_px: 0}}"]
-        if self.codec == "vp9":
-            own = ", ".join(f"{key}: {value}" for key, value in self.vp9.items())
+        if self.codec == VP9:
+            own = ", ".join(f"{key}: {value}" for key, value in self.properties.items())
             words += [
                 f"graph.encoder=[{{name: encoder, element: vp9enc, properties: {{{own}}}}}]",
                 "graph.sender=[{name: sent, element: identity},"
                 " {name: pay0, element: rtpvp9pay, properties: {pt: 96, mtu: '{mtu_bytes}'}}]",
                 "graph.knobs.bitrate=[{element: encoder, property: target-bitrate, value: bps}]",
-                "graph.key_frame=event",
                 "graph.efforts=null",
             ]
         return configuration(words, runnable=False).setup().vehicle.cameras["front"]
 
     def frames(self, seconds: float) -> list[bytes]:
-        once = pictures(self.clip, self.size, round(seconds * self.fps), self.fps)
+        most = round(seconds * self.fps)
+        once = pictures(self.clip, self.size, most, self.fps)
         there_and_back = once + once[-2:0:-1]  # a cut would be the clip's, not the drive's
-        return [there_and_back[number % len(there_and_back)] for number in range(round(seconds * self.fps))]
+        return [there_and_back[number % len(there_and_back)] for number in range(most)]
 
 
 class Chain:
@@ -112,11 +123,8 @@ class Chain:
         self._pad.set_active(True)
         segment = Gst.Segment()
         segment.init(Gst.Format.TIME)
-        for event in (
-            Gst.Event.new_stream_start("pushed"),
-            Gst.Event.new_caps(caps),
-            Gst.Event.new_segment(segment),
-        ):
+        opening = Gst.Event.new_stream_start("pushed"), Gst.Event.new_caps(caps), Gst.Event.new_segment(segment)
+        for event in opening:
             self._pad.push_event(event)
 
     def push(self, buffer: Gst.Buffer) -> tuple[list[Gst.Buffer], float]:
@@ -127,27 +135,29 @@ class Chain:
         if flow != Gst.FlowReturn.OK:
             error = self.pipeline.get_bus().pop_filtered(Gst.MessageType.ERROR)
             raise RuntimeError(f"{flow.value_nick}: {error.parse_error() if error else 'no error'}")
-        return self._waiting(), spent
+        return list(self._come()), spent
 
     def end(self) -> list[Gst.Buffer]:
+        """What was left inside."""
         self._pad.push_event(Gst.Event.new_eos())
-        left = self._waiting()
+        left = list(self._come())
         self.pipeline.set_state(Gst.State.NULL)
         return left
 
     def caps(self) -> Gst.Caps:
         return self._last.get_static_pad("sink").get_current_caps()
 
-    def _waiting(self) -> list[Gst.Buffer]:
-        found = []
+    def _come(self) -> Iterator[Gst.Buffer]:
         while sample := self._last.emit("try-pull-sample", 0):
-            found.append(sample.get_buffer())
-        return found
+            yield sample.get_buffer()
 
 
-class Picture(NamedTuple):
-    """An encoded picture: its packets, what the depayloader makes of them, whether a decoder can begin with it, s of
-    the processor."""
+class Encoded(NamedTuple):
+    """A picture: its packets, the unit that a depayloader makes of all of them, and how it begins.
+
+    key    whether a decoder can begin with it
+    spent  s of the processor
+    """
 
     packets: list[Gst.Buffer]
     unit: Gst.Buffer
@@ -159,306 +169,278 @@ class Picture(NamedTuple):
     def size(self) -> int:
         return sum(packet.get_size() for packet in self.packets)
 
+    def grey(self) -> Gst.Buffer | None:
+        """What a browser gets if it is incomplete; None: nothing."""
+        if not (data := grey_idr(self.head) if self.key else None):
+            return None
+        unit = Gst.Buffer.new_wrapped(data)
+        unit.pts, unit.duration = self.unit.pts, self.unit.duration
+        return unit
+
 
 class Encoder:
-    """The vehicle's elements of a camera, from gate to payloader."""
+    """The vehicle's elements of a camera, from gate to payloader, and the depayloader."""
 
-    def __init__(self, case: Case) -> None:
-        self._case, self._camera, self._number, self._ratio = case, case.camera(), 0, False
+    def __init__(self, case: Case, kbps: int) -> None:
+        self._case, self._camera, self._number, self._is_square = case, case.camera(), 0, True
         media = configuration(("vehicle=delivery_robot",), runnable=False).setup().media
         caps = f"video/x-raw,format=I420,width={case.size[0]},height={case.size[1]},framerate={case.fps}/1"
         caps += ",pixel-aspect-ratio=1/1,colorimetry=bt709,interlace-mode=progressive"
-        self.chain = Chain(launch(compile_graph(self._camera, media).vehicle), Gst.Caps.from_string(caps))
-        self.depayloader: Chain | None = None
-        self._sent = self.chain.pipeline.get_by_name("sent").get_static_pad("sink")
-        self.turn("sending", True)
-        self.turn("size", case.size)
+        self._chain = Chain(launch(compile_graph(self._camera, media).vehicle), Gst.Caps.from_string(caps))
+        self._depayloader: Chain | None = None
+        for knob, value in {"sending": True, "size": case.size, "bitrate": kbps}.items():
+            self.turn(knob, value)
 
-    def turn(self, knob: str, value) -> None:
+    def turn(self, knob: str, value: KnobValue) -> None:
         for element, key, filled in assignments(self._camera, knob, value):
-            Gst.util_set_object_arg(self.chain.pipeline.get_by_name(element), key, text(filled))
+            Gst.util_set_object_arg(self._chain.pipeline.get_by_name(element), key, text(filled))
 
-    def ask_for_key(self) -> None:
-        """As `runner.gst.pipeline` does."""
-        from gi.repository import GstVideo
-
-        if self._camera.graph.key_frame == "event":
-            self._sent.push_event(
-                GstVideo.video_event_new_upstream_force_key_unit(Gst.CLOCK_TIME_NONE, True, 0)
-            )
-            return
-        self._ratio = not self._ratio
-        size = self.chain.pipeline.get_by_name("size")
+    def begin_anew(self) -> None:
+        """With a key picture, as `KnobPanel.restart_encoder` does."""
+        self._is_square = not self._is_square
+        size = self._chain.pipeline.get_by_name("size")
         caps = size.get_property("caps").copy()
-        caps.set_value("pixel-aspect-ratio", Gst.Fraction(*((1000, 1001) if self._ratio else (1, 1))))
+        caps.set_value("pixel-aspect-ratio", Gst.Fraction(*((1, 1) if self._is_square else (1000, 1001))))
         size.set_property("caps", caps)
 
-    def encode(self, data: bytes) -> Picture:
+    def encode(self, data: bytes) -> Encoded:
         buffer = Gst.Buffer.new_wrapped(data)
-        buffer.pts, buffer.duration = (
-            self._number * Gst.SECOND // self._case.fps,
-            Gst.SECOND // self._case.fps,
-        )
+        buffer.pts, buffer.duration = self._number * Gst.SECOND // self._case.fps, Gst.SECOND // self._case.fps
         self._number += 1
-        packets, spent = self.chain.push(buffer)
-        self.depayloader = self.depayloader or Chain(DEPAY[self._case.codec], self.chain.caps())
-        (unit,) = [unit for packet in packets for unit in self.depayloader.push(packet)[0]]
-        head = unit.extract_dup(0, min(2048, unit.get_size()))
-        return Picture(packets, unit, head, self._is_key(head), spent)
+        packets, spent = self._chain.push(buffer)
+        self._depayloader = self._depayloader or Chain(DEPAYLOADER[self._case.codec], self._chain.caps())
+        (unit,) = [unit for packet in packets for unit in self._depayloader.push(packet)[0]]
+        head = unit.extract_dup(0, min(HEAD_BYTES, unit.get_size()))
+        # VP9: show_existing_frame and frame_type (bitstream specification, 6.2), of profile 0.
+        key = starts(head, "h264")[0] if self._case.codec == X264 else head[0] & 0x0C == 0
+        return Encoded(packets, unit, head, key, spent)
 
-    def _is_key(self, head: bytes) -> bool:
-        if self._case.codec == "vp9":
-            return head[0] & 0x0C == 0  # show_existing_frame and frame_type (VP9 bitstream, 6.2), profile 0
-        return starts(head, "h264")[0]
+    def decoder(self) -> Chain:
+        """Of what it has encoded."""
+        assert self._depayloader
+        return Chain(DECODER[self._case.codec], self._depayloader.caps())
+
+    def end(self) -> None:
+        self._chain.end()
 
 
-@dataclass
 class Way:
-    """The link and the operator's buffer: when each picture is handed on, or given up."""
+    """The link, and the operator's buffer: when each picture is handed on, or given up."""
 
-    kbps: float
-    loss: float
-    repair: bool
-    seed: int
-    _random: random.Random = field(init=False)
-    _free: float = 0.0  # when the link has sent what it has
-    _handed: float = 0.0
-
-    def __post_init__(self) -> None:
-        self._random = random.Random(self.seed)
+    def __init__(self, kbps: float, loss: float, is_repaired: bool, seed: int) -> None:
+        self._kbps, self._loss, self._is_repaired, self._random = kbps, loss, is_repaired, random.Random(seed)
+        self._free = self._handed = 0.0  # when the link has sent all it has; when the last picture was handed on
 
     def carry(self, packets: Sequence[Gst.Buffer], at: float) -> tuple[float, bool]:
         """When a picture of this time is handed on, and whether it is whole."""
-        whole, arrived = True, at
+        is_whole = True
         for packet in packets:
-            self._free = max(self._free, at) + 8 * (packet.get_size() + 28) / (1000 * self.kbps)
-            due = self._free + ONE_WAY_S
-            came = self._came(due)
-            whole, arrived = whole and came[1], max(arrived, came[0])
-        self._handed = max(self._handed, arrived)
-        return self._handed, whole
+            self._free = max(self._free, at) + 8 * (packet.get_size() + UDP_BYTES) / (1000 * self._kbps)
+            came, has_come = self._arrival(self._free + ONE_WAY_S)
+            self._handed, is_whole = max(self._handed, came), is_whole and has_come
+        return self._handed, is_whole
 
-    def _came(self, due: float) -> tuple[float, bool]:
-        if self._random.random() >= self.loss:
+    def _arrival(self, due: float) -> tuple[float, bool]:
+        if self._random.random() >= self._loss:
             return due, True
-        if not self.repair:
+        if not self._is_repaired:
             return due + WAIT_S, False
         for attempt in range(1, ATTEMPTS + 1):
-            if self._random.random() >= self.loss:
-                return due + attempt * (REORDER_S + 2 * ONE_WAY_S), True
+            if self._random.random() >= self._loss:
+                return due + attempt * (REORDER_MS / 1000 + 2 * ONE_WAY_S), True
         return due + WAIT_S + ATTEMPTS * 2 * ONE_WAY_S, False
 
 
 class Healing:
-    """Whether pictures are damaged, and when the vehicle is asked for a key picture."""
+    """Whether pictures show damage, and when the vehicle is asked for a key picture."""
 
     def __init__(self, codec: str) -> None:
-        self._codec, self._tracked, self._missing = codec, Damage("h264"), False
-        self._arrived: deque[tuple[float, bool]] = deque()
-        self._damaged, self._next, self._last = False, 0.0, -KEY_S
+        self._codec, self._damage, self._is_missing = codec, Damage("h264"), False
+        self._reported: deque[tuple[float, bool]] = deque()
+        self._is_damaged, self._next_report, self._asked = False, 0.0, -KEY_FRAME_S
 
-    def arrived(self, picture: Picture, at: float, whole: bool) -> bool:
-        """Returns whether the picture, which is drawn if it is whole, still shows damage."""
-        if self._codec == "x264":
-            damaged = self._tracked.add(self._missing or not whole, lambda: picture.head, whole=whole)
+    def hand_on(self, picture: Encoded, at: float, is_whole: bool) -> bool:
+        """Returns whether the screen shows damage now."""
+        is_incomplete, self._is_missing = self._is_missing or not is_whole, not is_whole
+        if self._codec == X264:
+            damaged = self._damage.add(is_incomplete, lambda: picture.head, whole=is_whole)
         else:
-            damaged = not whole or (not picture.key and (self._missing or self._tracked.is_damaged))
-            self._tracked.is_damaged = damaged
-        self._missing = not whole
-        self._arrived.append((at, damaged))
+            damaged = not (is_whole and picture.key) and (is_incomplete or self._damage.is_damaged)
+            self._damage.is_damaged = damaged
+        self._reported.append((at, damaged))
         return damaged
 
-    def key_due(self, now: float) -> bool:
-        due = False
-        while self._next + ONE_WAY_S <= now:
-            while self._arrived and self._arrived[0][0] <= self._next:
-                self._damaged = self._arrived.popleft()[1]
-            if self._damaged and self._next + ONE_WAY_S - self._last >= KEY_S:
-                due, self._last = True, self._next + ONE_WAY_S
-            self._next += REPORT_S
-        return due
+    def is_key_due(self, now: float) -> bool:
+        is_due = False
+        while (arrives := self._next_report + ONE_WAY_S) <= now:
+            while self._reported and self._reported[0][0] <= self._next_report:
+                self._is_damaged = self._reported.popleft()[1]
+            if self._is_damaged and arrives - self._asked >= KEY_FRAME_S:
+                is_due, self._asked = True, arrives
+            self._next_report += REPORT_S
+        return is_due
+
+
+class Handed(NamedTuple):
+    """A picture at the operator: when, its luma if it is whole, whether the screen shows damage from then on."""
+
+    at: float
+    picture: bytes | None
+    damaged: bool
 
 
 class Delivered(NamedTuple):
-    """Shares of time; s; quality on the screen."""
+    """damaged, frozen: shares of time; healed_s: mean; key: mean size, as a multiple of the mean picture."""
 
     damaged: float
-    stale: float
-    recovery: float
-    keys: int
-    key_size: float
-    largest: float
-    kbps: float
+    frozen: float
+    healed_s: float
+    key: float
     mssim: float
-    p5: float
     vmaf: float
     encode_ms: float
-    encode_p95: float
+    encode_p95_ms: float
     decode_ms: float
 
 
-def deliver(case: Case, kbps: int, loss: float, repair: bool, seed: int, seconds: float = SECONDS, vmaf=True) -> Delivered:
+def deliver(case: Case, loss: float, is_repaired: bool, seconds: float, seed: int) -> Delivered:
     Gst.init(None)
-    frames, encoder = case.frames(seconds), Encoder(case)
-    encoder.turn("bitrate", kbps)
-    way, healing = Way(kbps * CARRIES, loss, repair, seed), Healing(case.codec)
-    decoder: Chain | None = None
-    shown: dict[int, bytes] = {}
-    numbers: dict[int, int] = {}  # of pictures, by PTS: x264enc moves these
-    handed: list[tuple[float, bool, bool]] = []
-    sizes, keys, spent, decoding = [], [], [], []
-
-    def draw(buffers: Sequence[Gst.Buffer]) -> None:
-        for buffer in buffers:
-            shown[numbers[buffer.pts]] = buffer.extract_dup(0, case.size[0] * case.size[1])
-
+    kbps, frames = SIZES[case.size], case.frames(seconds)
+    encoder, decoder = Encoder(case, kbps), None
+    way, healing = Way(kbps * CARRIES, loss, is_repaired, seed), Healing(case.codec)
+    came: list[tuple[float, int, bool]] = []  # when, PTS, damage
+    decoded: dict[int, bytes] = {}  # by PTS, which x264enc moves
+    keys, encoding, decoding = [], [], []
     for number, data in enumerate(frames):
         now = number / case.fps
-        if healing.key_due(now):
-            encoder.ask_for_key()
+        if healing.is_key_due(now):
+            encoder.begin_anew()
         picture = encoder.encode(data)
-        sizes.append(picture.size)
-        spent.append(picture.spent)
-        if picture.key and number:
-            keys.append(picture.size)
-        decoder = decoder or Chain(DECODE[case.codec], encoder.depayloader.caps())
-        numbers[picture.unit.pts] = number
-        at, whole = way.carry(picture.packets, now)
-        handed.append((at, whole, healing.arrived(picture, at, whole)))
-        if whole:
-            drawn, took = decoder.push(picture.unit)
-            draw(drawn)
-            decoding.append(took)
-    draw(decoder.end())
-    encoder.chain.end()
-    budget = ONE_WAY_S + 2 / case.fps
-    meters = {name: find_metric(name).meter(case.size, Fraction(case.fps)) for name in ("mssim", "vmaf")[: 1 + vmaf]}
-    newest, damaged, stale, on_screen = 0, 0, 0, b""
-    arrived = 0
-    began, recoveries = None, []
-    for number, data in enumerate(frames):
-        while arrived < len(handed) and handed[arrived][0] <= number / case.fps + budget:
-            if handed[arrived][1] and arrived in shown:
-                newest, on_screen = arrived, shown[arrived]
-            arrived += 1
-        hurt = arrived > 0 and handed[arrived - 1][2]
-        damaged += hurt
-        stale += newest < number
-        if hurt and began is None:
-            began = number
-        if not hurt and began is not None:
-            recoveries.append((number - began) / case.fps)
-            began = None
-        for meter in meters.values():
-            meter.add(number, luma(data, case.size), luma(on_screen or bytes(len(data)), case.size))
-    scores = {name: meter.close() for name, meter in meters.items()}
-    steady = sizes[case.fps :]
-    mean = kbps * 125 / case.fps
-    mssim = list(scores["mssim"].values())
+        encoding.append(1000 * picture.spent)
+        keys += [picture.size] if picture.key and number else []
+        at, is_whole = way.carry(picture.packets, now)
+        came.append((at, picture.unit.pts, healing.hand_on(picture, at, is_whole)))
+        decoder = decoder or encoder.decoder()
+        if unit := picture.unit if is_whole else picture.grey():
+            drawn, spent = decoder.push(unit)
+            decoding.append(1000 * spent)
+            decoded |= {each.pts: _luma(each, case.size) for each in drawn}
+    encoder.end()
+    decoded |= {each.pts: _luma(each, case.size) for each in decoder.end()} if decoder else {}
+    handed = [Handed(at, decoded.get(pts), damaged) for at, pts, damaged in came]
+    damaged, frozen, healed_s, scores = _on_screen(case, frames, handed)
     return Delivered(
-        damaged / len(frames),
-        stale / len(frames),
-        fmean(recoveries) if recoveries else 0.0,
-        len(keys),
-        fmean(keys) / mean if keys else 0.0,
-        max(steady) / mean,
-        sum(steady) * 8 / 1000 / (len(steady) / case.fps),
-        fmean(mssim),
-        float(np.percentile(mssim, 5)),
-        fmean(scores["vmaf"].values()) if vmaf else 0.0,
-        1000 * fmean(spent),
-        1000 * float(np.percentile(spent, 95)),
-        1000 * fmean(decoding),
+        damaged,
+        frozen,
+        healed_s,
+        fmean(keys) / (kbps * 125 / case.fps) if keys else 0.0,
+        *scores,
+        fmean(encoding),
+        float(np.percentile(encoding, 95)),
+        fmean(decoding),
     )
 
 
-def luma(picture: bytes, size: tuple[int, int]) -> np.ndarray:
+def _on_screen(
+    case: Case, frames: Sequence[bytes], handed: Sequence[Handed]
+) -> tuple[float, float, float, tuple[float, float]]:
+    """Shares of time, time until healed, and MSSIM and VMAF of what the screen shows when each picture is due."""
+    meters = [find_metric(name).meter(case.size, Fraction(case.fps)) for name in ("mssim", "vmaf")]
+    shown, newest, arrived, damaged = bytes(case.size[0] * case.size[1]), -1, 0, []
+    frozen = 0
+    for number, data in enumerate(frames):
+        due = number / case.fps + ONE_WAY_S + 2 / case.fps
+        while arrived <= number and handed[arrived].at <= due:
+            if picture := handed[arrived].picture:
+                shown, newest = picture, arrived
+            arrived += 1
+        damaged.append(arrived > 0 and handed[arrived - 1].damaged)
+        frozen += newest < number
+        for meter in meters:
+            meter.add(number, *(_rows(each, case.size) for each in (data, shown)))
+    episodes = sum(now and not before for before, now in zip([False, *damaged], damaged, strict=False))
+    mssim, vmaf = (fmean(meter.close().values()) for meter in meters)
+    healed_s = sum(damaged) / case.fps / episodes if episodes else 0.0
+    return sum(damaged) / len(frames), frozen / len(frames), healed_s, (mssim, vmaf)
+
+
+def _luma(picture: Gst.Buffer, size: tuple[int, int]) -> bytes:
+    luma: bytes = picture.extract_dup(0, size[0] * size[1])
+    return luma
+
+
+def _rows(picture: bytes, size: tuple[int, int]) -> np.ndarray:
     return np.frombuffer(picture, np.uint8, size[0] * size[1]).reshape(size[1], size[0])
 
 
 def follow(case: Case) -> str:
-    """A step of the target down and up."""
+    """A step of the target down and up: shares of the new target in the time after it."""
     Gst.init(None)
-    frames, encoder = case.frames(3 * STEP_S), Encoder(case)
-    sizes, keys = [], []
-    for number, data in enumerate(frames):
-        if number % (STEP_S * case.fps) == 0:
-            encoder.turn("bitrate", (HIGH, LOW, HIGH)[number // (STEP_S * case.fps)])
-        picture = encoder.encode(data)
-        sizes.append(picture.size)
-        if picture.key and number:
-            keys.append(number / case.fps)
-    encoder.chain.end()
-
-    def rate(begin: float, end: float, target: int) -> float:
-        part = sizes[round(begin * case.fps) : round(end * case.fps)]
-        return sum(part) * 8 / 1000 / (end - begin) / target
-
-    rows = []
-    for at, target in ((STEP_S, LOW), (2 * STEP_S, HIGH)):
-        part = sizes[at * case.fps : (at + STEP_S) * case.fps]
-        seconds = [rate(at + more, at + more + 1, target) for more in range(1, STEP_S)]
-        rows.append(
-            f"{rate(at, at + .2, target):5.2f} {rate(at, at + .5, target):5.2f} {rate(at, at + 1, target):5.2f}"
-            f" {rate(at + .5, at + 1, target):5.2f} {rate(at + 1, at + 2, target):5.2f}"
-            f"  1 s {min(seconds):.2f}..{max(seconds):.2f}"
-            f"  largest {max(part) * case.fps / 125 / target:.1f} = {max(part) * 8 / target / CARRIES:.0f} ms"
-        )
-    return f"down {rows[0]} | up {rows[1]} | keys {keys}"
+    encoder, sizes = Encoder(case, HIGH), []
+    for number, data in enumerate(case.frames(3 * STEP_S)):
+        step, rest = divmod(number, STEP_S * case.fps)
+        if step and not rest:
+            encoder.turn("bitrate", (HIGH, LOW, HIGH)[step])
+            if case.encoder == ANEW and step == 1:
+                encoder.begin_anew()
+        sizes.append(encoder.encode(data).size)
+    encoder.end()
+    return " | ".join(
+        f"{name}: {_followed(sizes[at * case.fps : (at + STEP_S) * case.fps], case.fps, target)}"
+        for name, at, target in (("down", STEP_S, LOW), ("up", 2 * STEP_S, HIGH))
+    )
 
 
-def cases(clips: Sequence[Path], vp9: Mapping[str, object]) -> list[Case]:
-    return [
-        Case(codec, clip, size, fps, vp9)
-        for clip in clips
-        for size in SIZES
-        for fps in RATES
-        for codec in ("x264", "vp9")
-    ]
+def _followed(sizes: Sequence[int], fps: int, target: int) -> str:
+    per_picture = target * 125 / fps
+
+    def share(begin: float, end: float) -> float:
+        part = sizes[round(begin * fps) : round(end * fps)]
+        return sum(part) / len(part) / per_picture
+
+    seconds = [share(second, second + 1) for second in range(1, STEP_S)]
+    first = f"0.5 s {share(0, 0.5):.2f}, 1 s {share(0, 1):.2f}, then {min(seconds):.2f} to {max(seconds):.2f} a second"
+    return f"{first}, largest {max(sizes) / per_picture:.1f}, {8 * max(sizes) / target / CARRIES:.0f} ms of the link"
 
 
 def synthetic() -> Path:
-    vehicle = configuration(("vehicle=delivery_robot", "source=synthetic", "fps_max=30", "~cameras.rear", "~cameras.mast")).setup().vehicle
+    """The front camera's clip of the synthetic drive."""
+    words = ("vehicle=delivery_robot", "source=synthetic", "fps_max=30", "~cameras.rear", "~cameras.mast")
+    vehicle = configuration(words).setup().vehicle
     render_missing(vehicle, lambda *_: None)
     return Path(rendered(vehicle.cameras["front"]) or "")
-
-
-def named(case: Case) -> str:
-    return f"{case.clip.stem[:12]:12} {case.size[0]:4} {case.fps:2} Hz {case.codec:4}"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("clips", type=Path, nargs="*")
     parser.add_argument("--only", choices=("rate", "loss"))
-    parser.add_argument("--set", nargs="*", default=[])
-    parser.add_argument("--seconds", type=float, default=SECONDS)
-    parser.add_argument("--rates", type=int, nargs="*", default=RATES)
+    parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="properties of vp9enc")
+    parser.add_argument("--seconds", type=float, default=15, help="of each clip, with losses")
+    parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
-    vp9 = {**PROPERTIES, **dict(word.split("=") for word in options.set)}
-    every = [case for case in cases([synthetic(), *options.clips], vp9) if case.fps in options.rates]
+    properties = {**PROPERTIES, **dict(word.split("=") for word in options.set)}
+    places = [(clip, size, fps) for clip in (synthetic(), *options.clips) for size in SIZES for fps in RATES]
     with ProcessPoolExecutor(2) as pool:
         if options.only != "loss":
-            for case, row in zip(every, pool.map(follow, every), strict=True):
-                print(named(case), row, flush=True)
+            cases = [Case(encoder, *place, properties) for place in places for encoder in (X264, VP9, ANEW)]
+            for case, row in zip(cases, pool.map(follow, cases), strict=True):
+                print(case.name, row, flush=True)
         if options.only != "rate":
-            jobs = [
-                (case, loss, repair)
-                for case in every
-                for loss, repair in ((0.0, True), (0.005, True), (0.02, True), (0.005, False), (0.02, False))
+            runs = [
+                (Case(encoder, *place, properties), *link, options.seconds, options.seed)
+                for place in places
+                for link in LINKS
+                for encoder in (X264, VP9)
             ]
-            args = [(case, SIZES[case.size], loss, repair, 1, options.seconds) for case, loss, repair in jobs]
-            for job, row in zip(jobs, pool.map(_deliver, args), strict=True):
-                print(
-                    named(job[0]), f"{job[1]:.1%} {'rtx ' if job[2] else 'none'}",
-                    f"damaged {row.damaged:.3f} stale {row.stale:.3f} rec {row.recovery:.2f} keys {row.keys} {row.key_size:.1f}x"
-                    f" max {row.largest:.1f} kbps {row.kbps:.0f} mssim {row.mssim:.4f} p5 {row.p5:.3f} vmaf {row.vmaf:.1f}"
-                    f" enc {row.encode_ms:.2f}/{row.encode_p95:.2f} dec {row.decode_ms:.2f}", flush=True,
-                )
+            for (case, loss, is_repaired, *_), row in zip(runs, pool.map(_deliver, runs), strict=True):
+                link = f"{loss:.1%} lost, {'sent again' if is_repaired else 'for good'}"
+                figures = ", ".join(f"{key} {value:.3f}" for key, value in row._asdict().items())
+                print(case.name, f"{link:23}", figures, flush=True)
 
 
-def _deliver(arguments) -> Delivered:
-    return deliver(*arguments)
+def _deliver(run: tuple[Case, float, bool, float, int]) -> Delivered:
+    return deliver(*run)
 
 
 if __name__ == "__main__":
