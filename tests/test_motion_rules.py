@@ -92,9 +92,9 @@ def test_in_mode_single_every_picture_is_sent_again(drive):
 
 
 def test_the_headers_of_pictures_that_are_not_sent_leave_bits_to_video():
-    from runner.core.budget import video_kbps
+    from runner.core.budget import unplaced, video_kbps
     from runner.core.frame_rate import slowed
 
     camera = Drive(*WORDS).vehicle.cameras["rear_center"]
-    more, same = (video_kbps((slowed(camera, Fraction(hz)),), Fraction(300)) for hz in (10, 40))
+    more, same = (video_kbps((unplaced(slowed(camera, Fraction(hz))),), Fraction(300)) for hz in (10, 40))
     assert float(more - same) == pytest.approx(30 * 58 * 8 / 1000 / (1 + 58 / 1186), rel=0.01)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from fractions import Fraction
 
@@ -11,8 +12,11 @@ from helpers import Drive, vehicle
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runner.core.budget import on_the_wire, video_kbps, wire_kbps
+from runner.core.budget import on_the_wire, unplaced, video_kbps, wire_kbps
 from runner.core.events import LinkMeasured, LinkState
+from runner.core.model import Camera, Roi
+from runner.core.rules.safe import sent_cameras
+from runner.h264.region import region_unit
 from runner.mqtt.messages import MqttMessage, read_reception, topic
 from runner.records import to_json
 from runner.records.lines import line_from_json, line_to_json
@@ -21,6 +25,7 @@ from runner.schema import MAX_ERRORS
 from runner.vehicle.uplink import MeasuredUplink
 
 ROBOT = vehicle("vehicle=delivery_robot")
+APART = vehicle("vehicle=delivery_robot", "graph.sender.1.properties.aggregate-mode=none")
 NAMES = tuple(ROBOT.cameras)
 REPORT = ReceptionReport(
     at=100.04,
@@ -142,9 +147,10 @@ def test_units_of_unknown_cameras_are_left_out() -> None:
     assert uplink.take(ReceptionReported(1, "me", True, strange)) is None
 
 
+@pytest.mark.parametrize("says", [lambda camera: camera, unplaced])
 @given(video=st.integers(0, 10**5))
-def test_video_and_wire_rates_convert_back_and_forth(video: int) -> None:
-    cameras = tuple(ROBOT.cameras.values())
+def test_video_and_wire_rates_convert_back_and_forth(says: Callable[[Camera], Camera], video: int) -> None:
+    cameras = tuple(map(says, ROBOT.cameras.values()))
     assert video_kbps(cameras, wire_kbps(cameras, Fraction(video))) == video
     assert video_kbps(cameras, Fraction(1)) == 0
 
@@ -152,6 +158,28 @@ def test_video_and_wire_rates_convert_back_and_forth(video: int) -> None:
 def test_headers_of_an_access_unit() -> None:
     graph = ROBOT.cameras["front"].graph
     assert [on_the_wire(graph, size) for size in (1, 1186, 1187, 5000)] == [59, 1244, 1303, 5290]
+
+
+@given(size=st.integers(1, 5000), hz=st.sampled_from([5, 15, 40]), shares=st.booleans())
+def test_that_pictures_say_what_they_show_is_counted(size: int, hz: int, shares: bool) -> None:
+    """Of a small picture in its packet, else in a packet of its own, as with a payloader that puts nothing together."""
+    camera = replace((ROBOT if shares else APART).cameras["rear"], fps=Fraction(hz))
+    stated = len(region_unit(Roi(1000, 1000, 1000, 1000)))
+    is_apart = not shares or size + 2 + 3 + stated > 1186
+    sent = on_the_wire(camera.graph, size) + (on_the_wire(camera.graph, stated) if is_apart else 3 + stated)
+    kbit = Fraction(8 * hz, 1000)
+    bound = wire_kbps((camera,), size * kbit) / kbit
+    assert sent <= bound <= sent + 58 * 3
+    assert bound > wire_kbps((unplaced(camera),), size * kbit) / kbit
+
+
+def test_only_cameras_that_send_a_region_are_counted_so() -> None:
+    drive = connected("mode=single", kbps=6000)
+    before = sent_cameras(drive.vehicle, drive.run.state, {})
+    drive.accept("roi_set", camera="rear", x=0, y=0, width=424, height=240)
+    after = {camera.name: camera.graph.places for camera in sent_cameras(drive.vehicle, drive.run.state, {})}
+    assert not any(camera.graph.places for camera in before)
+    assert [name for name, places in after.items() if places] == ["rear"]
 
 
 # --- the total that follows ------------------------------------------------------------------------------------------
@@ -172,7 +200,7 @@ def measured(drive: Drive, begin: float, kbps: float, seconds: float = 2, **evid
 
 def test_the_total_is_what_the_link_carries_without_headers() -> None:
     drive = connected(kbps=6000)
-    total, cameras = measured(drive, 0.1, 3000), tuple(drive.vehicle.cameras.values())
+    total, cameras = measured(drive, 0.1, 3000), tuple(map(unplaced, drive.vehicle.cameras.values()))
     wire = Fraction(round(drive.run.memory["follow_link", "follow_link"]["belief"].total, 1)).limit_denominator(10)
     assert total == Fraction(int(10 * video_kbps(cameras, wire)), 10)
     assert 0.75 * 3000 < total < 3000

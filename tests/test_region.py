@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from runner.core.budget import REGION_BYTES
 from runner.core.model import Roi
 from runner.h264.access_unit import nal_units, read_unit
 from runner.h264.region import MARK, MOST_BYTES, region_of, region_unit, with_region
@@ -38,6 +39,10 @@ def test_a_region_is_read_back_as_it_was_stated_and_needs_no_escapes(x: int, y: 
 @pytest.mark.parametrize(("region", "length"), [(Roi(0, 0, 16, 16), 11), (Roi(200, 100, 640, 360), 14), (REGION, 14)])
 def test_it_is_small(region: Roi, length: int) -> None:
     assert len(region_unit(region)) == length
+
+
+def test_what_is_counted_of_the_uplink_is_enough() -> None:
+    assert 2 + len(region_unit(Roi(16383, 16383, 16383, 16383))) <= REGION_BYTES
 
 
 @pytest.mark.parametrize("start", [b"\0\0\0\1", b"\0\0\1"])

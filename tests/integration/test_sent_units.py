@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import time
 from contextlib import contextmanager
 from fractions import Fraction
 
+import inside
 import numpy as np
 import pytest
 
 from rig import streaming, until, watching
+from runner.core.budget import unplaced, video_kbps
 from runner.core.commands import Command
 from runner.core.model import Roi
 from runner.h264.access_unit import nal_units, stated_region
@@ -115,3 +118,29 @@ def test_a_clip_that_begins_again_has_key_pictures_with_parameter_sets(tmp_path)
         since = len(keys())
         until(lambda: len(keys()) > since + 4)  # two of each round, at most
         assert all(SPS in key for key in keys()), keys()
+
+
+@pytest.mark.parametrize("wire", [60, 300])  # kbit/s: each picture takes one packet, or several
+def test_a_camera_keeps_to_its_rate_although_its_pictures_say_what_they_show(wire):
+    words = ("vehicle=delivery_robot", "source.elements.0.properties.pattern=snow", "fps_max=15")
+    with streaming(*words, cameras=("rear",)) as (side, setup, (plan,), _), received(plan) as (_, units, packets):
+        camera, sent = setup.vehicle.cameras["rear"], lambda: inside.camera(side, "rear").counters()
+
+        until(lambda: units)
+
+        def on_the_wire(video):
+            """kbit/s over eight seconds of pictures."""
+            knobs = {"size": (160, 90), "roi": Roi(0, 0, 424, 240), "bitrate": int(video)}
+            side.turn([Command("rear", knob, value) for knob, value in knobs.items()])
+            until(lambda: units and stated_region(units[-1]))
+            time.sleep(2)  # until the buffer of the rate control is as full as it stays
+            before = sent()
+            packets.clear()
+            until(lambda: sent().frames >= before.frames + 8 * 15)
+            now, count = sent(), sum(packets.values())
+            header = camera.graph.settings.header_bytes
+            return 8 * 15 / 1000 * (now.bytes - before.bytes + header * count) / (now.frames - before.frames)
+
+        assert on_the_wire(video_kbps((camera,), Fraction(wire))) <= wire
+        if wire == 300:
+            assert on_the_wire(video_kbps((unplaced(camera),), Fraction(wire))) > wire

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from runner.core import allocation, scaling
 from runner.core import follow_link as follow
 from runner.core.belief import LOWEST, Belief
-from runner.core.budget import beside_sound, video_kbps, wire_kbps
+from runner.core.budget import beside_sound, unplaced, video_kbps, wire_kbps
 from runner.core.decision import Draft, UplinkShare
 from runner.core.events import LinkState
 from runner.core.follow_link import FLOOR, Ceiling, Reports
@@ -360,6 +360,7 @@ def sent_cameras(vehicle: Vehicle, state: State, fps: Mapping[str, Fraction]) ->
     fps  of those that send fewer pictures than they have
     """
     sent = {name: slowed(c, fps[name]) if name in fps else c for name, c in vehicle.cameras.items() if state.on[name]}
+    sent |= {name: unplaced(camera) for name, camera in sent.items() if state.rois[name] == camera.full_roi}
     return tuple(camera for name, camera in sent.items() for _ in range(state.copies.get(name, 1)))
 
 
