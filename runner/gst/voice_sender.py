@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 RATE, SAMPLE_BYTES = 48_000, 2  # of what the page sends, one channel
 LATE_S = 0.3  # what has come from the page so much later than usual is not sent: the key may have been released
+UNHEARD_S = 3.0  # the client does not notice that the vehicle has ended its connection: the vehicle's state says so
 RECORDING = 2  # steps after which the client sends
 SILENT_MS = 20  # sent once connected: the client announces its stream when the first packet is there
 
@@ -54,16 +55,23 @@ class VoiceSender:
         self._on_report = partial(on_report, VOICE)
         self._supervised = SupervisedPipeline(plan.sender, self._on_built, self._on_report)
         self._wanted = self._connected = False
+        self._heard_at = 0.0  # when the vehicle last had it, or could not: time.monotonic
         self._steps = 0  # of the client, towards sending
         self._began = 0.0  # this pipeline, time.monotonic
         self._source: Any = None
         self._clock, self._lateness = 0.0, Lateness()
 
-    def follow(self, *, may_speak: bool) -> None:
-        """Be connected, or not, from now on. To be called a few times a second: it notices revoked keys."""
-        later(0, partial(self._follow, may_speak))
+    def follow(self, *, may_speak: bool, is_heard: bool) -> None:
+        """Be connected, or not, from now on. To be called a few times a second: it notices what has ended.
 
-    def _follow(self, may_speak: bool) -> None:
+        is_heard  whether the vehicle states that this operator is connected
+        """
+        later(0, partial(self._follow, may_speak, is_heard))
+
+    def _follow(self, may_speak: bool, is_heard: bool) -> None:
+        now = time.monotonic()
+        if is_heard or not self._connected:
+            self._heard_at = now
         before, self._wanted = self._wanted, may_speak
         if may_speak and not before:
             self._supervised.start()
@@ -72,6 +80,9 @@ class VoiceSender:
             self._supervised.stop()
         elif may_speak and self._login and (withdrawn := self._login.withdrawn()):
             self._supervised.restart(withdrawn)
+        elif now - self._heard_at > UNHEARD_S:
+            self._connected = False
+            self._supervised.restart("the vehicle has ended the connection")
 
     def push(self, samples: bytes, sent: float, clock: float = 0.0) -> None:
         """Send what was spoken; dropped while the vehicle is not connected, and if it is old.

@@ -176,9 +176,13 @@ class LiveOperator:
 
     def _follow_voice(self, voice: VoiceSender, state: VehicleState | None) -> None:
         """Be connected to the vehicle's loudspeaker whenever the vehicle would let this operator speak."""
-        is_open = state is not None and state.voice is not UNSET and state.voice.fault is None
-        driving = state.driving if state else UNSET
-        voice.follow(may_speak=is_open and driving is not UNSET and driving.in_control == self.station.identity)
+        identity, driving = self.station.identity, state.driving if state else UNSET
+        played = UNSET if state is None else state.voice
+        is_open = played is not UNSET and played.fault is None
+        voice.follow(
+            may_speak=is_open and driving is not UNSET and driving.in_control == identity,
+            is_heard=played is not UNSET and played.operator == identity,
+        )
 
     def _follow(self, demand: Demand) -> None:
         with self._following:
@@ -217,7 +221,7 @@ class LiveOperator:
             if thread.ident:
                 thread.join(END_S)
         if self._voice:
-            self._voice.follow(may_speak=False)
+            self._voice.follow(may_speak=False, is_heard=False)
         self.station.close()
         try:
             if self._side:

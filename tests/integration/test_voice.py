@@ -61,11 +61,11 @@ def operator(setup, name, keyring=None, reports=None):
         said.append(": ".join(what))
 
     sender = VoiceSender(voice_plan(setup), report, name, keyring, setup.vehicle.name)
-    sender.follow(may_speak=True)
+    sender.follow(may_speak=True, is_heard=False)
     try:
         yield sender
     finally:
-        sender.follow(may_speak=False)
+        sender.follow(may_speak=False, is_heard=False)
         time.sleep(0.1)
 
 
@@ -143,6 +143,29 @@ def test_nobody_else_is_heard(tmp_path):
             assert written(heard) == silent
     assert f"voice: disconnected {CONTROLLER}, who is no longer in control" in of_vehicle
     assert of_vehicle.count(f"voice: refused 127.0.0.1 ({WATCHER}): {CONTROLLER} is in control") == 1
+
+
+def test_one_whose_connection_the_vehicle_has_ended_connects_again(tmp_path):
+    """As when another process of the same operator has taken its place, and ends; the client does not notice."""
+    heard, reports = tmp_path / "heard", []
+    with loudspeaker(heard) as (side, _, setup), operator(setup, CONTROLLER, reports=reports) as sender:
+        side.give_control([CONTROLLER], CONTROLLER)
+
+        def is_heard():
+            found = side.read_voice().operator == CONTROLLER
+            sender.follow(may_speak=True, is_heard=found)
+            return found
+
+        until(is_heard, every_s=0.1)
+        with operator(setup, CONTROLLER) as other:
+            until(lambda: side.read_voice().operator is None, every_s=0.001)
+            with speaking(other):
+                until(lambda: side.read_voice().speaking)
+        until(lambda: not is_heard(), every_s=0.1)
+        until(is_heard, every_s=0.1)
+        with speaking(sender):
+            until(lambda: side.read_voice().speaking)
+    assert reports[:1] == ["voice: the vehicle has ended the connection"]
 
 
 def test_what_comes_late_is_not_played(tmp_path, monkeypatch):
