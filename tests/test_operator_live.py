@@ -44,6 +44,14 @@ def operator(hangs: int, notes: list[str], samples: list[Any]) -> LiveOperator:
     return LiveOperator(SimpleNamespace(), station, log, lambda *_on_unit: side)  # type: ignore[arg-type]
 
 
+def before_start(stated: StatedView) -> LiveOperator:
+    """An operator of a robot, without streams."""
+    setup: Any = SimpleNamespace(vehicle=vehicle("vehicle=delivery_robot"))
+    station: Any = SimpleNamespace(seen=stated)
+    log: Any = SimpleNamespace()
+    return LiveOperator(setup, station, log, lambda *_: SimpleNamespace())  # type: ignore[arg-type,return-value]
+
+
 @pytest.mark.parametrize(
     ("view", "problem"),
     [
@@ -57,16 +65,25 @@ def operator(hangs: int, notes: list[str], samples: list[Any]) -> LiveOperator:
 )
 def test_a_program_that_shows_the_impossible_is_told_so(view: dict[str, Seen], problem: str) -> None:
     stated = StatedView()
-    running = LiveOperator(
-        SimpleNamespace(vehicle=vehicle("vehicle=delivery_robot")),  # type: ignore[arg-type]
-        SimpleNamespace(seen=stated),  # type: ignore[arg-type]
-        SimpleNamespace(),  # type: ignore[arg-type]
-        lambda *_: SimpleNamespace(),  # type: ignore[arg-type,return-value]
-    )
+    running = before_start(stated)
     running.see({"rear": NOWHERE})
     with pytest.raises(UserError, match=re.escape(problem)):
         running.see({"rear": Seen(0, 0, 10, 10, 10, 10), **view})
     assert stated.view == {"rear": NOWHERE}
+
+
+@pytest.mark.parametrize(
+    ("samples", "spoken", "problem"),
+    [
+        (b"", 1.0, "samples: 0 bytes: must be whole samples of 2 bytes, at least one, at most 1 s of 48000 Hz"),
+        (b"odd", 1.0, "samples: 3 bytes: must be whole samples of 2 bytes"),
+        (bytes(2 * 48_001), 1.0, "samples: 96002 bytes: must be whole samples of 2 bytes"),
+        (b"ab", float("nan"), "spoken: nan: must be s by a clock"),
+    ],
+)
+def test_a_program_that_speaks_what_is_no_voice_is_told_so(samples: bytes, spoken: float, problem: str) -> None:
+    with pytest.raises(UserError, match=re.escape(problem)):
+        before_start(StatedView()).speak(samples, spoken)
 
 
 def test_a_view_survives_a_machine_that_is_overloaded_for_a_while(monkeypatch: pytest.MonkeyPatch) -> None:

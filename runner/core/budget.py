@@ -16,6 +16,7 @@ REGION_BYTES = 18
 
 SOUND = "sound"  # its name among the streams of a vehicle, which no camera then has
 VOICE = "voice"  # likewise of the operator's voice, which takes nothing of the uplink
+VOICE_HZ, SAMPLE_BYTES = 48_000, 2  # of what a page or a program hands over, one channel
 
 
 def sound_kbps(kbps: int, packet_ms: int, header_bytes: int) -> Kbps:

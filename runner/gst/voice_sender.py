@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from gi.repository import Gst, GstRtsp
 
-from runner.core.budget import VOICE
+from runner.core.budget import SAMPLE_BYTES, VOICE, VOICE_HZ
 from runner.gst.srtp import set_master_key, write_keys
 from runner.gst.supervised import SupervisedPipeline
 from runner.gst.timers import later
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from runner.gst.secure import StreamLogin
     from runner.security.keyring import Keyring
 
-RATE, SAMPLE_BYTES = 48_000, 2  # of what the page sends, one channel
 LATE_S = 0.3  # what has come from the page so much later than usual is not sent: the key may have been released
 UNHEARD_S = 3.0  # the client does not notice that the vehicle has ended its connection: the vehicle's state says so
 RECORDING = 2  # steps after which the client sends
@@ -109,7 +108,7 @@ class VoiceSender:
         pipeline.get_bus().connect("message::progress", self._on_progress, pipeline)
         if self._login and (problem := self._login.prepare(pipeline, client)):
             self._on_report(problem)
-        self._source.emit("push-buffer", _buffer(bytes(RATE * SAMPLE_BYTES * SILENT_MS // 1000), 0.0))
+        self._source.emit("push-buffer", _buffer(bytes(VOICE_HZ * SAMPLE_BYTES * SILENT_MS // 1000), 0.0))
 
     def _on_element(self, _pipeline: Gst.Bin, _parent: Gst.Bin, element: Gst.Element) -> None:
         """Of those that the client adds."""
@@ -134,7 +133,7 @@ def _buffer(samples: bytes, at_s: float) -> Gst.Buffer:
     """With its time: when it was spoken, and not when it arrives here."""
     buffer = Gst.Buffer.new_wrapped(samples)
     buffer.pts = round(at_s * Gst.SECOND)
-    buffer.duration = Gst.SECOND * len(samples) // (SAMPLE_BYTES * RATE)
+    buffer.duration = Gst.SECOND * len(samples) // (SAMPLE_BYTES * VOICE_HZ)
     return buffer
 
 

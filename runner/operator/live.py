@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
-from math import inf
+from math import inf, isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,6 +22,7 @@ from msgspec import UNSET
 
 from runner.configuration import agreement
 from runner.configuration.config import configuration
+from runner.core.budget import SAMPLE_BYTES, VOICE_HZ
 from runner.core.evidence import REPORT_S
 from runner.core.model import Roi
 from runner.core.view import View
@@ -53,6 +54,7 @@ STUCK_S = 2.0  # a side that samples nothing for this long hangs
 GIVE_UP_S = 60.0  # after this long it ends; an overloaded machine may recover before
 END_S = 1.0  # how long the last sample may take
 SOONEST_S = 0.01  # between two reports, however often something else is seen
+SPOKEN_S = 1.0  # of voice that a program hands over at a time, at most
 
 
 class LiveOperator:
@@ -170,7 +172,15 @@ class LiveOperator:
         samples  S16LE at 48 kHz of one channel
         spoken   when, s, by any clock that runs steadily
         clock    which one: a number
+        raises   UserError for no sample, half a one, or more than SPOKEN_S: what is spoken must not be heard long after
         """
+        if not 0 < len(samples) <= SPOKEN_S * VOICE_HZ * SAMPLE_BYTES or len(samples) % SAMPLE_BYTES:
+            rule = (
+                f"must be whole samples of {SAMPLE_BYTES} bytes, at least one, at most {SPOKEN_S:g} s of {VOICE_HZ} Hz"
+            )
+            raise UserError("samples", "", f"{len(samples)} bytes", rule)
+        if not isfinite(spoken):
+            raise UserError("spoken", "", str(spoken), "must be s by a clock")
         if self._voice:
             self._voice.push(samples, spoken, clock)
 
