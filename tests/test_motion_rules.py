@@ -5,7 +5,7 @@ from __future__ import annotations
 from fractions import Fraction
 
 import pytest
-from helpers import Drive
+from helpers import Command, Drive
 
 from runner.core.commands import wanted
 from runner.core.frame_rate import sent_rate
@@ -98,3 +98,8 @@ def test_the_headers_of_pictures_that_are_not_sent_leave_bits_to_video():
     camera = Drive(*WORDS).vehicle.cameras["rear_center"]
     more, same = (video_kbps((unplaced(slowed(camera, Fraction(hz))),), Fraction(300)) for hz in (10, 40))
     assert float(more - same) == pytest.approx(30 * 58 * 8 / 1000 / (1 + 58 / 1186), rel=0.01)
+
+
+def test_no_rate_is_zero(tod: Command):
+    result = tod("validate", "modes=motion", "modes.automatic.while_standing.rear_fps=0")
+    assert result.problems == ["command line: modes.automatic.while_standing.rear_fps: 0: must be above 0"]

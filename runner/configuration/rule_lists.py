@@ -64,8 +64,8 @@ def parameters_of(entry: Mapping[str, Any]) -> dict[str, Any]:
 def call_rule(name: str, parameters: Mapping[str, Any]) -> RuleCall:
     """A rule with its parameters checked against the rule's own signature.
 
-    Parameters are numbers >= 0, made exact, in the unit at the end of their name; those like `halve_every_s` are > 0.
-    One whose default is a word is one of the words of its type.
+    Parameters are numbers >= 0, made exact, in the unit at the end of their name; those like `halve_every_s` and
+    `rear_fps` are > 0. One whose default is a word is one of the words of its type.
     raises  ModelError
     """
     found = find_rule(name)
@@ -81,7 +81,7 @@ def call_rule(name: str, parameters: Mapping[str, Any]) -> RuleCall:
             continue
         if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < float("inf"):
             raise ModelError(key, repr(value), "must be a number of 0 or more")
-        if "_every_" in key and value == 0:
+        if value == 0 and ("_every_" in key or key.endswith("_fps")):
             raise ModelError(key, value, "must be above 0")
     for key, parameter in known.items():
         if key not in parameters and parameter.default is inspect.Parameter.empty:
