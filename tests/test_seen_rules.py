@@ -142,7 +142,9 @@ def test_bits_go_to_what_fills_the_screen():
 
 def test_without_measured_quality_demand_shares_the_total():
     drive = Drive(*SEEN)
-    assert "front, rear, mast without measured quality: shared by demand" in drive["front"].reason
+    assert "no camera has measured quality: shared by demand" in drive["front"].reason
+    drive = Drive(*SEEN, *MEASURED[1:])
+    assert "front without measured quality: shared by demand" in drive["rear"].reason
 
 
 def test_floors_and_weights_hold(drive):

@@ -215,9 +215,11 @@ def share_by_quality(
     detail      between measured scales: the bits that a picture needs grow with its scale to this power
     Memory: the cameras given up.
     """
-    lacking = [name for name, own in draft.demand.items() if own and vehicle.cameras[name].rate_quality.quality is None]
+    sent = [name for name, own in draft.demand.items() if own]
+    lacking = [name for name in sent if vehicle.cameras[name].rate_quality.quality is None]
     if lacking:
-        draft = draft.noted(f"{', '.join(lacking)} without measured quality: shared by demand")
+        which = "no camera has" if lacking == sent else f"{', '.join(lacking)} without"
+        draft = draft.noted(f"{which} measured quality: shared by demand")
         return share_above_floors(vehicle, state, draft, memory)
     how = _How(float(kept), float(worst), least_kbps, float(detail))
     floors, slopes = lowest_of_all_copies(vehicle, state), list[float]()
