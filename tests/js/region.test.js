@@ -20,6 +20,17 @@ test("zooming in keeps the point under the pointer", () => {
   assert.deepEqual(zoomed(PART, { x: 720, y: 406 }, 0.5, FULL), { x: 600, y: 338, width: 480, height: 270 }); // a quarter of the way
 });
 
+test("the point stays to within half a px, although regions are in whole px", () => {
+  const share = (at, from, length) => (at - from) / length;
+  for (let factor = 0.5; factor < 1.4; factor += 0.013) {
+    const part = { x: 481, y: 273, width: 641, height: 361 };
+    const point = { x: 481 + 641 * 0.93, y: 273 + 361 * 0.87 };
+    const { x, y, width, height } = zoomed(part, point, factor, FULL);
+    assert.ok(Math.abs(x + share(point.x, part.x, part.width) * width - point.x) <= 0.5 + 1e-9, `${factor}`);
+    assert.ok(Math.abs(y + share(point.y, part.y, part.height) * height - point.y) <= 0.5 + 1e-9, `${factor}`);
+  }
+});
+
 test("zooming out ends at the full image, whatever the aspect ratio", () => {
   assert.deepEqual(zoomed(PART, { x: 480, y: 270 }, 2, FULL), WHOLE);
   assert.deepEqual(zoomed({ x: 0, y: 0, width: 400, height: 540 }, { x: 0, y: 0 }, 3, FULL), { x: 0, y: 0, width: 1200, height: 1080 });

@@ -18,13 +18,13 @@ export function inside({ x, y, width, height }, full) {
 const limit = (value, low, high) => Math.max(low, Math.min(value, high));
 
 /**
- * A region scaled by a factor about a point, which stays where it is. It keeps its aspect ratio until one side reaches the
- * image's; then only the other one grows, up to the full image.
+ * A region scaled by a factor about a point, which stays where it is, to within half a px. It keeps its aspect ratio until
+ * one side reaches the image's; then only the other one grows, up to the full image.
  * @param {Rectangle} region  @param {{x: number, y: number}} point  @param {number} factor  @param {Size} full
  */
 export function zoomed({ x, y, width, height }, point, factor, full) {
   const times = Math.max(factor, SMALLEST / width, SMALLEST / height);
-  const [wide, high] = [Math.min(full.width, width * times), Math.min(full.height, height * times)];
+  const [wide, high] = [Math.min(full.width, Math.round(width * times)), Math.min(full.height, Math.round(height * times))];
   const share = (at, from, length) => limit((at - from) / length, 0, 1);
   const [left, top] = [x + share(point.x, x, width) * (width - wide), y + share(point.y, y, height) * (height - high)];
   return inside({ x: left, y: top, width: wide, height: high }, full);
