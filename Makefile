@@ -2,7 +2,7 @@
 # make test   install what is missing, then everything that CI runs
 # make check  lint, types, import contracts, schemas, unit tests: no GStreamer, no browser
 # make javascript  only the checks of the pages' scripts
-# make soak   long repetitions of faults that a drive must survive, 80 minutes; SOAK=0.1 make soak is a tenth, KEYS=1 encrypts
+# make soak   long repetitions of faults that a drive must survive, 100 minutes; SOAK=0.1 make soak is a tenth, KEYS=1 encrypts
 # make deadspot UPLINK=FILE.csv  two drives over a recorded uplink: the picture of the README
 # make generated  the schemas and types that scripts/schemas makes of classes
 # make everywhere  HEAD on Debian 12, 13 and testing, in root directories made by debootstrap; SYSTEMS="trixie forky" selects

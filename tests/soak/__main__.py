@@ -1,8 +1,8 @@
 """Long repetitions of faults that a drive must survive: signals, stalls, openings, kills, frozen cameras, slow readers,
-new sizes, garbage, reports and links of any kind, clocks that drift apart, outages with keys, addresses that change,
-variants of cameras, bags and players as people own them, and thousands of changes that must leak nothing.
+new sizes, new views, garbage, reports and links of any kind, clocks that drift apart, outages with keys, addresses that
+change, variants of cameras, bags and players as people own them, and thousands of changes that must leak nothing.
 
-    make soak                           everything, about 80 minutes on two cores
+    make soak                           everything, about 100 minutes on two cores
     SOAK=0.1 make soak                  a tenth of it
     SOAK_SEED=7 make soak               repeats the random choices; each run prints its seed
     make soak PARTS="stalls hostile"    some parts only
@@ -38,6 +38,7 @@ import roaming
 import signals
 import sizes
 import stalls
+import views
 
 from rig import CHECKOUT
 
@@ -83,6 +84,7 @@ PARTS: dict[str, Part] = {
     "players": _variants("players"),
     "readers": readers.soak,
     "sizes": sizes.soak,
+    "views": views.soak,
     "hostile": hostile.soak,
     "reports": reports.soak,
     "links": links.soak,

@@ -322,6 +322,7 @@ export class Stream {
     return {
       status: this.status,
       note: noteOf(this),
+      region: this.region.stated(this.shown),
       ...this.counts,
       ...this.decoding.counts,
       error: this.decoding.error,
