@@ -30,7 +30,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from runner.configuration.editors import copies
-from runner.errors import ArgumentError, ConfigError, Problem
+from runner.errors import ArgumentError, ConfigError, Problem, RunError, os_errors_as
 from runner.verbs import Arguments
 from runner.verbs.new_vehicle import vehicle_files
 
@@ -57,7 +57,8 @@ def run(arguments: Arguments) -> int:
     texts = {**(own or (_templates() if everything else {})), **copies()}
     if problems := list(dict.fromkeys(_problems(place, texts))):
         raise ConfigError(problems, "nothing was written")
-    _write(place, texts)
+    with os_errors_as(lambda why: RunError(f"{place}: cannot be written: {why}")):
+        _write(place, texts)
     print("\n".join(str(place / name) for name in texts))
     if own:
         print(f"next: tod-runner print conf={place} vehicle={place.name}; then read {place / 'README.md'}")
