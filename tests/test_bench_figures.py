@@ -166,3 +166,23 @@ def test_cuts_are_apart_and_come_where_the_other_uplink_carries_enough() -> None
     for before, cut in pairwise(planned):
         assert cut.at_s - before.at_s - before.for_s >= two_uplinks.PAUSE_S - 0.01
     assert all(cut.at_s % 100 >= 41 and (cut.at_s + cut.for_s + 2) % 100 >= 40 for cut in planned)
+
+
+@pytest.mark.gst
+def test_vp9_counts_what_a_packet_waits_for_on_its_way() -> None:
+    vp9 = import_module("vp9")
+    packet = SimpleNamespace(get_size=lambda: 1000 - vp9.UDP_BYTES)  # 8 ms of the link
+    assert vp9.Way(1000, 0.0, True, 1).carry([packet] * 2, 1.0) == (pytest.approx(1.046), True)
+    assert vp9.Way(1000, 1.0, False, 1).carry([packet], 0.0) == (pytest.approx(0.078), False), "awaited for 40 ms"
+    assert vp9.Way(1000, 1.0, True, 1).carry([packet], 0.0) == (pytest.approx(0.258), False), "asked for three times"
+
+
+@pytest.mark.gst
+def test_vp9_is_damaged_until_a_whole_key_picture_and_asks_for_one_twice_a_second() -> None:
+    vp9 = import_module("vp9")
+    healing, later, key = vp9.Healing(vp9.VP9), SimpleNamespace(key=False), SimpleNamespace(key=True)
+    seen = [healing.hand_on(*each) for each in ((later, 0.1, True), (later, 0.2, False), (later, 0.3, True))]
+    assert seen == [False, True, True]
+    assert [healing.is_key_due(at) for at in (0.2, 0.3, 0.6, 0.8)] == [False, True, False, True]
+    assert [healing.hand_on(key, 0.9, whole) for whole in (False, True)] == [True, False]
+    assert not healing.is_key_due(2.0)

@@ -19,7 +19,7 @@ import pytest
 from browser import all_live, measure, opened, send, sized, take_control, until, viewing
 from rig import ROBOT_SIZES, SMALL_ROBOT, answers, free_port, needs_browser, process
 
-pytestmark = [pytest.mark.gst, needs_browser, pytest.mark.soak, pytest.mark.alone]
+pytestmark = [pytest.mark.gst, needs_browser, pytest.mark.soak]
 image = pytest.importorskip("PIL.Image")
 cv2 = pytest.importorskip("cv2")
 
@@ -293,13 +293,12 @@ def test_views_that_change_at_random_miss_no_picture_and_mislead_nobody(chromium
         f"{CHANGES} changes; not live: {Counter(marks)}; {changing.partly} of {changing.looks} looks: a part not sent"
     )
     for what in ("presses_px", "places_px", "zooms_px"):
-        print(f"{what}: at most {max(getattr(changing, what)):.2f} of {len(getattr(changing, what))}")
+        print(f"{what}: at most {max(getattr(changing, what), default=0):.2f} of {len(getattr(changing, what))}")
     assert changing.intervals(0) == []
     assert changing.wrong == []
     assert changing.partly > CHANGES / 20
-    assert max(changing.presses_px) <= HALF
-    assert max(changing.zooms_px) <= HALF
-    assert max(changing.places_px) <= HALF
+    assert len(changing.presses_px) > CHANGES / PRESS_EVERY / 2
+    assert max(changing.presses_px + changing.places_px + changing.zooms_px) <= HALF
 
 
 def last_of(watched):
