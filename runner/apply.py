@@ -21,9 +21,7 @@ from runner.gst import TYPELIBS, GLib, Gst
 from runner.gst.arrivals import take_arrivals
 from runner.gst.clocks import captured_at
 from runner.gst.credentials import Login
-from runner.gst.decoders import DecoderWatch
 from runner.gst.glib_thread import GlibThread
-from runner.gst.ip_camera import follow_cameras
 from runner.gst.lost import LostCameras
 from runner.gst.machine import check_machine, stream_problem, with_clip_range, with_video
 from runner.gst.outage import ReportMerger
@@ -43,6 +41,7 @@ from runner.gst.rtspsrc import limit_teardown
 from runner.gst.server import CameraServer
 from runner.gst.supervised import CameraCaller
 from runner.gst.timers import Guarded, every, later
+from runner.gst.unwatched import prepare_source
 from runner.gst.video_files import VideoFile, VideoFiles
 from runner.gst.watched import WatchedSource
 from runner.records.reception import Arrivals, SentFrame, UplinkReceived, UplinkSent
@@ -309,7 +308,7 @@ class VehicleSide:
             source = WatchedSource(plan, self._logins[name], self._left_out[name], report)
             source.install(pipeline, plan)
         else:
-            self._prepare(pipeline, plan, report)
+            prepare_source(pipeline, plan, self._logins[name], self._left_out[name], report)
         if self._video:
             VideoFile(self._video, name, "vehicle", _captured, self._on_report).follow(pipeline)
         return CameraPipeline(
@@ -321,16 +320,6 @@ class VehicleSide:
             source,
             self._uplinks.of(name) if self._uplinks and plan.serves else None,
         )
-
-    def _prepare(self, pipeline: Gst.Bin, plan: Plan, report: Callable[[str], None]) -> None:
-        """Set up a source that is not watched."""
-        login, bus = self._logins[plan.camera.name], (pipeline.get_parent() or pipeline).get_bus()
-        if problem := login.log_in(pipeline):
-            report(problem)
-        if follow_cameras(pipeline, plan, login.accept):
-            login.follow(bus)
-        end = pipeline.get_by_name(plan.source[-1].name).get_static_pad("src")
-        DecoderWatch(pipeline, end, self._left_out[plan.camera.name], report).follow(bus)
 
     def _refusal(self, camera: str) -> str | None:
         """Why a camera must not be asked now: it refuses the login, and would lock the vehicle out."""
