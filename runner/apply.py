@@ -23,7 +23,7 @@ from runner.gst.clocks import captured_at
 from runner.gst.credentials import Login
 from runner.gst.glib_thread import GlibThread
 from runner.gst.lost import LostCameras
-from runner.gst.machine import check_machine, stream_problem, with_clip_range, with_video
+from runner.gst.machine import check_machine, stream_problem, with_clip_range, with_lossless, with_video
 from runner.gst.outage import ReportMerger
 from runner.gst.pipeline import CameraPipeline, OnReport, Openings
 from runner.gst.probes import PassingBuffer
@@ -41,9 +41,8 @@ from runner.gst.rtspsrc import limit_teardown
 from runner.gst.server import CameraServer
 from runner.gst.supervised import CameraCaller
 from runner.gst.timers import Guarded, every, later
-from runner.gst.unwatched import prepare_source
 from runner.gst.video_files import VideoFile, VideoFiles
-from runner.gst.watched import WatchedSource
+from runner.gst.watched import WatchedSource, prepare_source
 from runner.records.reception import Arrivals, SentFrame, UplinkReceived, UplinkSent
 from runner.records.vehicle import CameraReading, SenderStages, SoundReading, VoiceReading
 from runner.settings import Media, Uplink
@@ -54,6 +53,7 @@ if TYPE_CHECKING:
     from runner.gst.encoded_again import read_again
     from runner.gst.first_look import first_look
     from runner.gst.lanes import run_lanes
+    from runner.gst.lossless import LosslessFiles
     from runner.gst.parameter_sets import parameter_set_notes
     from runner.gst.pictures import decode_video
     from runner.gst.received_uplinks import Addresses
@@ -72,6 +72,7 @@ if TYPE_CHECKING:
 __all__ = [
     "LIVE",
     "TYPELIBS",
+    "LosslessFiles",
     "OnSound",
     "OnUnit",
     "OperatorSide",
@@ -103,6 +104,7 @@ __all__ = [
 
 SELDOM = {  # by name, its module
     "RecordingSide": "recording_side",
+    "LosslessFiles": "lossless",
     "OnSound": "sound_receiver",
     "SoundPacket": "sound_receiver",
     "SoundReception": "sound_receiver",
@@ -128,6 +130,7 @@ class VehicleSide:
 
     on_report  called, from another thread, when a camera's pipeline starts, stops or fails
     video      where to store the sent streams; None: nowhere
+    lossless   where to keep whole pictures of the cameras whose plans say so; None: nowhere
     keyring    of this vehicle: viewers authenticate, and everything is encrypted; None: neither
     lost       by camera whose source does not open, why: it is tried again, and started once it does
     uplinks    by name, see `runner.gst.uplinks`; none: the system's routes decide
@@ -151,12 +154,14 @@ class VehicleSide:
         may_listen: Callable[[str], bool] = lambda address: False,
         sound: SoundPlan | None = None,
         voice: VoicePlan | None = None,
+        lossless: LosslessFiles | None = None,
     ) -> None:
         self._on_report, self._video = on_report, video
         kind: Any = uplinks and import_module("runner.gst.uplinks").VehicleUplinks
         self._uplinks = kind(uplinks, on_report, may_listen) if kind else None
         passphrase = keyring.watched_passphrase(lambda what: on_report("keys", what)).get if keyring else None
-        plans = with_clip_range(with_video(plans, video, "vehicle"))
+        plans = with_clip_range(with_lossless(with_video(plans, video, "vehicle"), lossless))
+        self._kept = lossless.cameras(plans, on_report) if lossless else None
         self._lock, self._glib = threading.Lock(), GlibThread()
         self._logins = {p.camera.name: Login(p, partial(on_report, p.camera.name)) for p in plans}
         self._left_out: dict[str, set[str]] = {plan.camera.name: set() for plan in plans}  # decoders
@@ -282,6 +287,8 @@ class VehicleSide:
                 self._server.stop()
 
         self._glib.end(stop)
+        if self._kept:
+            self._kept.stop()
 
     def _read(self, name: str, lost: str | None, copies: int, refused: Mapping[str, str]) -> CameraReading:
         pipeline, refusal = self._pipeline(name), self._refusal(name)
@@ -311,6 +318,8 @@ class VehicleSide:
             prepare_source(pipeline, plan, self._logins[name], self._left_out[name], report)
         if self._video:
             VideoFile(self._video, name, "vehicle", _captured, self._on_report).follow(pipeline)
+        if self._kept:
+            self._kept.follow(name, pipeline)
         return CameraPipeline(
             pipeline,
             plan,

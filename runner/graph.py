@@ -20,7 +20,7 @@ from runner.core.model import (
     Value,
 )
 from runner.errors import suggest
-from runner.settings import Endpoint, Media, Recording
+from runner.settings import Endpoint, Lossless, Media, Recording
 from runner.turning import per_frame_rate, text, turn_elements
 
 _PLAIN_VALUE = re.compile(r"[\w./:,+=@%-]+")
@@ -58,6 +58,13 @@ _FILE_SINK = Element(
     "filesink",
     {"sync": False, "async": False, "enable-last-sample": False, "buffer-mode": "unbuffered"},
 )
+# The branch behind the source keeps whole pictures without loss, see runner/gst/lossless.py. Its gate is closed at
+# first; `arrived` counts the pictures that pass it.
+LOSSLESS = "lossless-"
+_LOSSLESS_TEE = Element(f"{LOSSLESS}tee", "tee", {})
+_LOSSLESS_GATE = Element("gate", "valve", {"drop": True})
+_ARRIVED = Element("arrived", "identity", {})
+_LOSSLESS_SINK = Element("file", "filesink", {"sync": False, "async": False, "enable-last-sample": False})
 _COUNTERS = {"vehicle": "sent", "operator": "received"}  # by side, the identity that the tee follows
 CODECS = ("h264", "h265")  # supported in video files and on the operator's page
 FEEDBACK = "feedback"  # second part of a camera's path on the RTSP server: the same stream, with feedback
@@ -80,6 +87,7 @@ class Plan:
     bag        pictures that are pushed into the first element of the source; None: none
     needs      by element that only the vehicle may have, the package that provides it
     video      whether each side also writes what it sends or receives into a file
+    lossless   how much of its whole pictures the vehicle keeps; None: none
     """
 
     camera: Camera
@@ -96,6 +104,7 @@ class Plan:
     bag: BagTopic | None = None
     needs: Mapping[str, str] = field(default_factory=dict)
     video: bool = False
+    lossless: Lossless | None = None
 
     @property
     def name(self) -> str:
@@ -119,7 +128,14 @@ class Plan:
     @property
     def pipeline(self) -> str:
         """The vehicle's side as GStreamer parses it, before knobs are turned."""
-        return launch((*self.source, *self._teed("vehicle", self.vehicle))) + self._file_branch
+        tee = (_LOSSLESS_TEE,) if self.lossless else ()
+        branch = f" {_LOSSLESS_TEE.name}. ! {launch(self.lossless_elements)}" if self.lossless else ""
+        return launch((*self.source, *tee, *self._teed("vehicle", self.vehicle))) + self._file_branch + branch
+
+    @property
+    def entry(self) -> str:
+        """Name of the element that the source is linked to."""
+        return _LOSSLESS_TEE.name if self.lossless else self.vehicle[0].name
 
     @property
     def server(self) -> str | None:
@@ -144,6 +160,14 @@ class Plan:
         # A reader of the file needs the parameter sets at each keyframe.
         parser = Element("video-parser", f"{codec}parse", {"config-interval": -1})
         return (_FILE_GATE, _FILE_QUEUE, parser, _FILE_MUXER, _FILE_SINK)
+
+    @property
+    def lossless_elements(self) -> tuple[Element, ...]:
+        """Elements between the source and the file that keeps its pictures; none without one."""
+        if not self.lossless:
+            return ()
+        elements = (_LOSSLESS_GATE, _ARRIVED, *_RECORDED, *self.recorder, _LOSSLESS_SINK)
+        return tuple(replace(element, name=f"{LOSSLESS}{element.name}") for element in elements)
 
     @property
     def _file_branch(self) -> str:
@@ -180,20 +204,25 @@ def compile_graph(
     index: int = 0,
     clip: str | None = None,
     recording: Recording | None = None,
+    lossless: Lossless | None = None,
 ) -> Plan:
     """Fill the placeholders of a camera's source and graph.
 
     media      the vehicle's RTSP server
     index      number of the camera in its vehicle, for ports
     clip       path of the rendered clip, if the source renders one and it exists
-    recording  how `record` stores the source's frames
+    recording  how the source's frames are stored without loss
+    lossless   how much of them a drive keeps; None: none
     raises     ModelError for a placeholder without a value, a name that the source shares with a later element, or
-               packets that SRT would cut
+               packets that SRT would cut, and if whole pictures are to be kept of a camera that encodes by itself
     """
     graph, source = camera.graph, camera.source
     recorder = recording.elements if recording and not graph.passes else ()
     _check_names(graph, source, recorder)
     _check_packets(graph)
+    if lossless and graph.passes:
+        rule = "needs raw pictures, but this camera is passed on as it encodes: log.video=true keeps what it sends"
+        raise ModelError("log.lossless", None, rule, "graph.passes")
     values = _values(camera, media, index, clip)
 
     def fill(elements: Iterable[Element], where: str) -> tuple[Element, ...]:
@@ -223,6 +252,7 @@ def compile_graph(
         command=graph.command and _filled_command(graph.command, values),
         bag=bag_topic(camera),
         needs={**source.needs, **graph.needs, **(recording.needs if recording else {})},
+        lossless=lossless,
     )
 
 

@@ -23,7 +23,14 @@ if TYPE_CHECKING:
 def compile_plans(setup: Setup) -> list[Plan]:
     """A plan for each camera, with its rendered clip if there is one."""
     return [
-        compile_graph(camera, setup.media, index, clip=rendered(camera), recording=setup.recording)
+        compile_graph(
+            camera,
+            setup.media,
+            index,
+            clip=rendered(camera),
+            recording=setup.recording,
+            lossless=setup.log.lossless.get(camera.name),
+        )
         for index, camera in enumerate(setup.vehicle.cameras.values())
     ]
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from runner.core.budget import sound_kbps
 from runner.core.model import Camera, Element, Kbps, ModelError, Vehicle, check_unique
+from runner.errors import suggest
 from runner.redact import has_password
 
 if TYPE_CHECKING:
@@ -390,26 +391,58 @@ class Dimensions:
 
 
 @dataclass(frozen=True, slots=True)
+class Lossless:
+    """How much of a camera's whole pictures a drive keeps without loss.
+
+    for_s    length of a part, s; at most every_s
+    every_s  from the beginning of a part to that of the next, s; for_s: they follow one another
+    most_gb  of all parts of a drive, 10^9 bytes
+    """
+
+    for_s: float = 5.0
+    every_s: float = 60.0
+    most_gb: float = 10.0
+
+
+@dataclass(frozen=True, slots=True)
 class LogSettings:
     """What is logged of a drive, and which drives stay.
 
     video      whether that holds the video of every camera
+    lossless   by camera, how much of its whole pictures; no other camera's are kept
     sound      whether the operator's log holds the vehicle's sound
     keep_gb    what the drives of `drives=DIR` may take, 10^9 bytes; None: any size
     keep_days  age from which they are removed; None: none
     """
 
     video: bool = False
+    lossless: Mapping[str, Lossless] = field(default_factory=dict)
     sound: bool = False
     keep_gb: float | None = None
     keep_days: float | None = None
+
+    @staticmethod
+    def of(data: Mapping[str, Any], cameras: Collection[str]) -> LogSettings:
+        """From the section `log` of a configuration.
+
+        raises  ModelError for a camera that is not mounted, and for lengths that contradict each other
+        """
+        kept: dict[str, Lossless] = {}
+        for name, own in data.get("lossless", {}).items():  # older drives have none
+            if name not in cameras:
+                raise ModelError(f"lossless.{name}", repr(name), f"no such camera{suggest(name, cameras)}")
+            kept[name] = one = Lossless(**own)
+            if one.for_s > one.every_s:
+                rule = f"must be at most every_s, {one.every_s:g}"
+                raise ModelError(f"lossless.{name}.for_s", f"{one.for_s:g}", rule, f"lossless.{name}.every_s")
+        return LogSettings(**{**data, "lossless": kept})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Setup:
     """A vehicle, and the settings of its run.
 
-    recording   how `record` stores the frames of every camera
+    recording   how frames are stored without loss, by `record` and by `log.lossless`
     expires_s   age from which the vehicle drops a request, in addition to the round trip
     log         what is logged, and which drives stay
     latency     limit of the speed by latency

@@ -14,7 +14,8 @@ from runner.core.commands import KnobValue
 from runner.core.graph_settings import GraphSettings, KnobTarget
 from runner.core.model import Camera, Element, Graph, ModelError, Roi, Source
 from runner.graph import Plan, compile_graph, launch, rtsp_url, shell
-from runner.settings import Media
+from runner.plans import compile_plans
+from runner.settings import Lossless, Media
 from runner.turning import assignments, text
 
 MEDIA = Media("127.0.0.1", 8554, rtp_ports=(20000, 20999), session_timeout_s=10, max_viewers=1)
@@ -316,3 +317,16 @@ def test_a_knob_that_cannot_offer_the_requested_value() -> None:
     with pytest.raises(ModelError) as refused:
         assignments(replace(LEFT, graph=wrong), "bitrate", 1)
     assert str(refused.value) == "graph.knobs.bitrate: 'left': bitrate offers kbps, bps, controls"
+
+
+def test_whole_pictures_are_kept_in_a_branch_behind_the_source() -> None:
+    words = ("vehicle=delivery_robot", "source=test", "log.lossless={front: {for_s: 9}}")
+    front, rear = compile_plans(setup(*words))[:2]
+    assert front.lossless == Lossless(for_s=9.0, every_s=60.0, most_gb=10.0)
+    assert front.entry == "lossless-tee"
+    assert front.server is not None
+    assert f"! tee name=lossless-tee ! {front.vehicle[0].factory} " in front.server
+    assert "lossless-tee. ! valve name=lossless-gate drop=true ! identity name=lossless-arrived ! queue" in front.server
+    assert "x264enc name=lossless-encoder pass=quant quantizer=0" in front.server
+    assert "lossless" not in f"{rear.server}{front.receiver}{front.recording('/dev/null')}"
+    assert "lossless" not in front.vehicle_line({}), "what a shell runs writes no file"

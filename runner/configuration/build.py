@@ -124,15 +124,16 @@ class Builder:
         self._check_places(built)
         self._check_ports(built, {"media.port": media.port, "control.port": control.port, **listening})
         self._check_rtp_ports(built, media, sound, voice)
+        log = self.part(("log",), lambda data: LogSettings.of(data, mounted or {}))
         for index, camera in enumerate(built.values()):
-            self._check_compiles(camera, media, index, recording)
+            self._check_compiles(camera, media, index, recording, log)
             if camera.source.render:
                 self.attempt(("cameras", camera.name), lambda c=camera: view(c))  # type: ignore[misc]
             if self.runnable:
                 self._check_inputs(camera)
             if camera.source.plays_bags or "clip" in camera.source.placeholders:
                 self._check_files(camera)
-        if self.problems or recording is None:
+        if self.problems or recording is None or log is None:
             return None
         taken = sound.wire_kbps if sound else Kbps(0)
         return Setup(
@@ -142,7 +143,7 @@ class Builder:
             page=page,
             latency=LatencyLimit(**document.get("latency", {})),
             recording=recording,
-            log=LogSettings(**document["log"]),
+            log=log,
             expires_s=float(document["control"]["expires_s"]),
             keys=keys,
             insecure=insecure is True,
@@ -332,12 +333,16 @@ class Builder:
         key = error.key if error.key in camera.mount else f"source.{error.key}"
         self._report(("cameras", camera.name), ModelError(key, error.found, error.rule, "bag", "source.bag"))
 
-    def _check_compiles(self, camera: Camera, media: Media, index: int, recording: Recording | None) -> None:
+    def _check_compiles(
+        self, camera: Camera, media: Media, index: int, recording: Recording | None, log: LogSettings | None
+    ) -> None:
         """Check that everything that source, graph and recording refer to exists."""
         anything = {key: camera.mount.get(key, key) for key in MOUNT_KEYS}
         try:
             # One name for all: identical plans need not be checked against the registry again.
-            plan = compile_graph(replace(camera, name="camera", mount=anything), media, index, recording=recording)
+            named = replace(camera, name="camera", mount=anything)
+            kept = log.lossless.get(camera.name) if log else None
+            plan = compile_graph(named, media, index, recording=recording, lossless=kept)
             for knob, value in SAMPLE_KNOBS.items():
                 assignments(camera, knob, value)
             if self.composed.document["log"]["video"]:

@@ -30,6 +30,7 @@ from runner.records.lines import (
     Ended,
     LinesDropped,
     LinkSample,
+    LosslessBegan,
     Note,
     Record,
     VideoBegan,
@@ -201,6 +202,10 @@ class Log:
     def video(self, camera: str, file: str, captured: float) -> None:
         """A video file has started; `captured`: capture time of its first frame, s since 1970."""
         self.record(VideoBegan(self.now(), camera, file, captured))
+
+    def lossless(self, camera: str, file: str, captured: float) -> None:
+        """A file with whole pictures has started; `captured`: capture time of the first one, s since 1970."""
+        self.record(LosslessBegan(self.now(), camera, file, captured))
 
     def video_shift(self, camera: str, file: str, after_s: float, captured: float) -> None:
         """From a frame on, times in a video file are off by another amount; see `VideoShifted`."""

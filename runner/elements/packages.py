@@ -43,7 +43,9 @@ def missing_plugins(
 ) -> list[str]:
     """One sentence for each known element that streaming needs on these sides and the registry lacks."""
     needed = {"vehicle": (*plan.source, *plan.vehicle), "operator": plan.operator}
-    written = plan.video_elements if isinstance(plan, Plan) else ()
+    written: tuple[Element, ...] = plan.video_elements if isinstance(plan, Plan) else ()
+    if isinstance(plan, Plan) and "vehicle" in sides:
+        written += plan.lossless_elements
     elements = (*(element for side in sides for element in needed[side]), *written)
     return _missing(registry, elements, plan.needs)
 

@@ -12,6 +12,7 @@ from runner.gst.registry import require_plugins
 from runner.gst.source import source_problem
 
 if TYPE_CHECKING:
+    from runner.gst.lossless import LosslessFiles
     from runner.gst.video_files import VideoFiles
     from runner.sound import SoundPlan
     from runner.voice import VoicePlan
@@ -61,6 +62,11 @@ def with_video(plans: Sequence[Plan], video: VideoFiles | None, side: str) -> Se
     plans = [replace(plan, video=True) for plan in plans]
     require_plugins(plans, (side,))
     return plans
+
+
+def with_lossless(plans: Sequence[Plan], files: LosslessFiles | None) -> Sequence[Plan]:
+    """The plans to build: none keeps whole pictures if there is nowhere to keep them."""
+    return plans if files else [replace(plan, lossless=None) for plan in plans]
 
 
 def with_clip_range(plans: Sequence[Plan]) -> Sequence[Plan]:

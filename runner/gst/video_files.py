@@ -11,6 +11,7 @@ from pathlib import Path
 
 from gi.repository import Gst
 
+from runner.graph import LOSSLESS
 from runner.gst.probes import BufferProbe, PassingBuffer, TypeProbe
 
 DIRECTORY = "video"  # below the drive's directory
@@ -19,7 +20,7 @@ _MARK = "video-"  # prefix of the names of the elements that write the file, see
 
 # The file's branch accepts any stream, and must not influence its format or latency. Otherwise an encoder would choose
 # the format that the file prefers, and the stream's sink would hold packets back until the slowest branch is ready.
-_NOT_ASKED = TypeProbe(
+NOT_ASKED = TypeProbe(
     Gst.PadProbeType.QUERY_DOWNSTREAM | Gst.PadProbeType.QUERY_UPSTREAM,
     {
         Gst.QueryType.CAPS: Gst.PadProbeReturn.DROP,  # without an answer the element assumes no limit
@@ -72,7 +73,7 @@ class VideoFile:
         """Watch a newly built pipeline of a plan with `video`."""
         elements = {name: pipeline.get_by_name(f"{_MARK}{name}") for name in ("gate", "queue", "parser", "file")}
         elements["file"].set_locked_state(True)  # not opened with the pipeline, so that it cannot fail the pipeline
-        _NOT_ASKED.add_to(elements["gate"].get_static_pad("sink"))
+        NOT_ASKED.add_to(elements["gate"].get_static_pad("sink"))
         elements["queue"].connect("overrun", self._on_overrun)
         self._probes = (
             BufferProbe(elements["queue"].get_static_pad("src"), self._on_unit),
@@ -80,7 +81,7 @@ class VideoFile:
         )
         for probe in self._probes:
             probe.arm()
-        bus = _outermost(pipeline).get_bus()
+        bus = outermost(pipeline).get_bus()
         bus.enable_sync_message_emission()
         bus.connect("sync-message::error", self._on_error)
 
@@ -104,7 +105,7 @@ class VideoFile:
         self._capture_times.clear()
         parts = pad.get_parent_element().get_parent()
         try:
-            path = _new_file(self._files.directory / DIRECTORY, self._camera, self._side)
+            path = new_file(self._files.directory / DIRECTORY, f"{self._camera}.{self._side}", "ts")
         except OSError as error:
             self._fail(parts, str(error))
             return True
@@ -120,7 +121,8 @@ class VideoFile:
     def _on_error(self, _bus: Gst.Bus, message: Gst.Message) -> None:
         """From the thread in which it occurred, which is still blocked."""
         # A bin that fails to start resets all elements, even locked ones; a file sink without a name then fails.
-        if concerns_file(message) and (self._begun or message.src.get_name() != f"{_MARK}file"):
+        name = message.src.get_name() if message.src else ""
+        if name.startswith(_MARK) and (self._begun or name != f"{_MARK}file"):
             self._fail(message.src.get_parent(), message.parse_error()[0].message)
 
     def _fail(self, parts: Gst.Bin, why: str) -> None:
@@ -140,17 +142,17 @@ class VideoFile:
 
 def concerns_file(message: Gst.Message) -> bool:
     """Whether a message comes from an element that only serves the file."""
-    return bool(message.src) and message.src.get_name().startswith(_MARK)
+    return bool(message.src) and message.src.get_name().startswith((_MARK, LOSSLESS))
 
 
-def _new_file(directory: Path, camera: str, side: str) -> Path:
-    """Create an empty file that did not exist before.
+def new_file(directory: Path, name: str, suffix: str) -> Path:
+    """Create an empty file that did not exist before, with the next free number behind its name.
 
     raises  OSError
     """
     directory.mkdir(parents=True, exist_ok=True)
     for number in count():
-        path = directory / f"{camera}.{side}.{number}.ts"
+        path = directory / f"{name}.{number}.{suffix}"
         try:
             os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
         except FileExistsError:
@@ -159,7 +161,7 @@ def _new_file(directory: Path, camera: str, side: str) -> Path:
     raise AssertionError("numbers never end")
 
 
-def _outermost(element: Gst.Element) -> Gst.Element:
+def outermost(element: Gst.Element) -> Gst.Element:
     while (parent := element.get_parent()) is not None:
         element = parent
     return element

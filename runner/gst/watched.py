@@ -87,7 +87,7 @@ class WatchedSource(Gst.Bin):  # type: ignore[misc]
         for element in plan.source:
             pipeline.remove(pipeline.get_by_name(element.name))
         pipeline.add(self)
-        self.link(pipeline.get_by_name(plan.vehicle[0].name))
+        self.link(pipeline.get_by_name(plan.entry))
 
     @property
     def fault(self) -> str | None:
@@ -323,3 +323,16 @@ class _IdleCheck:
 
     def _on_idle(self) -> None:
         self.is_idle = True
+
+
+def prepare_source(
+    pipeline: Gst.Bin, plan: Plan, login: Login, left_out: set[str], on_report: Callable[[str], None]
+) -> None:
+    """Set up a source that is not watched in a newly built pipeline; the arguments are those of `WatchedSource`."""
+    bus = (pipeline.get_parent() or pipeline).get_bus()
+    if problem := login.log_in(pipeline):
+        on_report(problem)
+    if follow_cameras(pipeline, plan, login.accept):
+        login.follow(bus)
+    end = pipeline.get_by_name(plan.source[-1].name).get_static_pad("src")
+    DecoderWatch(pipeline, end, left_out, on_report).follow(bus)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from functools import partial
+from itertools import groupby
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import TYPE_CHECKING
@@ -42,29 +43,34 @@ LATER_ROUNDS = 0.3  # work that the adaptive plan is expected to add, as a share
 def measure(
     setup: Setup,
     study: Study,
-    sequences: Mapping[str, Footage],
+    sequences: Mapping[str, Sequence[Footage]],
     output: Path,
     progress: Progress,
     on_note: Callable[[str], None],
 ) -> Iterator[str]:
     """Measure and write models; yields a line for each.
 
-    sequences  by camera, its clip, or pictures of a bag
+    sequences  by camera, its clips, or pictures of a bag
     raises     UserError for input that cannot be measured, RunError if a run fails; finished models stay
     """
     metrics = tuple(_metric(study, name) for name in study.metrics)
     cache = Cache(cache_directory() / "points", on_note)
     alone = {name: (name,) for name in sequences if not any(name in members for members in study.pool.values())}
     models = {**alone, **study.pool}
-    inputs = [*study.masks.values(), *(clip for clip in sequences.values() if isinstance(clip, Path))]
+    footage = [clip for own in sequences.values() for clip in own]
+    inputs = [*study.masks.values(), *(clip for clip in footage if isinstance(clip, Path))]
     _check_output(output, models, inputs)
-    clips = {name: survey(path, cache, on_note) for name, path in sequences.items()}
+    clips = {name: [survey(clip, cache, on_note) for clip in own] for name, own in sequences.items()}
     parallel = parallel_tasks(study.parallel)
     with open_executor(study.workers, study.scheduler, parallel) as executor:
         for model, members in models.items():
             screens = _screens(study, [setup.vehicle.cameras[name] for name in members], metrics[0])
             every = (*metrics, *(reduced(metrics[0], factor) for factor in screens))
-            sweeps = [_sweep(setup, study, name, clips[name], every, cache, executor, parallel) for name in members]
+            sweeps = [
+                _sweep(setup, study, name, clip, every, cache, executor, parallel)
+                for name in members
+                for clip in clips[name]
+            ]
             measured = _measure(model, setup.vehicle, study, sweeps, metrics, screens, progress)
             yield _write(measured, output, sweeps)
 
@@ -199,7 +205,7 @@ def _measure(
     return Measured(
         name=name,
         camera=vehicle.cameras[first.name],
-        clips={sweep.name: sweep.clip for sweep in sweeps},
+        clips=dict(_named(sweeps)),
         masks={sweep.name: sweep.mask_digest for sweep in sweeps if sweep.mask_digest},
         encoder={"graph": text, "versions": first.encoder},
         metrics={metric.name: metric.identity for metric in metrics},
@@ -211,8 +217,15 @@ def _measure(
         stride=first.stride,
         points=points,
         choice=choice,
-        notes=[note for sweep in sweeps for note in _notes(vehicle.cameras[sweep.name], sweep.clip)],
+        notes=list(dict.fromkeys(n for sweep in sweeps for n in _notes(vehicle.cameras[sweep.name], sweep.clip))),
     )
+
+
+def _named(sweeps: Sequence[Sweep]) -> Iterator[tuple[str, Clip]]:
+    """Clips by camera; the second and further ones of a camera are numbered."""
+    for camera, own in groupby(sweeps, lambda sweep: sweep.name):
+        for number, sweep in enumerate(own, 1):
+            yield camera if number == 1 else f"{camera} {number}", sweep.clip
 
 
 def _points(

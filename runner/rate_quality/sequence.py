@@ -22,6 +22,7 @@ from runner.rate_quality.recordings import INDEX
 SURVEY_VERSION = 2
 FEWEST_FRAMES = 25
 VIDEO = ".ts"  # suffix of the video that a drive keeps
+LOSSLESS = ".lossless."  # in the name of a file with whole pictures that a drive keeps
 LOSSY = ("jpeg", "h264", "h265")  # formats of pictures in bags
 ARGUMENT = "sequence"  # of the command line, for messages
 Footage = Path | BagTopic  # a clip, or pictures of a bag
@@ -156,7 +157,9 @@ def _bag_form(footage: BagTopic) -> dict[str, Any]:
 
 
 def _is_recording(path: Path) -> bool:
-    """Whether `tod-runner record` made the clip, which is lossless with any codec."""
+    """Whether `tod-runner record` or a drive made the clip, which is lossless with any codec."""
+    if LOSSLESS in path.name:
+        return True
     try:
         cameras = json.loads(path.with_name(INDEX).read_text(encoding="utf-8"))["cameras"]
         return path.name in {camera.get("file") for camera in cameras.values()}

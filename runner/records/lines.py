@@ -55,6 +55,16 @@ class VideoBegan:
 
 
 @dataclass(frozen=True, slots=True)
+class LosslessBegan:
+    """A file with whole pictures of a camera, without loss, has started (`log.lossless`)."""
+
+    t: Time
+    camera: CameraName
+    file: File
+    captured: Annotated[Since1970, "capture time of its first picture, s since 1970"]
+
+
+@dataclass(frozen=True, slots=True)
 class VideoShifted:
     """From a frame on, the offset of times in a video file changes, by a pause or a receiver that smooths them."""
 
@@ -124,6 +134,7 @@ Record = (
     | ReceptionReported
     | Note
     | VideoBegan
+    | LosslessBegan
     | VideoShifted
     | SoundReceived
     | LinkSample
@@ -142,6 +153,7 @@ KINDS: dict[type[Any], str] = {  # value of a line's key `log`
     ReceptionReported: "reception",
     Note: "note",
     VideoBegan: "video",
+    LosslessBegan: "lossless",
     VideoShifted: "video_shift",
     SoundReceived: "sound",
     LinkSample: "link",

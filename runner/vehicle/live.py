@@ -452,6 +452,7 @@ def live_vehicle(
         for found in (*rates, *missing):
             report(found)
         video = apply.VideoFiles(log, drive.video, drive.video_shift) if log and setup.log.video else None
+        lossless = apply.LosslessFiles(log, drive.lossless) if log else None
         side = apply.VehicleSide(
             plans,
             setup.media,
@@ -463,6 +464,7 @@ def live_vehicle(
             partial(may_listen, setup),
             sound,
             voice,
+            lossless,
         )
         ending.callback(side.stop)
         ending.enter_context(_embedded_broker(setup, report))

@@ -15,8 +15,9 @@ The method is defined in conf/study/paper.yaml; its keys may be given without st
 bitrates_kbps= b_full_quality= cpu_cores= pool= masks= metric_every= workers= and others.
 
 DRIVE is a directory that log= wrote: its cameras are measured, in its configuration, on what it has of their whole
-images: what `record` has kept in it, the clips that its sources played, or, as second best, the video as sent, if that
-was whole and of full size (log.video=true). Pictures that were cropped to what the driver saw are refused.
+images: what the vehicle has kept without loss (log.lossless), what `record` has kept in it, the clips that its sources
+played, or, as second best, the video as sent, if that was whole and of full size (log.video=true). Pictures that were
+cropped to what the driver saw are refused.
 
 mount= is a configuration directory of your own: cameras of one kind are measured together, and rate_quality of that
 kind is replaced in CONF/cameras/KIND.yaml, so that conf=CONF vehicle=NAME drives with it; a file of your own is kept as
@@ -75,7 +76,7 @@ def run(arguments: Arguments) -> int:
     from runner.rate_quality.measure import measure
 
     with progress_bar() as progress, signals.interruptible():
-        measured = measure(setup, study, dict(paths), output, progress, say)
+        measured = measure(setup, study, paths, output, progress, say)
         for number, written in enumerate(measured):
             print(written)
             if mount:

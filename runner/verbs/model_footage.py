@@ -22,8 +22,12 @@ if TYPE_CHECKING:
 NO_CLIPS = (".json", ".yaml", ".png", ".pdf")  # suffixes of other files named after a camera
 
 
-def given(arguments: Arguments, setup: Setup, names: Sequence[str]) -> Mapping[str, Footage]:
+def given(arguments: Arguments, setup: Setup, names: Sequence[str]) -> Mapping[str, Sequence[Footage]]:
     """By camera, its clip, or its topic in a bag, as sequence= names it; without it, what its source plays."""
+    return {name: [footage] for name, footage in _given(arguments, setup, names).items()}
+
+
+def _given(arguments: Arguments, setup: Setup, names: Sequence[str]) -> Mapping[str, Footage]:
     path = arguments.path("sequence")
     if path is None:
         return _clips_of_sources(setup, names)
@@ -100,18 +104,24 @@ def _played(plan: Plan) -> Footage | None:
 # --- of a drive -------------------------------------------------------------------------------------------------------
 
 
-def of_drive(drive: Drive, setup: Setup, names: Sequence[str]) -> Mapping[str, Footage]:
+def of_drive(drive: Drive, setup: Setup, names: Sequence[str]) -> Mapping[str, Sequence[Footage]]:
     """By camera, what a drive has of its whole image; says what that is, and which cameras are left out.
 
-    First what `record` has kept in the directory of the drive, then what the source played, then the video as sent.
+    First what the vehicle has kept without loss, then what `record` has kept in the directory of the drive, then what
+    the source played, then the video as sent.
 
     raises  UserError if no camera can be measured
     """
-    recorded = _recorded(drive.path)
-    played = {plan.camera.name: _played(plan) for plan in _plans(setup, names) if plan.bag or plan.loops}
-    found: dict[str, Footage] = {}
+    kept, recorded = _kept(drive), _recorded(drive.path)
+    others = [name for name in names if name not in kept]
+    played = {plan.camera.name: _played(plan) for plan in _plans(setup, others) if plan.bag or plan.loops}
+    found: dict[str, Sequence[Footage]] = {}
     lacking = []
     for name in names:
+        if parts := kept.get(name):
+            found[name] = parts
+            say(f"{name}: measured on {', '.join(each.name for each in parts)}, kept without loss while driving")
+            continue
         footage: Footage | None = recorded.get(name)
         what = f"{recorded[name].name}, recorded without loss" if name in recorded else "what its source played"
         if footage is None:
@@ -122,13 +132,36 @@ def of_drive(drive: Drive, setup: Setup, names: Sequence[str]) -> Mapping[str, F
                 lacking.append(f"{name}: {sent}")
                 continue
             footage, what = sent, f"{sent.name}, as sent: second best, since it is already compressed"
-        found[name] = footage
+        found[name] = [footage]
         say(f"{name}: measured on {what}")
     if not found:
-        rule = f"has no whole pictures of its cameras ({'; '.join(lacking)}): record them with `tod-runner record`"
+        how = "keep some with log.lossless or `tod-runner record`"
+        rule = f"has no whole pictures of its cameras ({'; '.join(lacking)}): {how}"
         raise UserError(str(drive.path), "", None, rule)
     for line in lacking:
         say(f"{line}: left out")
+    return found
+
+
+def _kept(drive: Drive) -> Mapping[str, list[Path]]:
+    """By camera, the files with whole pictures that the vehicle has kept; says which are too short."""
+    from runner.clips import cache_directory
+    from runner.rate_quality.cache import Cache
+    from runner.rate_quality.sequence import ARGUMENT, survey
+    from runner.records.lines import LosslessBegan
+
+    cache = Cache(cache_directory() / "points", say)
+    found: dict[str, list[Path]] = {}
+    for line in drive.sides["vehicle"].of(LosslessBegan) if "vehicle" in drive.sides else ():
+        path = drive.path / line.file
+        if not path.resolve().is_relative_to(drive.path.resolve()) or not path.exists():
+            continue  # a drive may come from anyone, and its user may have removed parts
+        try:
+            survey(path, cache, say)
+        except UserError as error:
+            say(f"{str(error).removeprefix(f'{COMMAND_LINE}: {ARGUMENT}: ')}: left out")
+            continue
+        found.setdefault(line.camera, []).append(path)
     return found
 
 

@@ -85,14 +85,15 @@ def storing_video_at(monkeypatch: Any, directory: Path, device: str, queue_bytes
     queue_bytes  how much may wait for it
     """
     from runner import graph
-    from runner.gst import video_files
+    from runner.gst import lossless, video_files
 
-    def new_file(_directory: Path, camera: str, side: str) -> Path:
-        path = directory / f"{camera}.{side}.ts"
+    def new_file(_directory: Path, name: str, suffix: str) -> Path:
+        path = directory / f"{name}.{suffix}"
         path.symlink_to(device)
         return path
 
-    monkeypatch.setattr(video_files, "_new_file", new_file)
+    for module in (video_files, lossless):
+        monkeypatch.setattr(module, "new_file", new_file)
     monkeypatch.setitem(graph._FILE_QUEUE.properties, "max-size-bytes", queue_bytes)
 
 
