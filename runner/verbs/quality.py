@@ -140,7 +140,9 @@ def _check(recorded: _Recorded, found: Mapping[str, tuple[bool, bool]]) -> None:
     if not found:
         raise UserError(path, "", None, "no camera's video was kept on both sides: drive with log.video=true")
     if not any(scored for scored, _ in found.values()):
-        raise UserError(path, "", None, "no capture times were logged, so nothing can be compared")
+        raise UserError(
+            path, "", None, "nothing can be compared: no capture times were logged, or the videos lack their pictures"
+        )
     if recorded.clips and len({scene for _, scene in found.values()}) > 1:
         _warn(f"{path}: the clips of some cameras are missing: these are compared with the stream as sent")
 

@@ -159,7 +159,7 @@ def test_without_capture_times_nothing_is_compared(tod, drive, tmp_path):
         camera["arrivals"] = [[t, None] for t, _ in camera["arrivals"]]
 
     path = changed(drive, tmp_path / "timeless", timeless)
-    rule = "no capture times were logged, so nothing can be compared"
+    rule = "nothing can be compared: no capture times were logged, or the videos lack their pictures"
     assert tod("quality", str(path)).err.endswith(f"{path}: {rule}\n")
 
 
