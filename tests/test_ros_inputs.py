@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 
 from runner.configuration.config import configuration
 from runner.core.events import parse
+from runner.core.view import Seen, View
 from runner.ros.inputs import input_services, input_topics, ros_name
+from runner.ros.pictures import DecodedPictures
 
 VEHICLE = configuration(["vehicle=delivery_robot"]).vehicle()
 TOPICS, SERVICES = input_topics(VEHICLE), input_services(VEHICLE)
@@ -45,3 +48,19 @@ def test_a_number_must_be_finite():
     for number in (float("nan"), float("inf")):
         with pytest.raises(ValueError, match=f"{number}: must be a number"):
             TOPICS["~/total_kbps"].event({"number": number})
+
+
+def test_a_display_that_shows_the_impossible_is_named_once() -> None:
+    setup = replace(configuration(["vehicle=delivery_robot"]).setup(), insecure=True)
+    reports: list[str] = []
+    views: list[View] = []
+    shown = DecodedPictures(setup, reports.append, lambda view, _for_s: views.append(view))
+    size = {"screen_width": 640, "screen_height": 360}
+    wrong = {"topic": "~/camera/front/seen", "x": 1000, "y": 0, "width": 1000, "height": 720, **size}
+    for _ in range(1000):
+        shown._on_message(wrong, 0)
+    rule = "must lie inside the image of 1280x720 px; it counts as seen in full"
+    assert reports == [f"front: ~/camera/front/seen: {rule}"]
+    assert views[-1] == {}
+    shown._on_message({**wrong, "x": 0}, 0)
+    assert views[-1] == {"front": Seen(0, 0, 1000, 720, 640, 360)}

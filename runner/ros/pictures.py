@@ -14,6 +14,7 @@ from runner.records.vehicle import CameraState
 from runner.ros.inputs import check_names, ros_name
 from runner.ros.process import NodeProcess, check_discovery
 from runner.settings import Setup
+from runner.system.reports import LimitedReports
 
 SEEN_S = 2.0  # what a message says is shown holds for so long
 
@@ -31,7 +32,8 @@ class DecodedPictures:
         check_discovery(setup.ros, setup.insecure)
         check_names(setup.vehicle)
         settings = replace(setup.ros, node=f"{setup.ros.node}_operator")
-        self._cameras, self._report, self._on_seen = setup.vehicle.cameras, on_report, on_seen
+        self._cameras, self._on_seen = setup.vehicle.cameras, on_seen
+        self._report = LimitedReports(on_report)  # a display states what it shows many times a second
         self._topics = {f"~/camera/{ros_name(name)}/seen": name for name in self._cameras}
         self._shown: dict[str, tuple[Seen, float]] = {}  # by camera, and until when: time.monotonic
         self._node = NodeProcess(
@@ -85,7 +87,8 @@ class DecodedPictures:
         camera = self._cameras[self._topics[message["topic"]]]
         shown, now = seen_of(message, camera), time.monotonic()
         if problem := shown.problem(camera):
-            self._report(f"{camera.name}: {message['topic']}: {problem}; it counts as seen in full")
+            topic = message["topic"]
+            self._report(f"{camera.name}: {topic}: {problem}; it counts as seen in full", topic)
             self._shown.pop(camera.name, None)
         else:
             self._shown[camera.name] = shown, now + SEEN_S
