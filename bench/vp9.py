@@ -9,8 +9,7 @@ target, 30 ms each way, random loss. The operator's side asks for missing packet
 `runner/gst/repair.py` does, or, without retransmission, for 40 ms. Its browser gets whole pictures only, and a grey one
 in place of an incomplete key picture of H.264, as `read_unit` makes it. Until a key picture or a whole refresh wave has
 healed the damage, 25 reports a second state it, and the vehicle answers with a key picture twice a second at most: with
-new caps, which `vp9enc` takes for a new start, too. (If an event asks for a key picture instead, the picture behind it
-is up to 15 times as large as the mean one.)
+new caps, which `vp9enc` takes for a new start, too.
 
 Quality is that of what is on the screen 30 ms and two intervals after each picture of the source was captured: where
 that picture is late or lost, one before it.
@@ -53,7 +52,7 @@ LINKS = ((0.0, True), (0.02, True), (0.005, False), (0.02, False))  # share of p
 ONE_WAY_S, WAIT_S, REPORT_S = 0.03, 0.04, 0.04
 UDP_BYTES = 28  # of headers in front of RTP
 CARRIES = 10 / 9  # times the target
-HIGH, LOW, STEP_S = 2000, 300, 6  # kbit/s; s at each
+STEP, STEP_S = (2000, 300), 6  # kbit/s; s at each
 PROPERTIES = {  # of vp9enc
     "deadline": 1,
     "cpu-used": 8,
@@ -68,7 +67,8 @@ PROPERTIES = {  # of vp9enc
     "threads": 1,
     "tile-columns": 0,
 }
-X264, VP9, ANEW = "x264", "VP9", "VP9, anew"  # the last one starts anew with each lower target
+X264, VP9 = "x264", "VP9"
+ANEW, KEY = "VP9, anew", "VP9, key"  # which begins anew with a lower target, or is asked for a key picture by an event
 DEPAYLOADER = {X264: "rtph264depay ! video/x-h264,stream-format=byte-stream,alignment=au", VP9: "rtpvp9depay"}
 DECODER = {X264: "avdec_h264 max-threads=1", VP9: "vp9dec threads=1"}
 
@@ -202,6 +202,13 @@ class Encoder:
         caps = size.get_property("caps").copy()
         caps.set_value("pixel-aspect-ratio", Gst.Fraction(*((1, 1) if self._is_square else (1000, 1001))))
         size.set_property("caps", caps)
+
+    def ask_for_key(self) -> None:
+        """By an event, which x264 answers with a refresh wave."""
+        from gi.repository import GstVideo  # its version is required by `runner.gst`
+
+        event = GstVideo.video_event_new_upstream_force_key_unit(Gst.CLOCK_TIME_NONE, True, 0)
+        self._chain.pipeline.get_by_name("sent").get_static_pad("sink").push_event(event)
 
     def encode(self, data: bytes) -> Encoded:
         buffer = Gst.Buffer.new_wrapped(data)
@@ -373,21 +380,23 @@ def _rows(picture: bytes, size: tuple[int, int]) -> np.ndarray:
     return np.frombuffer(picture, np.uint8, size[0] * size[1]).reshape(size[1], size[0])
 
 
-def follow(case: Case) -> str:
+def follow(case: Case, high: int, low: int) -> str:
     """A step of the target down and up: shares of the new target in the time after it."""
     Gst.init(None)
-    encoder, sizes = Encoder(case, HIGH), []
+    encoder, sizes = Encoder(case, high), []
     for number, data in enumerate(case.frames(3 * STEP_S)):
         step, rest = divmod(number, STEP_S * case.fps)
         if step and not rest:
-            encoder.turn("bitrate", (HIGH, LOW, HIGH)[step])
-            if case.encoder == ANEW and step == 1:
-                encoder.begin_anew()
+            encoder.turn("bitrate", (high, low, high)[step])
+        if (step, rest) == (1, 0) and case.encoder == ANEW:
+            encoder.begin_anew()
+        elif (step, rest) == (1, 0) and case.encoder == KEY:
+            encoder.ask_for_key()
         sizes.append(encoder.encode(data).size)
     encoder.end()
     return " | ".join(
         f"{name}: {_followed(sizes[at * case.fps : (at + STEP_S) * case.fps], case.fps, target)}"
-        for name, at, target in (("down", STEP_S, LOW), ("up", 2 * STEP_S, HIGH))
+        for name, at, target in (("down", STEP_S, low), ("up", 2 * STEP_S, high))
     )
 
 
@@ -415,6 +424,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("clips", type=Path, nargs="*")
     parser.add_argument("--only", choices=("rate", "loss"))
+    parser.add_argument(
+        "--step", nargs=2, type=int, default=STEP, metavar=("HIGH", "LOW"), help="of the target, kbit/s"
+    )
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="properties of vp9enc")
     parser.add_argument("--seconds", type=float, default=15, help="of each clip, with losses")
     parser.add_argument("--seed", type=int, default=1)
@@ -423,8 +435,9 @@ def main() -> None:
     places = [(clip, size, fps) for clip in (synthetic(), *options.clips) for size in SIZES for fps in RATES]
     with ProcessPoolExecutor(2) as pool:
         if options.only != "loss":
-            cases = [Case(encoder, *place, properties) for place in places for encoder in (X264, VP9, ANEW)]
-            for case, row in zip(cases, pool.map(follow, cases), strict=True):
+            cases = [Case(encoder, *place, properties) for place in places for encoder in (X264, VP9, ANEW, KEY)]
+            rates = ([kbps] * len(cases) for kbps in options.step)
+            for case, row in zip(cases, pool.map(follow, cases, *rates), strict=True):
                 print(case.name, row, flush=True)
         if options.only != "rate":
             runs = [
