@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
@@ -11,6 +12,8 @@ from importlib import import_module
 
 from runner.errors import ArgumentError, RunError, UserError, reason
 from runner.system import signals
+
+NEW_OBJECTS = 20_000  # until they are searched for garbage: those of a start stay, and the search takes a tenth of it
 
 # All other modules are imported once signals are handled: an interrupted import would print a traceback.
 
@@ -40,6 +43,8 @@ def main(argv: Sequence[str] | None = None) -> int:
              143 SIGTERM
     """
     _open_standard_streams()
+    if argv is None:
+        gc.set_threshold(NEW_OBJECTS)
     with signals.handled():
         status = _status(list(sys.argv[1:] if argv is None else argv))
         _flush_or_drop()

@@ -16,6 +16,7 @@ import pytest
 from helpers import Command, UserConf, shared_cache
 from hypothesis import settings
 
+from runner.__main__ import NEW_OBJECTS
 from runner.configuration import config
 from runner.configuration.origin import Composed
 
@@ -27,6 +28,10 @@ REGISTRY = Path(tempfile.gettempdir()) / f"gstreamer-registry-of-tests-{os.getui
 settings.register_profile("same", deadline=None, derandomize=True, max_examples=25)
 settings.register_profile("random", deadline=None, derandomize=False, print_blob=True)
 settings.load_profile("same")
+
+
+def pytest_configure() -> None:
+    gc.set_threshold(NEW_OBJECTS)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
