@@ -9,7 +9,7 @@ from fractions import Fraction
 from functools import lru_cache
 
 from runner.core.commands import KnobValue
-from runner.core.graph_settings import GraphSettings
+from runner.core.graph_settings import NEVER_S, GraphSettings
 from runner.core.model import PLACEHOLDER, Camera, Element, Graph, ModelError, Roi, Value
 from runner.dropping import EVERY
 
@@ -17,7 +17,6 @@ from runner.dropping import EVERY
 _COUNT_FRAMES = ("x264enc", "x265enc")
 # Encoders whose rate control makes up for time without pictures, by pictures that are too large.
 _SAVE_UP = ("openh264enc",)
-NEVER_S = 1e6  # between two waves that the encoder begins by itself, where each is asked for
 Assignment = tuple[str, str, Value]  # element, property, value
 
 

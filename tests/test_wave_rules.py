@@ -5,6 +5,9 @@ from __future__ import annotations
 import pytest
 from helpers import Drive
 
+from runner.core.graph_settings import NEVER_S
+from runner.vehicle.repair import KeyFrames
+
 WORDS = ("vehicle=delivery_robot", "mode=collective", "modes.collective.waves_by_loss={loss: 0.01, calm_s: 10}")
 
 
@@ -58,3 +61,33 @@ def test_a_vehicle_without_the_rule_has_its_encoders_make_them():
 def test_who_waits_for_a_wave_waits_for_the_longest_interval(drive):
     settings = drive.vehicle.cameras["rear"].graph.settings
     assert (settings.shortest_wave_s, settings.key_interval_s) == (1.5, 6.0)
+
+
+def test_without_a_longest_interval_there_are_none_without_loss_and_with_loss_as_many_as_it_asks_for():
+    drive = Drive(*WORDS, "graph.longest_wave_s=0")
+    settings = drive.vehicle.cameras["rear"].graph.settings
+    assert (settings.shortest_wave_s, settings.key_interval_s, settings.may_have_no_waves) == (1.5, None, True)
+    assert intervals(drive) == {1.5}
+    drive.accept("operator_connected", t=0)
+    measure(drive, 0, 1, 0.0)
+    assert intervals(drive) == {NEVER_S}
+    assert "no refresh waves: 0 % of the packets lost" in drive["rear"].reason
+    measure(drive, 12, 12.1, 0.0025)
+    assert intervals(drive) == {6.0}
+    measure(drive, 12.1, 12.2, 0.02)
+    assert intervals(drive) == {1.5}
+
+
+def test_key_pictures_are_sent_to_who_asks_for_them_and_more_rarely_to_who_only_watches():
+    drive = Drive(*WORDS, "graph.longest_wave_s=0")
+    drive.accept("operator_connected", t=0)
+    measure(drive, 0, 1, 0.0)
+    frames, decision = KeyFrames(), drive.run.decision
+
+    def sent(t, drives):
+        return frames.to_repair(["rear", "unknown"], decision, t, drives)
+
+    assert [sent(t, True) for t in (1.0, 1.4, 1.5)] == [["rear"], [], ["rear"]]
+    assert [sent(t, False) for t in (2.5, 4.5, 5.0, 7.9)] == [[], ["rear"], [], ["rear"]]
+    with_waves = Drive(*WORDS)
+    assert KeyFrames().to_repair(["rear"], with_waves.run.decision, 1.0, False) == []

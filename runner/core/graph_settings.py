@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+NEVER_S = 1e6  # between two refresh waves: there are none
+
 
 @dataclass(frozen=True, slots=True)
 class KnobTarget:
@@ -44,7 +46,7 @@ class GraphSettings:
     srt_latency_ms     how long SRT may take to repair a loss, its playout delay
     dscp               DiffServ code point of the video packets; -1 leaves it to the system
     key_interval_s     between key frames or refresh waves, at most; fills {key_interval_frames}
-    longest_wave_s     between refresh waves, at most, where a rule sets how often they are asked for
+    longest_wave_s     between refresh waves, at most, where a rule sets how often they are asked for; 0: no limit
     shortest_wave_s    between refresh waves that are asked for, at least; None: the encoder makes them by itself
     vbv_frames         rate control buffer in frames at the bitrate in force; fills {vbv_ms}
     lowest_kbps        to which a camera that encodes by itself can be set
@@ -62,3 +64,8 @@ class GraphSettings:
     shortest_wave_s: float | None = None
     vbv_frames: float | None = None
     lowest_kbps: int = 1
+
+    @property
+    def may_have_no_waves(self) -> bool:
+        """Whether only a key picture, which has to be asked for, makes the picture of a decoder whole that joins."""
+        return self.shortest_wave_s is not None and self.key_interval_s is None

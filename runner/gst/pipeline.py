@@ -75,6 +75,7 @@ class CameraPipeline:
     source     the source, if it is watched
 
     untimed      whether the source does not know when the last picture was captured
+    is_joined    whether a player has begun that waits for a key frame; those who begin within a second get the same one
     uplinks      None: the system's routes decide
     requests     limits what viewers request
     sent_frames  when frames left; None without RTP
@@ -109,6 +110,7 @@ class CameraPipeline:
         self._restarts_after_gaps = is_restarted_after_gaps(plan.camera.graph)
         self._passed = self._passed_stream()
         self._is_gap = False
+        self.is_joined = False
         self._waved = 0.0  # when a refresh wave was asked for last, time.monotonic
         self._pushed: PushedPictures | None = None  # those of a Python program
         self._elements = [pipeline.get_by_name(element.name) for element in plan.vehicle]
@@ -226,6 +228,9 @@ class CameraPipeline:
             self._look_at_rate(now, passed_counts(self._entered)[0])
         if self.sent_frames:
             self.sent_frames.look()
+        if self.is_joined and self.requests.grant_key_unit():
+            self.is_joined = False
+            self.send_key_frame()
         self._ask_for_wave(now)
         if self._passed:
             self._passed.look()

@@ -118,8 +118,8 @@ class Receiver(StreamReceiver):
         self._on_unit, self._on_picture = on_unit, on_picture
         self._regions: deque[tuple[int | None, Roi]] = deque(maxlen=MAX_DECODING)  # by PTS
         self._codec = video_codec(plan.camera.graph)
-        # Of a camera that encodes by itself, others have long received what its pictures refer to.
-        self._joins = plan.camera.graph.passes is not None
+        # Others have long received what the pictures of a camera that encodes by itself, or makes no waves, refer to.
+        self._joins = plan.camera.graph.passes is not None or plan.camera.graph.settings.may_have_no_waves
         self._damage, self._damaged = Damage(self._codec, is_damaged=self._joins), 0
         self._before = Reception()  # counters of earlier pipelines
         self.stopped_at = Reception()  # counters when it was stopped

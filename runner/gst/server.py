@@ -280,8 +280,8 @@ class CameraServer:
         self._left.wake(name)
         # Players without feedback cannot request a key frame, and show nothing before they have seen a whole wave.
         pipeline, joins = self.pipelines.get(name), len(self._clients.watching(name)) > 1
-        if joins and pipeline and not wants_feedback(path(context)) and pipeline.requests.grant_key_unit():
-            pipeline.send_key_frame()
+        if joins and pipeline and not wants_feedback(path(context)):
+            pipeline.is_joined = True
 
     def _on_teardown(self, client: GstRtspServer.RTSPClient, context: GstRtspServer.RTSPContext) -> None:
         connection = self._clients.of(client)

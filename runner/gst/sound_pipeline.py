@@ -43,6 +43,7 @@ class SoundPipeline:
         add_capture_time(payloader)
         last = payloader.get_static_pad("src")
         self.requests = RequestLimit(last, on_report)
+        self.is_joined = False  # is not asked: each packet can be decoded by itself
         NOT_SEEKABLE.add_to(last)
         if plan.repeats:
             end = pipeline.get_by_name(plan.source[-1].name)
@@ -61,9 +62,6 @@ class SoundPipeline:
     def drop_queued_packet(self) -> None:
         """Drop the packet queued for an interleaved viewer, if any."""
         drop_queued_packet(self._pipeline)
-
-    def send_key_frame(self) -> None:
-        """Each packet can be decoded by itself."""
 
 
 class _Repeating:

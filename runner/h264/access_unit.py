@@ -150,8 +150,9 @@ class RecentUnits:
     from a grey one. After a long pause the units before it are gone, so a decoder that starts now shows the last IDR
     where no wave has passed yet; one that has been running does not.
 
-    A camera that encodes by itself (`keyed`) sends a whole key picture now and then. Before the first one there is
-    nothing to begin with, unless it announces refresh waves; nor is there once the last one is too old to be kept.
+    A camera that encodes by itself (`keyed`) sends a whole key picture now and then, one without refresh waves when it
+    is asked for one. Before the first one there is nothing to begin with, unless it announces refresh waves; nor is
+    there once the last one is too old to be kept. Whoever has begun goes on.
 
     Some encoders state their parameter sets only once; then key units are completed by those last seen (H.265).
 
@@ -172,6 +173,7 @@ class RecentUnits:
         self._resumed = -inf  # when the stream went on after its last long pause
         self._is_cut = False  # whether units since the last IDR are no longer stored
         self._has_waves = False  # whether it has announced one since then
+        self._has_begun = False  # whether a decoder has been able to start
 
     def add(self, unit: AccessUnit) -> AccessUnit:
         """Store a received unit; returns it with `exact` set for a decoder that starts from the stored units."""
@@ -188,12 +190,13 @@ class RecentUnits:
             self._key = AccessUnit(grey, None, unit.arrived, key=True, exact=False)
             self._grey_since = unit.arrived
         if self._key is None:
-            return unit._replace(exact=False)
+            return unit._replace(exact=self._has_begun and self._grey_since is None)
+        self._has_begun = True
         self._has_waves |= unit.recovery is not None
         self._since.append(unit)
         self._forget(unit.arrived)
         if not self._since:
-            return unit._replace(exact=False)
+            return unit._replace(exact=self._grey_since is None)
         if self._grey_since is not None and not self._is_refreshing(self._grey_since):
             self._grey_since = None
         if self._grey_since is not None:

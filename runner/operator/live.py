@@ -81,6 +81,7 @@ class LiveOperator:
         self.setup, self.station, self._voice = setup, station, voice
         self._demand, self._following = demand, threading.Lock()
         self._received = frozenset[str]()  # as the demand was last followed
+        self._lacking = frozenset[str]()  # see `lack`
         self._holds = False  # whether this operator held control when the vehicle was last heard
         self.on_dropped: Callable[[Collection[str]], None] = lambda cameras: None  # that are no longer received
         self._log, self._build = log, build
@@ -149,6 +150,10 @@ class LiveOperator:
         with self._following:
             self._demand.ask(cameras, is_open=is_open, now=time.monotonic())
         self._follow(self._demand)
+
+    def lack(self, cameras: Collection[str]) -> None:
+        """Ask for key pictures of these cameras, and no others, until the next call. From any thread."""
+        self._lacking = frozenset(cameras)
 
     def see(self, view: View | None, for_s: float = inf) -> None:
         """State to the vehicle what this program shows, or uses, of each camera; from any thread.
@@ -270,7 +275,12 @@ class LiveOperator:
     def _report_reception(self, side: OperatorSide) -> None:
         is_held_up = self._late.is_excused(time.monotonic())  # other threads first read what has arrived meanwhile
         if not is_held_up and not self.station.link.is_behind():  # else they accumulate for the next report
-            self.station.report_reception(side.take_arrivals())
+            arrivals = side.take_arrivals()
+            if lacking := self._lacking:
+                arrivals = {
+                    uplink: own._replace(damaged=[*lacking.union(own.damaged)]) for uplink, own in arrivals.items()
+                }
+            self.station.report_reception(arrivals)
 
     def _repeat(self, what: str, pause: Callable[[], object], work: Callable[[], None]) -> None:
         """Repeat a piece of work until stopped; an exception must not end the operator's view of a moving vehicle.

@@ -77,6 +77,8 @@ class PageServer(Listener):
                 None: it is served to browsers
     on_voice    called in the page's thread with what its holder speaks, as `LiveOperator.speak`; None: dropped
     on_shown    called in the page's thread with the cameras that all windows show, and whether one of them is a page
+    on_lacking  called in the page's thread, a few times a second, with the cameras of which a window has nothing to
+                begin with before a key picture comes, which only a request brings
     raises      RunError if the port is in use or plotly is not installed
     """
 
@@ -90,7 +92,9 @@ class PageServer(Listener):
         socket: Path | None = None,
         on_shown: Callable[[Collection[str], bool], None] = lambda cameras, is_open: None,
         on_voice: Callable[[bytes, float, float], None] | None = None,
+        on_lacking: Callable[[Collection[str]], None] = lambda cameras: None,
     ) -> None:
+        self._on_lacking = on_lacking
         self._setup, self._station, self._on_counter = setup, station, on_counter
         self._socket, self._on_voice = socket, on_voice
         self._vehicle = vehicle = setup.vehicle
@@ -184,6 +188,7 @@ class PageServer(Listener):
     def _add_sample(self, sample: Sample) -> None:
         self._history.add(sample)
         self._windows.broadcast("sample", {"time": sample.t, **to_json(sample)})
+        self._on_lacking(_lacking(self._vehicle.cameras, self._windows, self._recent))
 
     def _add_note(self, note: Mapping[str, Any]) -> None:
         self._notes.append(note)
@@ -380,9 +385,17 @@ def _hear(windows: Windows, packet: SoundPacket, station: Station) -> None:
             viewer.hear(packet.number, captured, packet.arrived, packet.data)
 
 
+def _lacking(cameras: Mapping[str, Camera], windows: Windows, recent: Sequence[RecentUnits]) -> list[str]:
+    """Cameras that send key pictures on request only, and of which a window has nothing to begin with."""
+    asked = [(index, name) for index, name in enumerate(cameras) if cameras[name].graph.settings.may_have_no_waves]
+    return [name for index, name in asked if any(w.waits(index) for w in windows) and not recent[index].burst()]
+
+
 def _recent(camera: Camera) -> RecentUnits:
     graph = camera.graph
-    return RecentUnits(graph.settings.key_interval_s, video_codec(graph), keyed=graph.passes is not None)
+    interval = graph.settings.key_interval_s or graph.settings.shortest_wave_s
+    keyed = graph.passes is not None or graph.settings.may_have_no_waves
+    return RecentUnits(interval, video_codec(graph), keyed=keyed)
 
 
 async def _send(ws: web.WebSocketResponse, viewer: PageViewer, turn: asyncio.Lock | None) -> None:

@@ -98,6 +98,10 @@ class PageViewer:
             self._queues[camera] = _CameraQueue()
             self._nonempty.set()
 
+    def waits(self, camera: int) -> bool:
+        """Whether it has nothing yet to begin with."""
+        return camera in self._queues and self._queues[camera].needs_burst
+
     async def next(self) -> str | bytes:
         """Wait for the next message to send."""
         while (message := self.pop()) is None:

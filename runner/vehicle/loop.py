@@ -323,8 +323,8 @@ class ControlLoop:
             self._publisher.latency = (t - overdue_s, None if latency_ms is UNSET else latency_ms)
         if link:
             self._take(link)
-        if reported.in_control and item.report.damaged is not UNSET:
-            self.applier.send_key_frames(self._key_frames.to_repair(item.report.damaged, self._run.decision, t))
+        if (lost := item.report.damaged) is not UNSET:
+            self.applier.send_key_frames(self._key_frames.to_repair(lost, self._run.decision, t, reported.in_control))
 
     def _update_presence(self, sender: str, t: float, event: Event | None) -> None:
         """Any message of an operator shows its presence."""

@@ -124,10 +124,23 @@ def _served(
     layouts = Layouts(conf, station.identity if setup.keys else WITHOUT_KEYS)
     if socket:
         page = PageServer(
-            setup, station, layouts=layouts, socket=socket, on_shown=operator.show, on_voice=operator.speak
+            setup,
+            station,
+            layouts=layouts,
+            socket=socket,
+            on_shown=operator.show,
+            on_voice=operator.speak,
+            on_lacking=operator.lack,
         )
     else:
-        page = PageServer(setup, station, keyring=page_keyring(setup), layouts=layouts, on_voice=operator.speak)
+        page = PageServer(
+            setup,
+            station,
+            keyring=page_keyring(setup),
+            layouts=layouts,
+            on_voice=operator.speak,
+            on_lacking=operator.lack,
+        )
     station.listeners.append(page)
     page.start()
     if socket is None:

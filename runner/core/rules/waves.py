@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from fractions import Fraction
-from math import ceil
+from math import ceil, floor
 from typing import NamedTuple
 
 from runner.core.decision import Draft
+from runner.core.graph_settings import NEVER_S
 from runner.core.model import Vehicle, exact, least_float, plain
 from runner.core.rules.registry import Memory, Step, rule
 from runner.core.state import State
@@ -50,8 +51,9 @@ def waves_by_loss(
         memory = {"lost": past}
     share = min(Fraction(1), exact(round(past.share, 4)) / loss) if loss else Fraction(int(past.share > 0))
     intervals = _intervals(vehicle, share)
-    words = ", ".join(f"{plain(each)} s" for each in sorted(set(intervals.values())))
-    note = f"refresh waves every {words}: {100 * past.share:.2g} % of the packets lost"
+    lost = f"{100 * past.share:.2g} % of the packets lost"
+    words = ", ".join(f"{plain(each)} s" for each in sorted(set(intervals.values())) if each < NEVER_S)
+    note = f"refresh waves every {words}: {lost}" if words else f"no refresh waves: {lost}"
     return draft.noted(note, wave_s=intervals) if intervals else draft.replaced(wave_s=intervals), memory
 
 
@@ -60,6 +62,12 @@ def _intervals(vehicle: Vehicle, share: Fraction) -> dict[str, Fraction]:
     found = {}
     for name, camera in vehicle.cameras.items():
         if shortest := camera.graph.settings.shortest_wave_s:
-            least, most = exact(shortest), exact(camera.graph.settings.key_interval_s or shortest)
-            found[name] = max(least, most - STEP_S * ceil(share * (most - least) / STEP_S))
+            found[name] = _interval(exact(shortest), camera.graph.settings.key_interval_s, share)
     return found
+
+
+def _interval(least: Fraction, longest: float | None, share: Fraction) -> Fraction:
+    """longest: None: there may be no waves; then the number of waves goes with the loss, not the time between them."""
+    if longest is None:
+        return max(least, STEP_S * floor(least / share / STEP_S)) if share else exact(NEVER_S)
+    return max(least, exact(longest) - STEP_S * ceil(share * (exact(longest) - least) / STEP_S))
