@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 import yaml
-from helpers import Command, process
+from helpers import CONF, Command, process
 
 from runner.configuration.editors import FOLDER
 from runner.resources import directory
@@ -43,6 +43,13 @@ def test_the_new_directory_is_valid(tod: Command, fleet: Path) -> None:
     status, out, err = tod("print", f"conf={fleet}", "vehicle=my_vehicle", "modes=my_modes", "source=v4l2")
     assert (status, err) == (0, "")
     assert [line.partition(":")[0] for line in out.splitlines() if " kbit/s: " in line] == ["# front", "# rear"]
+
+
+def test_the_rules_are_those_of_the_packaged_modes(fleet: Path) -> None:
+    paths = fleet / "modes" / "my_modes.yaml", CONF / "modes" / "safe.yaml"
+    own, packaged = (yaml.safe_load(path.read_text()) for path in paths)
+    assert own == packaged
+    assert [list(rules) for rules in own.values()] == [list(rules) for rules in packaged.values()]
 
 
 def test_the_checks_run_validate(fleet: Path) -> None:
