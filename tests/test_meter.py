@@ -81,8 +81,19 @@ def test_windows_are_not_compared_while_nothing_is_sent() -> None:
 def test_a_new_decision_has_time_to_settle() -> None:
     meter = ReceptionMeter(fps=20)
     for sample in range(13):
-        meter.add(sample / 4, Counters(5 * sample, 25_000 * sample), Decided(kbps=800 + sample // 4))
+        meter.add(sample / 4, Counters(5 * sample, 25_000 * sample), Decided(fps=20.0 + sample // 4))
     assert meter.windows == 0
+
+
+def test_a_bitrate_that_follows_the_link_hides_neither_latency_nor_missing_frames() -> None:
+    meter = ReceptionMeter(fps=20)
+    for sample in range(20):
+        meter.add(sample / 4, Counters(2 * sample, 25_000 * sample), Decided(kbps=800 + sample // 4))
+    assert (meter.windows, meter.short, meter.sized, meter.sizes) == (4, 4, 4, {(480, 260): 4})
+    assert (list(meter.latencies_ms), list(meter.followed)) == ([12.0] * 4, [])
+    for sample in range(20, 32):
+        meter.add(sample / 4, Counters(5 * sample, 25_000 * sample), Decided(width=480 + 2 * sample))
+    assert (meter.windows, meter.sized, list(meter.followed)) == (7, 4, [])
 
 
 def test_memory_does_not_grow_for_weeks() -> None:

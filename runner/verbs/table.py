@@ -171,7 +171,7 @@ def _summary(meter: ReceptionMeter, sample: Any) -> dict[str, str]:
         f"{meter.fps:g}",
         f"{meter.short} of {meter.windows}",
         _share(middle(meter.followed)),
-        f"{sum(meter.sizes.values())} of {meter.windows}",
+        f"{sum(meter.sizes.values())} of {meter.sized}",
         str(len(meter.sizes)),
         _number(middle(meter.latencies_ms)),
         _number(percentile(meter.latencies_ms, 0.95)),
