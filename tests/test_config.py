@@ -118,6 +118,28 @@ def test_a_users_file_shadows_only_the_packaged_file_of_its_name(conf: UserConf)
     assert vehicle().cameras["front_center"].rate_quality.b_full == 5000
 
 
+def test_a_file_that_is_added_changed_or_removed_counts_at_once(conf: UserConf) -> None:
+    """Although what choices compose is kept."""
+
+    def kbps() -> float:
+        document = configuration(["source=test", "pqos=mine", "fps_max=7"], conf.path).document
+        return float(document["pqos"]["kbps"])
+
+    conf.write("pqos/mine.yaml", "defaults: [constant, _self_]\n")
+    assert [kbps(), kbps()] == [5000, 5000]
+    conf.change("pqos/constant.yaml", {"kbps: 5000": "kbps: 70"})  # shadows what it builds on
+    assert [kbps(), kbps()] == [70, 70]
+    conf.change("pqos/constant.yaml", {"kbps: 70": "kbps: 800"})
+    assert kbps() == 800
+    (conf.path / "pqos" / "constant.yaml").unlink()
+    assert kbps() == 5000
+    conf.write("pqos/mine.yaml", "defaults: [map, _self_]\nkbps: 9\n")
+    assert kbps() == 9
+    (conf.path / "pqos" / "mine.yaml").unlink()
+    with pytest.raises(ConfigError, match="no such file"):
+        kbps()
+
+
 def test_a_user_can_add_files_of_every_group(conf: UserConf) -> None:
     conf.change("cameras/front_center.yaml", {"1920": "640", "1040": "480"})
     (conf.path / "cameras/front_center.yaml").rename(conf.path / "cameras/tiny.yaml")
