@@ -17,6 +17,7 @@ from runner.graph import Plan, launch
 from runner.turning import turn_elements
 
 BAG = "bag"  # the appsrc of a sequence that is a topic of a bag
+LEFT_OUT = "left-out-"  # begins the names of elements that leave out pictures
 FRAMES = "frames"  # the tee that passes every frame of the sequence
 QUEUE = "queue max-size-buffers=3 max-size-bytes=0 max-size-time=0"
 SINK = "videoconvert ! video/x-raw,format=I420 ! appsink name={} emit-signals=true sync=false async=false max-buffers=2"
@@ -24,10 +25,11 @@ SINK = "videoconvert ! video/x-raw,format=I420 ! appsink name={} emit-signals=tr
 
 @dataclass(frozen=True, slots=True)
 class Lane:
-    """One encoding: a scaling factor and a target bitrate."""
+    """One encoding: a scaling factor, a target bitrate, and of which n each n-th picture is encoded."""
 
     scaling: Fraction
     kbps: int
+    nth: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,15 +64,17 @@ def compile_lanes(plan: Plan, decode: str, roi: Roi, lanes: Sequence[Lane], bag:
     raises  ModelError if the graph's bitrate knob names no element that frames pass through
     """
     before, after = cut(plan)
-    factors = sorted({lane.scaling for lane in lanes})
+    shares = sorted({(lane.scaling, lane.nth) for lane in lanes})
     parts = [f"{decode} ! tee name={FRAMES}"]
-    for i, factor in enumerate(factors):
+    for i, (factor, nth) in enumerate(shares):
         shared = _turned(plan, before, {"roi": roi, "size": output_size(roi, factor)}, f"_{i}")
-        parts.append(f"{FRAMES}. ! {QUEUE} ! {launch(shared)} ! tee name=scaled_{i}" if shared else "")
+        line = " ! ".join((QUEUE, *_dropping(plan, nth, i), launch(shared)))
+        parts.append(f"{FRAMES}. ! {line} ! tee name=scaled_{i}" if shared else "")
     names = []
     for j, lane in enumerate(lanes):
-        own = _turned(plan, after, {"bitrate": lane.kbps}, f"_lane{j}")
-        parts.append(f"scaled_{factors.index(lane.scaling)}. ! {QUEUE} ! {launch(own)} ! {SINK.format(f'sink_{j}')}")
+        own = _turned(plan, after, {"bitrate": lane.kbps}, f"_lane{j}", lane.nth)
+        scaled = f"scaled_{shares.index((lane.scaling, lane.nth))}."
+        parts.append(f"{scaled} ! {QUEUE} ! {launch(own)} ! {SINK.format(f'sink_{j}')}")
         names.append(LaneNames(f"{encoder(plan)}_lane{j}", f"{_counter(plan)}_lane{j}", f"sink_{j}"))
     return LaneSet(" ".join(parts), plan.camera.fps, tuple(names), bag)
 
@@ -79,7 +83,18 @@ def fragment(plan: Plan, roi: Roi, lane: Lane) -> str:
     """The elements that produce a lane's pictures, as text: any change of graph or settings changes it."""
     before, after = cut(plan)
     knobs: dict[str, KnobValue] = {"roi": roi, "size": output_size(roi, lane.scaling), "bitrate": lane.kbps}
-    return launch(turn_elements(plan.camera, (*before, *after), knobs))
+    return " ! ".join(
+        (*_dropping(plan, lane.nth), launch(turn_elements(plan.camera, (*before, *after), knobs, lane.nth)))
+    )
+
+
+def _dropping(plan: Plan, nth: int, number: int = 0) -> tuple[str, ...]:
+    """Leaves out all but each n-th picture, as the knob `fps` does while driving: behind it the caps stay."""
+    if nth == 1:
+        return ()
+    rates = (plan.camera.fps, plan.camera.fps / nth)
+    own, slow = (f"video/x-raw,framerate={fps.numerator}/{fps.denominator}" for fps in rates)
+    return (f"videorate name={LEFT_OUT}{number} drop-only=true skip-to-first=true", slow, f"capssetter caps={own}")
 
 
 def cut(plan: Plan) -> tuple[tuple[Element, ...], tuple[Element, ...]]:
@@ -107,7 +122,7 @@ def _counter(plan: Plan) -> str:
 
 
 def _turned(
-    plan: Plan, elements: Iterable[Element], knobs: Mapping[str, KnobValue], suffix: str
+    plan: Plan, elements: Iterable[Element], knobs: Mapping[str, KnobValue], suffix: str, nth: int = 1
 ) -> tuple[Element, ...]:
-    turned = turn_elements(plan.camera, elements, knobs)
+    turned = turn_elements(plan.camera, elements, knobs, nth)
     return tuple(replace(element, name=element.name + suffix) for element in turned)

@@ -52,11 +52,13 @@ def is_restarted_after_gaps(graph: Graph) -> bool:
     return saves_up and {target.property for target in graph.knobs["size"]} == {"caps"}
 
 
-def turn_elements(camera: Camera, elements: Iterable[Element], knobs: Mapping[str, KnobValue]) -> tuple[Element, ...]:
-    """Elements of a camera with these knobs turned; settings of other elements are ignored."""
+def turn_elements(
+    camera: Camera, elements: Iterable[Element], knobs: Mapping[str, KnobValue], pace: float = 1.0
+) -> tuple[Element, ...]:
+    """Elements of a camera with these knobs turned; settings of other elements are ignored. pace: see `assignments`."""
     by_element: dict[str, dict[str, Value]] = {}
     for knob, value in knobs.items():
-        for name, key, filled in assignments(camera, knob, value):
+        for name, key, filled in assignments(camera, knob, value, pace):
             by_element.setdefault(name, {})[key] = filled
     return tuple(replace(e, properties={**e.properties, **by_element.get(e.name, {})}) for e in elements)
 

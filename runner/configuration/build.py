@@ -456,7 +456,9 @@ def _rate_quality(data: Mapping[str, Any], graph: Graph | None) -> RateQualityMo
         exact(its["scale"]): _model(its, b_full, ("shown", index)) for index, its in enumerate(data.get("shown", ()))
     }
     whole = RateQualityModel((Fraction(1),), (Fraction(0),), b_full)
-    return whole if graph and graph.passes else replace(_model(data, b_full), shown=dict(sorted(shown.items())))
+    rates = RateQualityModel.rates_of(data.get("rates", ()))
+    measured = replace(_model(data, b_full), shown=dict(sorted(shown.items())), rates=rates)
+    return whole if graph and graph.passes else measured
 
 
 def _model(data: Mapping[str, Any], b_full: Kbps, path: schema.Path = ()) -> RateQualityModel:

@@ -6,7 +6,7 @@ Bitrates are kbit/s and exact (`Fraction` of the decimal text a user wrote), siz
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from decimal import Decimal
 from enum import StrEnum
@@ -119,6 +119,18 @@ class Roi:
 
 
 @dataclass(frozen=True, slots=True)
+class RateQuality:
+    """Quality at a rate of pictures, of 1, in points (kbit/s, quality).
+
+    delivered  of a picture that is sent, compared with itself: what counts while the scene stands
+    held       of what a screen shows at each picture of the source, without latency: what counts while it moves
+    """
+
+    delivered: tuple[tuple[float, float], ...]
+    held: tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True, slots=True)
 class RateQualityModel:
     """Scaling factor that looks best in each bitrate range (paper, Eq. 3 and Table I).
 
@@ -127,6 +139,7 @@ class RateQualityModel:
     b_full   kbit/s for the full image: the end of the last range and the camera's share in the allocation
     quality  of the full image over its bitrate with the best of these factors; None: not measured
     shown    by factor of the image's size at which a screen shows it, the model of what is seen there; ascending
+    rates    by Hz, what fewer pictures a second look like at the same bitrate; none: not measured
     raises   ModelError
 
     Derived: `whole_b_min`, the bounds as integers if all are whole, otherwise empty; `ranges`, each range B_r and its
@@ -138,6 +151,7 @@ class RateQualityModel:
     b_full: Kbps
     quality: Curve | None = None
     shown: Mapping[Fraction, RateQualityModel] = field(default_factory=dict)
+    rates: Mapping[Fraction, RateQuality] = field(default_factory=dict)
     whole_b_min: tuple[int, ...] = field(init=False, repr=False)
     ranges: tuple[str, ...] = field(init=False, repr=False)
 
@@ -163,6 +177,12 @@ class RateQualityModel:
         ends = [*bounds[1:], "..."]
         texts = (f"range [{a}, {b}) -> {s}" for a, b, s in zip(bounds, ends, factors, strict=True))
         object.__setattr__(self, "ranges", tuple(texts))
+
+    @staticmethod
+    def rates_of(data: Iterable[Mapping[str, Any]]) -> Mapping[Fraction, RateQuality]:
+        """From a camera's `rate_quality.rates`."""
+        points = {exact(its["fps"]): [tuple(map(tuple, its[key])) for key in ("delivered", "held")] for its in data}
+        return {fps: RateQuality(*both) for fps, both in points.items()}
 
     def at(self, scale: Fraction) -> tuple[Fraction, RateQualityModel]:
         """The measured factor of the image's size that is nearest to that of a screen, and its model; 1: this one."""

@@ -18,7 +18,7 @@ from runner.errors import RunError
 from runner.gst.caps import structure
 from runner.gst.pictures import LumaPlane, luma_of
 from runner.gst.stream_times import joined_units
-from runner.lanes import BAG, FRAMES, LaneSet
+from runner.lanes import BAG, FRAMES, LEFT_OUT, LaneSet
 
 POLL_NS = 200 * 1_000_000
 STALLED_S = 60  # without a frame for this long the pipeline is deadlocked
@@ -80,7 +80,7 @@ def run_lanes(
         Gst.PadProbeType.BUFFER | Gst.PadProbeType.EVENT_DOWNSTREAM,
         lambda pad, info: _on_source(run, pad, info, on_frame),
     )
-    for rate in _elements(pipeline, "videorate"):
+    for rate in (each for each in _elements(pipeline, "videorate") if not each.get_name().startswith(LEFT_OUT)):
         rate.get_static_pad("sink").add_probe(Gst.PadProbeType.BUFFER, lambda _, info: _on_read(run, info.get_buffer()))
     results = [Encoded() for _ in lanes.lanes]
     for number, lane in enumerate(lanes.lanes):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from fractions import Fraction
 from importlib.metadata import version
 from pathlib import Path
@@ -18,6 +18,7 @@ from runner.rate_quality.cache import digest
 from runner.rate_quality.choice import Choice, ShownChoice
 from runner.rate_quality.curves import Crossing, Ladder, Point
 from runner.rate_quality.metrics import NAMES
+from runner.rate_quality.rates import RatePoint, Rates
 from runner.rate_quality.sequence import Sequence as Clip
 
 FORMAT_VERSION: Literal[1] = 1
@@ -39,6 +40,7 @@ class Measured:
     plan      full or adaptive
     stride    every stride-th frame was scored
     notes     about the sequences
+    rates     quality with fewer pictures a second; empty: not measured
     """
 
     name: str
@@ -56,6 +58,7 @@ class Measured:
     points: Sequence[Point]
     choice: Choice
     notes: Sequence[str]
+    rates: Rates = field(default_factory=dict)
 
     @property
     def warnings(self) -> list[str]:
@@ -175,6 +178,21 @@ class DroppedDocument(TypedDict):
     reason: str
 
 
+class RateDocument(TypedDict):
+    """Fewer pictures a second at the same bitrates.
+
+    fps        pictures a second
+    kbps       bitrates, kbit/s, at which all rates are compared
+    delivered  by bitrate, quality of the pictures that were sent, each compared with itself
+    held       likewise, at each picture of the source, of the last one that was sent, without latency
+    """
+
+    fps: float
+    kbps: list[int]
+    delivered: list[float]
+    held: list[float]
+
+
 class CoresDocument(TypedDict):
     """Processor time of a factor.
 
@@ -207,6 +225,7 @@ class Document(TypedDict):
     regret       the best choice for each number of factors
     dropped      factors that are not worth using
     cores        what the encoder needs at the sequence's frame rate
+    rates        quality with fewer pictures a second, if it was measured
     warnings     notes on using the model
     """
 
@@ -230,6 +249,7 @@ class Document(TypedDict):
     regret: list[LadderDocument]
     dropped: list[DroppedDocument]
     cores: list[CoresDocument]
+    rates: NotRequired[list[RateDocument]]
     warnings: list[str]
 
 
@@ -237,7 +257,7 @@ def to_json(measured: Measured) -> Document:
     """The model file; schemas/rate_quality.schema.json is made from these classes."""
     choice = measured.choice
     sequences = {name: _clip_to_json(clip) for name, clip in measured.clips.items()}
-    return {
+    document: Document = {
         "version": FORMAT_VERSION,
         "tod_runner": version("tod-runner"),
         "name": measured.name,
@@ -262,6 +282,9 @@ def to_json(measured: Measured) -> Document:
         "cores": [{"scaling": plain(factor), "cores": round(share, 4)} for factor, share in choice.cores.items()],
         "warnings": measured.warnings,
     }
+    if measured.rates:
+        document["rates"] = [_rate_to_json(fps, points) for fps, points in measured.rates.items()]
+    return document
 
 
 def to_yaml(measured: Measured) -> str:
@@ -290,6 +313,8 @@ def to_yaml(measured: Measured) -> str:
         *([f"  quality: {[list(point) for point in choice.quality]}"] if choice.quality else []),
         *(["  shown:   # the same for screens that show fewer pixels"] if choice.shown else []),
         *(line for scale, its in choice.shown.items() for line in _shown_to_yaml(scale, its)),
+        *(["  rates:   # fewer pictures a second at the same bitrates"] if measured.rates else []),
+        *(line for fps, points in measured.rates.items() for line in _rate_to_yaml(fps, points)),
         f"  model: {measured.name}.model.json   # the curves, beside this file",
     ]
     return "\n".join(lines) + "\n"
@@ -301,6 +326,14 @@ def _shown_to_yaml(scale: Fraction, its: ShownChoice) -> list[str]:
         f"      scaling: {[plain(each) for each in its.scaling]}",
         f"      b_min_kbps: {list(its.b_min)}",
         *([f"      quality: {[list(point) for point in its.quality]}"] if its.quality else []),
+    ]
+
+
+def _rate_to_yaml(fps: Fraction, points: Sequence[RatePoint]) -> list[str]:
+    return [
+        f"    - fps: {plain(fps)}",
+        f"      delivered: {[[point.kbps, round(point.delivered, 4)] for point in points]}   # a picture that is sent",
+        f"      held: {[[point.kbps, round(point.held, 4)] for point in points]}   # what is shown until the next one",
     ]
 
 
@@ -356,6 +389,15 @@ def _point_to_json(point: Point) -> PointDocument:
         "second_kbps": round(point.second_kbps, 2),
         "encode_ms": round(point.encode_ms, 4),
         **cast(PointDocument, scores),
+    }
+
+
+def _rate_to_json(fps: Fraction, points: Sequence[RatePoint]) -> RateDocument:
+    return {
+        "fps": plain(fps),
+        "kbps": [point.kbps for point in points],
+        "delivered": [round(point.delivered, 6) for point in points],
+        "held": [round(point.held, 6) for point in points],
     }
 
 

@@ -19,10 +19,20 @@ from runner.lanes import Lane, cut, fragment
 from runner.rate_quality import plans
 from runner.rate_quality.artefact import MARK, Measured, dumps, to_json, to_yaml
 from runner.rate_quality.cache import Cache, file_digest
-from runner.rate_quality.choice import ChoiceCriteria, choose, choose_shown, pooled
+from runner.rate_quality.choice import WHOLE, Choice, ChoiceCriteria, choose, choose_shown, pooled
 from runner.rate_quality.curves import Point, mean_score
 from runner.rate_quality.metrics import Metric, find_metric
 from runner.rate_quality.metrics.reduced import fits, name_at, reduced
+from runner.rate_quality.rates import (
+    RatePoint,
+    Rates,
+    compared,
+    every_nth,
+    rate_lanes,
+    rate_points,
+    rate_stride,
+    rate_table,
+)
 from runner.rate_quality.sequence import Footage, as_recorded, survey
 from runner.rate_quality.sequence import Sequence as Clip
 from runner.rate_quality.study import Study, check_size, stride
@@ -200,6 +210,7 @@ def _measure(
     except ValueError as error:
         raise RunError(f"{name}: {error}") from None
     first = sweeps[0]
+    rates = _rates(study, vehicle, choice, sweeps, deciding, lambda share: progress(f"{name}, rates", share))
     lane = Lane(study.scalings[0], study.rates[0])
     text = fragment(first.plan, first.plan.camera.full_roi, lane)
     return Measured(
@@ -217,6 +228,7 @@ def _measure(
         stride=first.stride,
         points=points,
         choice=choice,
+        rates=rates,
         notes=list(dict.fromkeys(n for sweep in sweeps for n in _notes(vehicle.cameras[sweep.name], sweep.clip))),
     )
 
@@ -226,6 +238,34 @@ def _named(sweeps: Sequence[Sweep]) -> Iterator[tuple[str, Clip]]:
     for camera, own in groupby(sweeps, lambda sweep: sweep.name):
         for number, sweep in enumerate(own, 1):
             yield camera if number == 1 else f"{camera} {number}", sweep.clip
+
+
+def _rates(
+    study: Study,
+    vehicle: Vehicle,
+    choice: Choice,
+    sweeps: Sequence[Sweep],
+    metric: Metric,
+    on_progress: Callable[[float], None],
+) -> Rates:
+    """Quality with fewer pictures a second, at the rates of the study, otherwise at those in the camera's file."""
+    camera = sweeps[0].plan.camera
+    every = every_nth(camera, study.fps or tuple(vehicle.cameras[sweeps[0].name].rate_quality.rates))
+    if not every:
+        return {}
+    if metric.every_frame or metric.name not in WHOLE:
+        raise ArgumentError("fps", metric.name, "needs metric=mssim: rates are compared by a quality of 0 to 1")
+    step = rate_stride(sweeps[0].stride, every)
+    own = [replace(sweep, stride=step, metrics=(metric,), _keys={}) for sweep in sweeps]
+    found: dict[Fraction, dict[int, RatePoint]] = {}
+    part = 1 / len(every) / len(own)
+    for number, nth in enumerate(every):
+        lanes = rate_lanes(choice, study.rates, nth)
+        begun = number * len(own)
+        groups = [sweep.measure(lanes, _rising(on_progress, (begun + at) * part, part)) for at, sweep in enumerate(own)]
+        found[camera.fps / nth] = rate_points(metric.name, groups, nth, step)
+    on_progress(1.0)
+    return compared(found)
 
 
 def _points(
@@ -280,4 +320,5 @@ def _write(measured: Measured, output: Path, sweeps: Sequence[Sweep]) -> str:
     ladder = ", ".join(f"{float(factor):g} from {bound}" for factor, bound in pairs)
     encoded, found = (sum(getattr(sweep, key) for sweep in sweeps) for key in ("encoded", "found"))
     head = f"{output / measured.name}.yaml: {ladder}, b_full {choice.b_full} kbit/s"
-    return "\n".join([f"{head} ({encoded} encoded, {found} known)", *(f"  {warning}" for warning in measured.warnings)])
+    lines = [*measured.warnings, *rate_table(measured.rates)]
+    return "\n".join([f"{head} ({encoded} encoded, {found} known)", *(f"  {line}" for line in lines)])

@@ -37,11 +37,19 @@ def plot(measured: Measured, path: Path) -> list[Path]:
     """
     score = mean_score(measured.metric, measured.sign)
     curves = draw_curves(measured.points, score)
-    figure = Figure(figsize=SIZE_IN, layout="constrained")
-    axes = figure.add_subplot()
+    width, height = SIZE_IN
+    rows = 2 if measured.rates else 1
+    figure = Figure(figsize=(width, rows * height), layout="constrained")
+    axes, *others = figure.subplots(rows, squeeze=False)[:, 0]
     colours = _draw_curves(axes, measured, curves)
     _draw_ladder(axes, measured, curves, colours)
-    _label_axes(axes, measured, curves)
+    axes.set_ylim(*_limits(measured, curves))
+    clips = ", ".join(Path(clip.path).name for clip in measured.clips.values())
+    _label_axes(axes, measured, f"{measured.name}   ({clips})")
+    for below in others:
+        _draw_rates(below, measured)
+    for each in (axes, *others):
+        each.set_xlim(curves.kbps[0], curves.kbps[-1])
     return [_saved(figure, path, form) for form in FORMATS]
 
 
@@ -92,17 +100,24 @@ def _mark(axes: Axes, kbps: float, text: str, *, left: bool) -> None:
     )
 
 
-def _label_axes(axes: Axes, measured: Measured, curves: Curves) -> None:
-    clips = ", ".join(Path(clip.path).name for clip in measured.clips.values())
-    axes.set_title(f"{measured.name}   ({clips})", fontsize=10)
+def _draw_rates(axes: Axes, measured: Measured) -> None:
+    """Quality with fewer pictures a second: of those that are sent, and of what is shown until the next one."""
+    palette = mpl.colormaps["plasma"](np.linspace(0, 0.8, len(measured.rates)))
+    for (fps, points), colour in zip(measured.rates.items(), palette, strict=True):
+        kbps, label = [point.kbps for point in points], f"{float(fps):.3g} Hz"
+        axes.plot(kbps, [point.delivered for point in points], ".-", color=colour, label=f"{label}, delivered")
+        axes.plot(kbps, [point.held for point in points], ".--", color=colour, label=f"{label}, held")
+    _label_axes(axes, measured, "fewer pictures a second at the same bitrate")
+
+
+def _label_axes(axes: Axes, measured: Measured, title: str) -> None:
+    axes.set_title(title, fontsize=10)
     axes.set_xscale("log")
-    axes.set_xlim(curves.kbps[0], curves.kbps[-1])
     axes.xaxis.set_major_locator(LogLocator(10, (1, 2, 5)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda kbps, _: f"{kbps:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_xlabel("target bitrate in kbit/s")
     axes.set_ylabel(measured.labels[measured.metric])
-    axes.set_ylim(*_limits(measured, curves))
     axes.grid(color="#e6e6e6", lw=0.6)
     axes.set_axisbelow(True)
     axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False)

@@ -30,6 +30,7 @@ class Study:
     b_full_quality: float | None
     cpu_cores: float | None
     screens: tuple[Fraction, ...]
+    fps: tuple[Fraction, ...]
     pool: Mapping[str, tuple[str, ...]]
     masks: Mapping[str, Path]
     vmaf_model: str
@@ -66,6 +67,7 @@ def read_study(data: Mapping[str, Any]) -> Study:
         b_full_quality=data["b_full_quality"],
         cpu_cores=data["cpu_cores"],
         screens=tuple(map(exact, data.get("screens", ()))),  # missing in older logs
+        fps=tuple(map(exact, data.get("fps", ()))),  # likewise
         pool={name: tuple(members) for name, members in data["pool"].items()},
         masks={name: Path(path) for name, path in data["masks"].items()},
         vmaf_model=data["vmaf_model"],

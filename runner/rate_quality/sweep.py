@@ -53,15 +53,18 @@ class Sweep:
     def measure(self, lanes: Sequence[Lane], on_progress: Callable[[float], None]) -> list[Point]:
         """Points of some lanes, from the cache or measured; each is stored as soon as its task is done.
 
+        lanes        all of them of the same n-th pictures
         on_progress  called with the share of the work that is done, never decreasing
         raises  RunError; points finished by then stay in the cache
         """
+        of = {(lane.scaling, lane.kbps): lane for lane in lanes}
         points = [point for lane in lanes if (point := self._cached(lane))]
         self.found += len(points)
         known = {(point.scaling, point.target_kbps) for point in points}
         missing = [lane for lane in lanes if (lane.scaling, lane.kbps) not in known]
         for point in self._run(self._tasks(missing), on_progress):
-            self.cache.store(self._key(Lane(point.scaling, point.target_kbps)), self._json(point))
+            key = self._key(of[point.scaling, point.target_kbps])
+            self.cache.store(key, self._json(point, key))
             points.append(point)
             self.encoded += 1
         return points
@@ -137,8 +140,8 @@ class Sweep:
         document = self.cache.load(self._key(lane))
         return None if document is None else point_from_json(lane.scaling, lane.kbps, document, self._identities)
 
-    def _json(self, point: Point) -> dict[str, object]:
-        before = self.cache.load(self._key(Lane(point.scaling, point.target_kbps))) or {}
+    def _json(self, point: Point, key: str) -> dict[str, object]:
+        before = self.cache.load(key) or {}
         document = point_to_json(point, self._identities)
         return document | {"scores": before.get("scores", {}) | document["scores"]}
 

@@ -19,6 +19,9 @@ images: what the vehicle has kept without loss (log.lossless), what `record` has
 played, or, as second best, the video as sent, if that was whole and of full size (log.video=true). Pictures that were
 cropped to what the driver saw are refused.
 
+fps= adds rates of fewer pictures, Hz: at the same bitrates, the quality of each delivered picture, and of what a screen
+holds until the next one.
+
 mount= is a configuration directory of your own: cameras of one kind are measured together, and rate_quality of that
 kind is replaced in CONF/cameras/KIND.yaml, so that conf=CONF vehicle=NAME drives with it; a file of your own is kept as
 KIND.yaml.before. Shows what this changes in decisions at 1, 3 and 8 Mbit/s. The models are in output=, else in
@@ -32,6 +35,7 @@ Measurements are cached by content in the user's cache directory: an interrupted
   tod-runner model vehicle=tum_q7 source=synthetic output=models graph=openh264_rtsp
   tod-runner model vehicle=tum_q7 source=synthetic mount=my_vehicles
   tod-runner model drives/monday mount=my_vehicles
+  tod-runner model camera=front_center sequence=drive.mp4 output=models 'fps=[12.5,5]'
   tod-runner model camera=front_left sequence=drive.mcap cameras.front_left.topic=/left/image_raw output=models
   tod-runner model camera=top_left sequence=top.mkv output=models masks.top_left=mask.png cpu_cores=0.3
   tod-runner model compare models/front_center.model.json models_new/front_center.model.json

@@ -22,6 +22,7 @@ import pytest
 from rig import CHECKOUT, CLIPS, WAIT_S, faults, over_tcp, process, run, streaming, until
 from runner import schema
 from runner.__main__ import main
+from runner.configuration.config import configuration
 from runner.core.commands import Command
 from runner.core.model import Roi
 from runner.rate_quality.artefact import read_model
@@ -541,3 +542,31 @@ def test_on_a_recorded_drive_each_factor_wins_a_range(tmp_path, cache):
     assert len(document["scaling"]) >= 3
     assert len(document["points"]) <= 80  # of 160, with those for smaller screens
     assert document["b_min_kbps"] == sorted(document["b_min_kbps"])
+
+
+def test_fewer_pictures_a_second_are_compared_at_the_same_bitrates(clip, tmp_path, cache):
+    """Each is better than one of all, but in this street, which moves, what is held is not."""
+    output = tmp_path / "models"
+    words = (*CAMERA, f"sequence={clip}", f"output={output}", "screens=[]", "scalings=[0.5]")
+    first = model(*words, "bitrates_kbps=[100,200]", "fps=[12.5,5]", cache=cache, figures=True)
+    assert "25 Hz" in first.stdout
+    assert "12.5 Hz" in first.stdout
+    assert "5 Hz" in first.stdout
+    assert (output / "front_center.png").stat().st_size > 20_000
+    document = read_model(output / "front_center.model.json")
+    all_of_them, half, fifth = document["rates"]
+    assert [each["fps"] for each in document["rates"]] == [25, 12.5, 5]
+    assert all_of_them["delivered"] == all_of_them["held"]
+    for number in range(len(all_of_them["kbps"])):
+        assert fifth["delivered"][number] > half["delivered"][number] > all_of_them["delivered"][number]
+        assert fifth["held"][number] < half["held"][number] < half["delivered"][number]
+    conf = tmp_path / "own" / "cameras"
+    conf.mkdir(parents=True)
+    shutil.copy(output / "front_center.yaml", conf / "measured.yaml")
+    vehicle = configuration(["cameras@cameras.front_center=measured"], conf.parent, runnable=False).vehicle()
+    rates = vehicle.cameras["front_center"].rate_quality.rates
+    assert list(rates) == [25, Fraction(25, 2), 5]
+    assert rates[Fraction(5)].held[0] == (100, pytest.approx(fifth["held"][0], abs=1e-4))
+    again = model(*words, "bitrates_kbps=[100,200]", "fps=[12.5,5]", "metric=psnr", cache=cache)
+    assert again.returncode == 2
+    assert "fps: psnr: needs metric=mssim" in again.stderr
