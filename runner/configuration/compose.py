@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import pickle
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from runner import schema
 from runner.configuration.files import GROUPS, ROOT, bases_of, chosen_by, conf_directories, defaults, find_file, options
@@ -33,7 +32,6 @@ RESTATED = (
     "is stated in {first}, too, and both would be merged, with the rules of that file in their old places; "
     "write out all modes in one file, without the other in defaults; a single number: modes.MODE.RULE.NUMBER=VALUE"
 )
-MOST_TREES = 32  # kept, of 50 KB each
 WHOLE = ("vehicle", "experiment")  # groups whose files apply to the whole document
 MAX_RESOLVED = 50_000  # values of a configuration with its interpolations expanded
 PACKAGE_HEADER = "# @package _global_"  # a vehicle's file applies to the whole document
@@ -52,6 +50,8 @@ def compose(
     instead  by group, the choice in place of that of the packaged conf/config.yaml
     raises   ConfigError
     """
+    from omegaconf import open_dict
+
     parsed = parse_overrides(overrides)
     directories = conf_directories(user)
     problems = [p for override in parsed for p in (*choice_problems(override, directories), *rule_problems(override))]
@@ -68,6 +68,8 @@ def compose(
         raise ConfigError(problems)
     parts += [Part(label(of_site.path), (), of_site.content, of_site.path)] if of_site else []
     parts += reversed(files)
+    with open_dict(config):
+        del config["hydra"]
     composed = _resolved(config, parts, choices)
     if of_site and (problems := list(of_site.problems(composed.document))):
         raise ConfigError(problems)
@@ -176,20 +178,25 @@ def _compose(
     site: Mapping[str, Any] | None,
 ) -> tuple[DictConfig, dict[str, str]]:
     """Hydra's composition, and by group the chosen file."""
-    from hydra._internal.config_loader_impl import ConfigLoaderImpl
+    from hydra import compose as hydra_compose
+    from hydra import initialize_config_dir
+    from hydra.core.global_hydra import GlobalHydra
     from hydra.errors import HydraException
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
+    from runner.configuration.hydra_files import search, without_launchers
+
     # OmegaConf's resolver for environment variables is not supported: only files define values.
     OmegaConf.clear_resolver("oc.env")
+    search(directories, instead, site)
     root = find_file(directories, "", ROOT)
     chosen = {key for key, _ in chosen_by(root)}
-    words = [override.choosing(chosen) for override in overrides if override.choice]
-    values = [override.setting() for override in overrides if not override.choice]
+    words = [o.hydra(chosen) for o in overrides]
+    GlobalHydra.instance().clear()
     try:
-        config, choices = _tree(words, directories, instead, site)
-        ConfigLoaderImpl._apply_overrides_to_config(values, config)
+        with initialize_config_dir(str(directories[-1]), version_base="1.3"), without_launchers():
+            config = hydra_compose(ROOT, words, return_hydra_config=True)
     except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError(_list_problems(error, directories) or [_hydra_problem(error, directories)]) from None
     except (TypeError, ValueError) as error:
@@ -204,83 +211,8 @@ def _compose(
     except RecursionError:
         rule = "files include each other in a cycle"
         raise ConfigError([Problem(COMMAND_LINE, "", " ".join(o.text for o in overrides), rule)]) from None
-    return config, choices
-
-
-class _Tree(NamedTuple):
-    """What choices compose.
-
-    node     before values are set, pickled
-    choices  by group, the chosen file
-    parts    the files behind it
-    """
-
-    node: bytes
-    choices: dict[str, str]
-    parts: list[Part]
-
-
-_trees: dict[object, _Tree] = {}  # by all that chooses files, the newest last
-
-
-def _tree(
-    words: Sequence[str], directories: Sequence[Path], instead: Mapping[str, str], site: Mapping[str, Any] | None
-) -> tuple[DictConfig, dict[str, str]]:
-    """The tree that choices compose, which the caller may modify, and by group the chosen file.
-
-    Hydra takes most of the time of a composition, and many differ only in values. So trees are kept while their files
-    stay the same.
-
-    words  the choices
-    """
-    key = (*words, *directories, *sorted(instead.items()))
-    kept = _trees.get(key) if site is None else None
-    if kept and _is_current(kept, directories):
-        node: DictConfig = pickle.loads(kept.node)
-        return node, kept.choices
-    config, choices = _composed(words, directories, instead, site)
-    if site is None and all(_group(choice) in GROUPS for choice in choices):
-        _trees.pop(key, None)
-        _trees[key] = _Tree(pickle.dumps(config), choices, list(_file_parts(directories, choices)))
-        if len(_trees) > MOST_TREES:
-            del _trees[next(iter(_trees))]
-    return config, choices
-
-
-def _is_current(tree: _Tree, directories: Sequence[Path]) -> bool:
-    """Whether the same files would be found, with the same content."""
-    try:
-        now = list(_file_parts(directories, tree.choices))
-    except ConfigError:
-        return False
-    return len(now) == len(tree.parts) and all(
-        one.path == other.path and one.content is other.content for one, other in zip(now, tree.parts, strict=True)
-    )
-
-
-def _composed(
-    words: Sequence[str], directories: Sequence[Path], instead: Mapping[str, str], site: Mapping[str, Any] | None
-) -> tuple[DictConfig, dict[str, str]]:
-    """As `_tree`, by Hydra."""
-    from hydra import compose as hydra_compose
-    from hydra import initialize_config_dir
-    from hydra.core.global_hydra import GlobalHydra
-    from omegaconf import open_dict
-
-    from runner.configuration.hydra_files import search, without_launchers
-
-    search(directories, instead, site)
-    GlobalHydra.instance().clear()
-    with initialize_config_dir(str(directories[-1]), version_base="1.3"), without_launchers():
-        config = hydra_compose(ROOT, [*words], return_hydra_config=True)
     choices = {str(key): str(value) for key, value in config.hydra.runtime.choices.items()}
-    with open_dict(config):
-        del config["hydra"]
     return config, choices
-
-
-def _group(choice: str) -> str:
-    return choice.partition("@")[0]
 
 
 def _hydra_problem(error: Exception, directories: Sequence[Path]) -> Problem:

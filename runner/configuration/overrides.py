@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import islice, product
 from math import prod
 from pathlib import Path
@@ -30,13 +30,12 @@ MAX_RUNS = 1000  # of a sweep
 
 @dataclass(frozen=True, slots=True)
 class Override:
-    """One override: a choice of a group's file, or a value; `parsed` is Hydra's form of it."""
+    """One override: a choice of a group's file, or a value."""
 
     text: str
     key: str
     value: Any
     choice: bool
-    parsed: HydraOverride
 
     @property
     def deletes(self) -> bool:
@@ -47,22 +46,17 @@ class Override:
         """Whether it removes an optional choice."""
         return self.choice and self.key in OPTIONAL and self.value == "null"
 
-    def choosing(self, chosen: Collection[str]) -> str:
-        """The form for Hydra of a choice, in which a plus is optional.
+    def hydra(self, chosen: Collection[str]) -> str:
+        """Its form for Hydra, in which a plus is optional. The schema defines the valid keys.
 
         chosen  groups for which conf/config.yaml chooses a file
         """
         if self.is_none:
             return f"~{self.key}"
-        return self.text.lstrip("+") if self.deletes or self.key in chosen else self.text
-
-    def setting(self) -> HydraOverride:
-        """The form for Hydra of a value, in which a plus is optional. The schema defines the valid keys."""
-        from hydra.core.override_parser.types import OverrideType
-
-        if self.deletes:
-            return self.parsed
-        return replace(self.parsed, type=OverrideType.FORCE_ADD, input_line=f"++{self.text.lstrip('+')}")
+        plain = self.text.lstrip("+")
+        if self.deletes or (self.choice and self.key in chosen):
+            return plain
+        return self.text if self.choice else f"++{plain}"
 
 
 def parse_overrides(overrides: Sequence[str]) -> list[Override]:
@@ -81,7 +75,7 @@ def parse_overrides(overrides: Sequence[str]) -> list[Override]:
             choice = group in GROUPS and not isinstance(value, dict)
             if choice and value is None and not override.is_delete():
                 value = "null"
-            parsed.append(Override(text, override.get_key_element().lstrip("+~"), value, choice, override))
+            parsed.append(Override(text, override.get_key_element().lstrip("+~"), value, choice))
         except HydraException as error:
             problems.append(_problem(text, error))
     if problems:
