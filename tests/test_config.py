@@ -119,8 +119,6 @@ def test_a_users_file_shadows_only_the_packaged_file_of_its_name(conf: UserConf)
 
 
 def test_a_file_that_is_added_changed_or_removed_counts_at_once(conf: UserConf) -> None:
-    """Although what choices compose is kept."""
-
     def kbps() -> float:
         document = configuration(["source=test", "pqos=mine", "fps_max=7"], conf.path).document
         return float(document["pqos"]["kbps"])
