@@ -141,6 +141,7 @@ def test_a_camera_keeps_to_its_rate_although_its_pictures_say_what_they_show(wir
             header = camera.graph.settings.header_bytes
             return 8 * 15 / 1000 * (now.bytes - before.bytes + header * count) / (now.frames - before.frames)
 
-        assert on_the_wire(video_kbps((camera,), Fraction(wire))) <= wire
-        if wire == 300:
-            assert on_the_wire(video_kbps((unplaced(camera),), Fraction(wire))) > wire
+        counted = on_the_wire(video_kbps((camera,), Fraction(wire)))
+        assert counted <= wire
+        if wire == 300:  # with smaller pictures the rate control leaves a part unused
+            assert on_the_wire(video_kbps((unplaced(camera),), Fraction(wire))) > counted
