@@ -17,7 +17,7 @@ from runner.rate_quality.measure import measure
 def measured(output: Path, **study: Any) -> None:
     """Measure a model of a clip that is missing, which is noticed after what this tests."""
     config = configuration(["vehicle=delivery_robot"], runnable=False)
-    clips = {"front": output / "front.mkv"}
+    clips = {"front": [output / "front.mkv"]}
     next(measure(config.vehicle(), replace(config.study(), **study), clips, output, lambda *_: None, print))
 
 

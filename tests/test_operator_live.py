@@ -32,6 +32,7 @@ def operator(hangs: int, notes: list[str], samples: list[Any]) -> LiveOperator:
     side: Any = SimpleNamespace(sample=sample, received=dict, sound=None, stop=lambda: None)
     station: Any = SimpleNamespace(
         state=None,
+        seen=StatedView(),
         connect=lambda: None,
         close=lambda: None,
         link=SimpleNamespace(is_behind=lambda: True),
