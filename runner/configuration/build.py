@@ -452,13 +452,13 @@ def _capture(source: Source, data: Mapping[str, Any]) -> Capture:
 
 def _rate_quality(data: Mapping[str, Any], graph: Graph | None) -> RateQualityModel:
     b_full = exact(data["b_full_kbps"])
+    if graph and graph.passes:  # it has one size, whatever the file of its kind says
+        return RateQualityModel((Fraction(1),), (Fraction(0),), b_full)
     shown = {
         exact(its["scale"]): _model(its, b_full, ("shown", index)) for index, its in enumerate(data.get("shown", ()))
     }
-    whole = RateQualityModel((Fraction(1),), (Fraction(0),), b_full)
     rates = RateQualityModel.rates_of(data.get("rates", ()))
-    measured = replace(_model(data, b_full), shown=dict(sorted(shown.items())), rates=rates)
-    return whole if graph and graph.passes else measured
+    return replace(_model(data, b_full), shown=dict(sorted(shown.items())), rates=rates)
 
 
 def _model(data: Mapping[str, Any], b_full: Kbps, path: schema.Path = ()) -> RateQualityModel:
