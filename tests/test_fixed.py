@@ -47,6 +47,10 @@ def test_it_is_sent_whole_in_one_size_as_the_camera_encodes_it() -> None:
         assert rear.reason.startswith("1234 of 1234 kbit/s, as the camera encodes it")
 
 
+def test_bitrates_below_which_other_sizes_would_be_sent_do_not_concern_it() -> None:
+    assert drive(3000, "cameras.rear.rate_quality.b_full_kbps=100")["rear"].kbps == 100
+
+
 def test_what_does_not_fit_is_said() -> None:
     made = drive(1000, sends=1500)
     assert [made[name].kbps for name in ("front", "rear", "mast")] == [0, 1500, 0]
