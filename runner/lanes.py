@@ -25,7 +25,7 @@ SINK = "videoconvert ! video/x-raw,format=I420 ! appsink name={} emit-signals=tr
 
 @dataclass(frozen=True, slots=True)
 class Lane:
-    """One encoding: a scaling factor, a target bitrate, and of which n each n-th picture is encoded."""
+    """One encoding: a scaling factor and a target bitrate; every nth picture is encoded."""
 
     scaling: Fraction
     kbps: int

@@ -37,26 +37,26 @@ Rates = Mapping[Fraction, tuple[RatePoint, ...]]  # by Hz, falling from the sour
 
 
 def every_nth(camera: Camera, wanted: Sequence[Fraction]) -> list[int]:
-    """1, and of which n each n-th picture is sent at the wanted rates, Hz; none but 1 if no lower rate is wanted."""
+    """1, and each n for which every nth picture gives a wanted rate, Hz; empty if no lower rate is wanted."""
     found = {int(camera.fps / sent_rate(camera, rate * ROUNDED)) for rate in wanted} - {1}
     return [1, *sorted(found)] if found else []
 
 
 def rate_stride(stride: int, every: Iterable[int]) -> int:
-    """The largest interval of scored frames, up to this one, that meets all phases of each n-th picture alike."""
+    """The largest interval between scored frames up to `stride` which meets each phase of every nth picture alike."""
     every = list(every)
     return next(step for step in range(stride, 0, -1) if all(gcd(step, nth) == 1 for nth in every))
 
 
 def rate_lanes(choice: Choice, kbps: Sequence[int], nth: int) -> list[Lane]:
-    """Encodings of each n-th picture at some of these bitrates up to b_full, with the factors that were chosen."""
+    """Encodings of every nth picture at some of these bitrates up to b_full, with the factors that were chosen."""
     usable = [each for each in kbps if each <= choice.b_full] or list(kbps[:1])
     step = max(1, -(-len(usable) // BITRATES))
     return [Lane(choice.scaling[bisect_right(choice.b_min, each) - 1], each, nth) for each in usable[::-step][::-1]]
 
 
 def rate_points(metric: str, groups: Sequence[Sequence[Point]], nth: int, stride: int) -> dict[int, RatePoint]:
-    """By bitrate, quality of each n-th picture over some clips; without bitrates that an encoder exceeds.
+    """By bitrate, quality of every nth picture over some clips; without bitrates that an encoder exceeds.
 
     groups  of each clip, the points of all bitrates
     """
