@@ -158,8 +158,12 @@ def test_a_part_is_drawn_in_its_place_and_the_rest_is_marked_as_not_sent(chromiu
 
         until(is_placed)
         shot(page, f"part-not-sent{'-gpu' * gpu}")
-        drawn = page.evaluate("tod.measure()")["cameras"][FRONT]["drawn_size"]
-        assert (drawn["width"] > WIDTH) == gpu  # as large as on the screen, or left to the browser
+
+        def drawn_px():
+            return page.evaluate("tod.measure()")["cameras"][FRONT]["drawn_size"]["width"]
+
+        # As large as on the screen, or left to the browser, unless a busy machine's picture is frozen for a moment.
+        until(lambda: (drawn_px() > WIDTH) == gpu)
         squeezed = encoded(whole, MIDDLE, (96, 128)), encoded(whole, FULL, (96, 128))  # pixels that are not square
         until(lambda: shows(squeezed[0], MIDDLE.to_json(), "PART NOT SENT"))
         until(is_placed)
