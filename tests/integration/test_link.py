@@ -503,7 +503,7 @@ def test_a_policer_drops_what_exceeds_its_rate_without_a_queue():
             break  # otherwise a busy machine sent a burst, of which less passes
     assert lines[-1].queue_ms == 0
     assert lines[-1].packets + lines[-1].dropped == 250
-    assert 125 <= lines[-1].packets <= 150
+    assert 120 <= lines[-1].packets <= 150  # of about a second, and the depth
 
 
 @needs_root

@@ -937,7 +937,7 @@ def test_a_monitor_in_the_tab_of_a_page_has_no_control(chromium, picture):
     with served(picture, None) as (server, _), opened(chromium, server.url) as page:
         controlling(page)
         visit(page, f"{server.url}?show=front")
-        until(lambda: page.evaluate("window.tod?.control") == "nobody")
+        page.wait_for_function("window.tod?.control === 'nobody'")  # also while the page loads once more
         time.sleep(0.5)
         assert page.evaluate("tod.control") == "nobody"
         visit(page, server.url)

@@ -303,7 +303,7 @@ def test_packets_of_an_intruder_change_nothing(tmp_path: Path, keys: bool) -> No
         operator.watch(2)
         way.seen = lambda packet: True
         operator.watch(1)
-        assert forged.count(VIDEO) > 2 * FPS > 10 * forged.count(REPEATED)  # the viewer itself may request some
+        assert forged.count(VIDEO) > max(2 * FPS, 10 * forged.count(REPEATED))  # the viewer itself may request some
         reported, operator.reported[:] = list(operator.reported), []
         check_every_picture(operator)
         foreign = [f"{CAMERA}: packets from hosts other than the vehicle are dropped"]
