@@ -58,6 +58,7 @@ LONGEST = (
 DRIVES = {
     "test_link": "1",
     "test_live": "1",
+    "test_page_rate": "1",
     "test_players": "1",
     "test_feedback": "2",
     "test_page_sides": "2",

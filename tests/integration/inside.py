@@ -26,6 +26,24 @@ def receiver(side: Any, name: str) -> Any:
     return side._receivers[name]._supervised._pipeline
 
 
+def requested(pipeline: Any) -> list[int]:
+    """Numbers of the packets that a receiver's pipeline requests again from now on, growing."""
+    from runner.gst import Gst
+
+    numbers: list[int] = []
+
+    def note(_pad: Any, info: Any) -> Any:
+        structure = info.get_event().get_structure()
+        if structure and structure.get_name() == "GstRTPRetransmissionRequest":
+            numbers.append(structure.get_value("seqnum"))
+        return Gst.PadProbeReturn.OK
+
+    for element in pipeline.iterate_recurse():
+        if element.get_factory().get_name() == "rtpjitterbuffer":
+            element.get_static_pad("sink").add_probe(Gst.PadProbeType.EVENT_UPSTREAM, note)
+    return numbers
+
+
 def fail(pipeline: Any, why: str) -> None:
     """Make an element of a pipeline report an error, as one does that loses its device or its connection."""
     from runner.gst import GLib, Gst

@@ -489,6 +489,7 @@ print(late_s)
 """
 
 
+@pytest.mark.alone
 @needs_root
 def test_a_policer_drops_what_exceeds_its_rate_without_a_queue():
     """Of a second at 2056 kbit/s it passes 1028 kbit/s and its depth; nothing waits."""
@@ -503,7 +504,7 @@ def test_a_policer_drops_what_exceeds_its_rate_without_a_queue():
             break  # otherwise a busy machine sent a burst, of which less passes
     assert lines[-1].queue_ms == 0
     assert lines[-1].packets + lines[-1].dropped == 250
-    assert 120 <= lines[-1].packets <= 150  # of about a second, and the depth
+    assert 125 <= lines[-1].packets <= 150
 
 
 @needs_root

@@ -46,6 +46,7 @@ def drive(page, positions, speed, wanted):
     until(is_followed, every_s=0.1)
 
 
+@pytest.mark.alone
 def test_fewer_pictures_are_live_and_the_page_says_how_many(chromium):
     ports = {key: free_port() for key in ("page.port", "media.port", "control.port")}
     words = (*WORDS, *(f"{key}={port}" for key, port in ports.items()))
@@ -64,6 +65,6 @@ def test_fewer_pictures_are_live_and_the_page_says_how_many(chromium):
             shot(page, "standing")
             assert all(f"of {STANDING_HZ} fps" in text for text in shown.values())
             # A tile that still judged by 15 pictures a second would be frozen for half of the time.
-            assert all(4 * own.get("frozen", 0) < own["live"] for own in page.evaluate("seen").values())
+            assert all(20 * own.get("frozen", 0) < own["live"] for own in page.evaluate("seen").values())
         child.terminate()
         child.wait(timeout=15)
