@@ -390,6 +390,9 @@ class Dimensions:
             raise ModelError("track_m", f"{self.track_m:g}", rule, "width_m")
 
 
+WHOLE = ".lossless"  # in the names of files with whole pictures that a drive keeps, behind the camera's
+
+
 @dataclass(frozen=True, slots=True)
 class Lossless:
     """How much of a camera's whole pictures a drive keeps without loss.

@@ -17,7 +17,7 @@ from runner.gst.clocks import captured_at
 from runner.gst.probes import BufferProbe, PassingBuffer
 from runner.gst.streams import passed_counts
 from runner.gst.video_files import DIRECTORY, NOT_ASKED, new_file, outermost
-from runner.settings import Lossless
+from runner.settings import WHOLE, Lossless
 
 CHECK_S = 0.2
 FINISH_S = 30.0  # an encoder or a disk that makes no progress for this long has failed
@@ -185,7 +185,7 @@ class _Branch:
         if not self._has_room(0):
             return
         try:
-            self._path = path = new_file(camera.files.directory / DIRECTORY, f"{camera.name}.lossless", "mkv")
+            self._path = path = new_file(camera.files.directory / DIRECTORY, f"{camera.name}{WHOLE}", "mkv")
         except OSError as error:
             camera.end(reason(error))
             return

@@ -18,11 +18,11 @@ from runner.h264.access_unit import stated_region
 from runner.lanes import BAG, FRAMES, LaneSet
 from runner.rate_quality.cache import Cache, digest, file_digest
 from runner.rate_quality.recordings import INDEX
+from runner.settings import WHOLE
 
 SURVEY_VERSION = 2
 FEWEST_FRAMES = 25
 VIDEO = ".ts"  # suffix of the video that a drive keeps
-LOSSLESS = ".lossless."  # in the name of a file with whole pictures that a drive keeps
 LOSSY = ("jpeg", "h264", "h265")  # formats of pictures in bags
 ARGUMENT = "sequence"  # of the command line, for messages
 Footage = Path | BagTopic  # a clip, or pictures of a bag
@@ -158,7 +158,7 @@ def _bag_form(footage: BagTopic) -> dict[str, Any]:
 
 def _is_recording(path: Path) -> bool:
     """Whether `tod-runner record` or a drive made the clip, which is lossless with any codec."""
-    if LOSSLESS in path.name:
+    if f"{WHOLE}." in path.name:
         return True
     try:
         cameras = json.loads(path.with_name(INDEX).read_text(encoding="utf-8"))["cameras"]

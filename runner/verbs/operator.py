@@ -25,6 +25,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -122,25 +123,8 @@ def _served(
     from runner.page.server import PageServer
 
     layouts = Layouts(conf, station.identity if setup.keys else WITHOUT_KEYS)
-    if socket:
-        page = PageServer(
-            setup,
-            station,
-            layouts=layouts,
-            socket=socket,
-            on_shown=operator.show,
-            on_voice=operator.speak,
-            on_lacking=operator.lack,
-        )
-    else:
-        page = PageServer(
-            setup,
-            station,
-            keyring=page_keyring(setup),
-            layouts=layouts,
-            on_voice=operator.speak,
-            on_lacking=operator.lack,
-        )
+    served = partial(PageServer, setup, station, layouts=layouts, on_voice=operator.speak, on_lacking=operator.lack)
+    page = served(socket=socket, on_shown=operator.show) if socket else served(keyring=page_keyring(setup))
     station.listeners.append(page)
     page.start()
     if socket is None:
