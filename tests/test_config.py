@@ -630,6 +630,8 @@ def test_a_base_that_does_not_exist(conf: UserConf, tod: Command) -> None:
             ["cameras.rear_center.rate_quality.b_full_kbps=1e9"],
             "cameras.rear_center.rate_quality.b_full_kbps: 1000000000.0: must be at most 2000000",
         ),
+        (["log.lossless=[front_center]"], "log.lossless: [front_center]: must be a mapping"),
+        (["cameras.rear_center.rate_quality.scaling={a:1}"], "rate_quality.scaling: {a:1}: must be a list"),
         (["~cameras.nothing"], "Could not delete from config. 'cameras.nothing' does not exist."),
     ],
 )

@@ -243,6 +243,10 @@ def _hydra_problem(error: Exception, directories: Sequence[Path]) -> Problem:
         for path, entries in defaults(directories):
             if any(interpolation[1] in value for _, value in entries):
                 return Problem(label(path), "defaults", interpolation[1], rule)
+    merged = re.search(r"Error merging override \+*([\w.@/-]+)=([\[{].*)", text)
+    if merged:
+        kind = "a list" if merged[2].startswith("{") else "a mapping"
+        return Problem(COMMAND_LINE, merged[1], merged[2], f"must be {kind}")
     return Problem(COMMAND_LINE, "", None, rule)
 
 
