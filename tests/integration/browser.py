@@ -121,6 +121,11 @@ def _load(load):
 LOADING = ("Execution context was destroyed", "tod is not defined")
 
 
+def when(page, condition):
+    """Wait for a JavaScript expression; also through a load, and as a function, which the pages' policy lets poll."""
+    page.wait_for_function(f"() => {condition}", timeout=1000 * rig.WAIT_S)
+
+
 def has_started(page):
     """Whether the page's main module has run; not if the page loads again meanwhile."""
     try:

@@ -37,6 +37,7 @@ from browser import (
     viewing,
     visit,
     visit_again,
+    when,
 )
 from rig import WAIT_S, answers, free_port, needs_browser, passes, process
 from runner.page.server import MAY_ASK
@@ -299,7 +300,7 @@ def test_a_reload_keeps_control_history_and_mode(page):
     choose(page, "collective")
     before = page.evaluate("tod.history.time.length")
     visit_again(page)
-    until(lambda: page.evaluate("window.tod !== undefined && tod.state && tod.history"))
+    when(page, "window.tod && tod.state && tod.history")
     all_live(page)
     assert page.evaluate("tod.history.time.length") >= before
     until(lambda: page.evaluate("tod.control") == "you")
@@ -550,7 +551,7 @@ def test_drive_is_offered_once_and_only_the_driver_changes_the_view(chromium, de
     page.locator("#drive-control").click()
     until(lambda: "the vehicle must stand before its control is released" in page.inner_text("#toasts"))
     page.reload()
-    until(lambda: page.evaluate("window.tod?.control") == "you")
+    when(page, "window.tod?.control === 'you'")
     assert (offer.is_hidden(), page.evaluate("tod.view")) == (True, "drive")
     page.locator("#to-configure").click()
     assert (offer.is_hidden(), page.evaluate("tod.view")) == (True, "configure")

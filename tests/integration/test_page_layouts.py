@@ -34,8 +34,9 @@ from browser import (
     viewing,
     visit,
     visit_again,
+    when,
 )
-from rig import SMALL_ROBOT, WAIT_S, answers, free_port, needs_browser, passes, process
+from rig import SMALL_ROBOT, answers, free_port, needs_browser, passes, process
 from runner.configuration.config import configuration
 from runner.configuration.layout import HEADER, NOWHERE, Layouts
 from runner.core import events
@@ -157,7 +158,7 @@ def served(picture, layouts, *words, vehicle=SMALL_ROBOT, conf=None):
 
 
 def controlling(page):
-    until(lambda: page.evaluate("window.tod?.control") == "you")
+    when(page, "window.tod?.control === 'you'")
 
 
 def pulled(page, selector, right, down):
@@ -238,7 +239,7 @@ def test_a_layout_is_dragged_moved_by_keys_saved_and_reset(chromium, picture, tm
         assert set(pictures) == set(CAMERAS)
         shot(page, "layout")
         visit_again(page)
-        until(lambda: page.evaluate("window.tod?.control") == "you")
+        controlling(page)
         until(lambda: edges(page) == large)
         page.click("#edit-layout")
         page.keyboard.press("ArrowDown")
@@ -287,7 +288,7 @@ def test_places_of_the_drive_view_are_dragged_moved_by_keys_saved_and_reset(chro
         assert page.evaluate("document.querySelector('.tile.selected').dataset.camera") == "front"
         shot(page, "drive-places")
         visit_again(page)
-        until(lambda: page.evaluate("window.tod?.control") == "you")
+        controlling(page)
         until(lambda: edges(page) == large)
         page.keyboard.press("d")
         page.click("#edit-drive")
@@ -335,7 +336,7 @@ def test_a_page_whose_modules_fail_to_load_loads_again(chromium, picture, module
 
         tab.route(f"**/static/{module}", fail_once)
         visit(page, server.url)
-        page.wait_for_function("() => window.tod?.state", timeout=1000 * WAIT_S)  # through navigations
+        when(page, "window.tod?.state")
         assert failed
         all_live(page)
 
@@ -831,7 +832,7 @@ def test_a_page_without_webcodecs_shows_no_picture_as_live_and_is_reported_as_sl
         tab.add_init_script("delete window.VideoDecoder")
         page = tab.new_page()
         visit(page, server.url)
-        until(lambda: has_started(page) and page.evaluate("tod.control") == "you")
+        controlling(page)
         until(lambda: page.locator(".tile[data-status=unsupported]").count() == 3)
         assert "no WebCodecs" in page.inner_text("[data-camera=front] .refused")
         until(lambda: station.attention == "slow")
@@ -937,11 +938,11 @@ def test_a_monitor_in_the_tab_of_a_page_has_no_control(chromium, picture):
     with served(picture, None) as (server, _), opened(chromium, server.url) as page:
         controlling(page)
         visit(page, f"{server.url}?show=front")
-        page.wait_for_function("window.tod?.control === 'nobody'")  # also while the page loads once more
+        when(page, "window.tod?.control === 'nobody'")
         time.sleep(0.5)
         assert page.evaluate("tod.control") == "nobody"
         visit(page, server.url)
-        until(lambda: page.evaluate("window.tod?.control") == "you")
+        controlling(page)
 
 
 def test_an_enlarged_picture_hides_no_alarm(chromium, picture):
