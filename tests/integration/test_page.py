@@ -184,8 +184,15 @@ def test_eight_pictures_move(page):
 
 
 def test_a_page_that_opens_shows_no_alarm_in_its_first_seconds(chromium, demo):
-    until(lambda: marks_of_opening(chromium, demo))  # the vehicle may have just begun
-    log = until(lambda: marks_of_opening(chromium, demo))
+    silences = []
+
+    def undisturbed():
+        """Marks of a page, unless the vehicle fell silent since the last one: then its pictures are lost, rightly."""
+        log, count = marks_of_opening(chromium, demo)
+        silences.append(count)
+        return log if silences[-2:] == [count, count] else None
+
+    log = until(undisturbed)
     for camera in SIZES:
         marks = [(ms, mark) for ms, name, mark in log if name == camera]
         (began, first), live = marks[0], next(ms for ms, mark in marks if mark == "live")
@@ -195,12 +202,11 @@ def test_a_page_that_opens_shows_no_alarm_in_its_first_seconds(chromium, demo):
 
 
 def marks_of_opening(chromium, demo):
-    """Of a page that opens, until all are live; none if a camera is lost because the vehicle has just fallen silent."""
+    """Of a page that opens, until all are live; and how often the vehicle has fallen silent by then."""
     with opened(chromium, demo) as page:
         all_live(page)
         log = page.evaluate("tod.measure()")["status_log"]
-        was_silent = "the vehicle has been silent for" in page.text_content("#news")
-        return None if was_silent and any(mark == "lost" for *_, mark in log) else log
+        return log, page.text_content("#news").count("the vehicle has been silent for")
 
 
 def test_single_a_dragged_region_changes_the_received_picture(page):
