@@ -632,6 +632,10 @@ def test_a_base_that_does_not_exist(conf: UserConf, tod: Command) -> None:
         ),
         (["log.lossless=[front_center]"], "log.lossless: [front_center]: must be a mapping"),
         (["cameras.rear_center.rate_quality.scaling={a:1}"], "rate_quality.scaling: {a:1}: must be a list"),
+        (
+            ["cameras.rear_center.rate_quality={scaling: {a: 1}}"],
+            "rate_quality: {scaling: {a: 1}}: has a list in place of a mapping, or the reverse",
+        ),
         (["~cameras.nothing"], "Could not delete from config. 'cameras.nothing' does not exist."),
     ],
 )

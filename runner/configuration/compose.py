@@ -215,6 +215,15 @@ def _compose(
     return config, choices
 
 
+def _wanted(value: str, replaces: str) -> str:
+    """What a list or mapping of the command line should be, by Hydra's words on what it replaces."""
+    if value.startswith("["):
+        return "must be a mapping"
+    if "object_type=list" in replaces:
+        return "must be a list"
+    return "has a list in place of a mapping, or the reverse"
+
+
 def _hydra_problem(error: Exception, directories: Sequence[Path]) -> Problem:
     """Hydra's message as one problem; a file missing from a defaults list gets a suggestion."""
     text = str(error)
@@ -245,8 +254,7 @@ def _hydra_problem(error: Exception, directories: Sequence[Path]) -> Problem:
                 return Problem(label(path), "defaults", interpolation[1], rule)
     merged = re.search(r"Error merging override \+*([\w.@/-]+)=([\[{].*)", text)
     if merged:
-        kind = "a list" if merged[2].startswith("{") else "a mapping"
-        return Problem(COMMAND_LINE, merged[1], merged[2], f"must be {kind}")
+        return Problem(COMMAND_LINE, merged[1], merged[2], _wanted(merged[2], replaces=str(error.__cause__)))
     return Problem(COMMAND_LINE, "", None, rule)
 
 
